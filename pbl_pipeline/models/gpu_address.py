@@ -89,7 +89,8 @@ def _start(address: str, log: Path) -> None:
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
     with log.open("wb") as out:
-        command = [sys.executable, "-m", "pbl_pipeline.models.gpu_server", address]
+        # -P: not from the current folder, which may hold another checkout.
+        command = [sys.executable, "-P", "-m", "pbl_pipeline.models.gpu_server", address]
         process = subprocess.Popen(
             command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
         )

@@ -109,9 +109,7 @@ def test_pictures_of_many_videos_share_batches_and_get_their_own_answers(server:
     assert lite.note == ""
 
 
-def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(
-    server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     picture = pictures(224, 1)[0]
     network, asked = network_of("blazepose_detector"), network_of("blazepose_detector")
     before = network(picture)
