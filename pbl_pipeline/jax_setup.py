@@ -47,7 +47,8 @@ def configure() -> None:
     keep_programs()
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
-    # neither: 0.98 s and 14 s). Read when the first device is asked for. Detection needs the trials and is another process.
+    # neither: 0.98 s and 14 s). Read when the first device is asked for. Detection
+    # needs the trials and is another process.
     for flag in ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false"):
         flags = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in flags:

@@ -101,7 +101,7 @@ class BlazePoseLandmarks:
         quick_path: str | Path | None = None,
     ) -> None:
         def load(path: str | Path, sha256: str) -> Network:
-            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=num_threads, exact=False)
+            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=num_threads)
 
         self._model = load(model_path, sha256)
         self._quick = load(quick_path, MODEL_SHA256) if quick_path else self._model

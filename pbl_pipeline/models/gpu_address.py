@@ -25,7 +25,7 @@ _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def gpu_visible() -> bool:
-    """Whether JAX would find an NVIDIA GPU, told without loading it: a driver, a GPU that is not hidden, JAX's plugin."""
+    """Whether JAX would find an NVIDIA GPU, without loading it: a driver, a GPU that is not hidden, a plugin."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     hidden = listed is not None and listed.split(",")[0].strip() in ("", "-1", "NoDevFiles")
     other = os.environ.get("JAX_PLATFORMS", "")

@@ -30,15 +30,13 @@ from .tflite import NUM_THREADS, LiteModel
 @dataclasses.dataclass(frozen=True)
 class NetworkSpec:
     """A network: its file with SHA-256, the sizes of the outputs that are wanted (None: all), and how the values 0 to
-    255 of a picture enter it: times `scale` plus `offset`. `exact`: a GPU does not round the factors of products to
-    ten bits (TensorFloat-32), which is twice as fast."""
+    255 of a picture enter it: times `scale` plus `offset`."""
 
     path: str
     sha256: str
     outputs: tuple[int, ...] | None
     scale: float
     offset: float = 0.0
-    exact: bool = True
 
     def entered(self, image: np.ndarray) -> np.ndarray:
         """Return a picture (H, W, 3) uint8 as the network takes it, float32."""
@@ -56,7 +54,7 @@ class Network:
     sha256
         Of the file.
     device
-        Name of the GPU that computes and the rounding of its products, or "" for LiteRT on the CPU.
+        Name of the GPU that computes, or "" for LiteRT on the CPU.
     note
         Why LiteRT computes although a GPU is visible; "" where there is nothing to say.
 
@@ -75,10 +73,9 @@ class Network:
         offset: float = 0.0,
         outputs: Collection[int] | None = None,
         num_threads: int = NUM_THREADS,
-        exact: bool = True,
     ) -> None:
         wanted = None if outputs is None else tuple(sorted(outputs))
-        self._spec = NetworkSpec(str(Path(path).resolve()), sha256, wanted, scale, offset, exact)
+        self._spec = NetworkSpec(str(Path(path).resolve()), sha256, wanted, scale, offset)
         self._threads, self._lock = num_threads, threading.Lock()
         self.sha256, self.device, self.note = sha256, "", ""
         self._remote: _Remote | None = None

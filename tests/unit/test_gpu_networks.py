@@ -1,4 +1,4 @@
-"""TensorFlow Lite graphs as JAX functions, and the process that owns the GPU: same numbers as LiteRT, here on the CPU."""
+"""TensorFlow Lite graphs as JAX functions and the process that owns the GPU, here on the CPU: LiteRT's numbers."""
 
 from __future__ import annotations
 
