@@ -129,10 +129,9 @@ def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblErro
 
 
 def at_once(videos: int) -> int:
-    """Processes that detect in so many videos: one for each core where a GPU computes the networks, else one for every
-    two cores, each of which has a network for each of its own."""
-    share = 1 if gpu_visible() and asked_device() != "cpu" else 2
-    return max(1, min(videos, cores() // share))
+    """Processes that detect in so many videos: one for each core where a GPU computes the networks, else this one,
+    whose threads use the cores."""
+    return max(1, min(videos, cores())) if gpu_visible() and asked_device() != "cpu" else 1
 
 
 @contextlib.contextmanager

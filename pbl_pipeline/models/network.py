@@ -2,7 +2,8 @@
 
 On the GPU one process for each machine and GPU owns the networks (`gpu_server`); every process that detects sends its
 pictures there, so that pictures of many videos make up a batch. What was asked for by `PBL_ONNX_DEVICE` holds here as
-for ONNX models: "cpu" never uses the GPU, "cuda" fails without it, "auto" uses it where it works.
+for ONNX models: "cpu" never uses the GPU, "auto" uses it where it works; "cuda" fails where one is visible to JAX
+and does not compute. Where none is, LiteRT computes whatever was asked for: "cuda" may be meant for an ONNX model.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ class Network:
     Raises
     ------
     PblError
-        ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for and does not compute
-        this network. USAGE: an unknown device.
+        ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for, a GPU is visible,
+        and it does not compute this network. USAGE: an unknown device.
     """
 
     def __init__(
@@ -80,8 +81,7 @@ class Network:
         self.sha256, self.device, self.note = sha256, "", ""
         self._remote: _Remote | None = None
         self._lite: LiteModel | None = None
-        asked = asked_device()
-        if asked == "cpu" or not (asked == "cuda" or gpu_address.gpu_visible()):
+        if asked_device() == "cpu" or not gpu_address.gpu_visible():
             self._lite = self._load()
             return
         try:
