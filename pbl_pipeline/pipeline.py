@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+from pbl_pipeline import progress
 from pbl_pipeline.deidentify import to_show
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
@@ -18,14 +21,16 @@ from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
 from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
 from pbl_pipeline.kinetics import visit_kinetics
 from pbl_pipeline.methods import Method
+from pbl_pipeline.models import asked_device, gpu_visible
 from pbl_pipeline.names import check_height, check_label, check_mass, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
+from pbl_pipeline.resources import cores, shared_cores
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
-from pbl_pipeline.video import attitude_of, find_camera, probe, read_phone_log, sha256_of
+from pbl_pipeline.video import PhoneLog, attitude_of, find_camera, probe, read_phone_log, sha256_of
 from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit, save_visit
 
 
@@ -68,29 +73,23 @@ def run_visit(
     check_mass(mass_kg)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
-    found: list[Recording] = []
     problems: dict[str, PblError] = {}
     seen: dict[str, str] = {}
+    inputs = []
     for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
-        video = choice = None
+        one = _Input(path, name, log, out, camera_file, person, people.paramset, keypoints.paramset, method.paramset)
         try:
             first = seen.setdefault(sha256_of(path), name)
             if first != name:
                 raise _named_twice(path, first)
-            video = probe(path)
-            camera = find_camera(video, camera_file)
-            tracking = track_people(path, people, info=video)
-            choice = choose_subject(tracking, override=person)
-            subject = require_subject(choice, tracking, path, out / f"{name}.persons.png")
-            points = detect_keypoints(path, tracking, subject, camera, params=keypoints)
-            if log is not None:
-                points = points.with_attitude(attitude_of(log[1], log[0], video))
-            check_trial(points, name, method)
-            found.append(Recording.of(name, keypoints=points, path=path, video=video, choice=choice))
         except PblError as error:
-            problems[name] = error
-            problem = choice.reason if choice is not None and choice.person_id is None else error.short()
-            found.append(Recording(name, path, video, choice, problem=problem))
+            one = dataclasses.replace(one, error=error)
+        inputs.append(one)
+    found: list[Recording] = []
+    for one, (recording, error) in zip(inputs, _side_by_side(inputs), strict=True):
+        found.append(recording)
+        if error is not None:
+            problems[one.name] = error
     recordings = [r for r in found if not r.problem]
     if not recordings:
         raise next(iter(problems.values()))
@@ -106,6 +105,66 @@ def run_visit(
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
     visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
     return measured(visit, norm=norm, mass_kg=mass_kg), problems
+
+
+@dataclasses.dataclass(frozen=True)
+class _Input:
+    """A video of `run_visit`: its sensor log with the file of that, its methods, and an error that it has already."""
+
+    path: Path
+    name: str
+    log: tuple[Path, PhoneLog] | None
+    out: Path
+    camera_file: Path | None
+    person: int | None
+    people: Paramset
+    keypoints: Paramset
+    fit: Paramset
+    error: PblError | None = None
+
+
+def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblError | None]]:
+    """Detect in each video, in their order: in as many processes as `at_once` says, or here."""
+    processes = at_once(sum(i.error is None for i in inputs))
+    if processes < 2:
+        yield from map(_detected, inputs)
+        return
+    with detection_processes(processes) as pool:
+        yield from progress.track(pool.map(_detected, inputs), "videos", total=len(inputs), unit="video")
+
+
+def at_once(videos: int) -> int:
+    """Processes that detect in so many videos: one for each core where a GPU computes the networks, else this one,
+    whose threads use the cores."""
+    return max(1, min(videos, cores())) if gpu_visible() and asked_device() != "cpu" else 1
+
+
+@contextlib.contextmanager
+def detection_processes(n: int) -> Iterator[ProcessPoolExecutor]:
+    """Yield a pool of processes that share the cores. Not forked: threads of the libraries do not survive that."""
+    with shared_cores(n), ProcessPoolExecutor(n, multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
+def _detected(one: _Input) -> tuple[Recording, PblError | None]:
+    """Keypoints of a video, checked, or the error that leaves it out."""
+    video = choice = None
+    try:
+        if one.error is not None:
+            raise one.error
+        video = probe(one.path)
+        camera = find_camera(video, one.camera_file)
+        tracking = track_people(one.path, one.people, info=video)
+        choice = choose_subject(tracking, override=one.person)
+        subject = require_subject(choice, tracking, one.path, one.out / f"{one.name}.persons.png")
+        points = detect_keypoints(one.path, tracking, subject, camera, params=one.keypoints)
+        if one.log is not None:
+            points = points.with_attitude(attitude_of(one.log[1], one.log[0], video))
+        check_trial(points, one.name, one.fit)
+        return Recording.of(one.name, keypoints=points, path=one.path, video=video, choice=choice), None
+    except PblError as error:
+        problem = choice.reason if choice is not None and choice.person_id is None else error.short()
+        return Recording(one.name, one.path, video, choice, problem=problem), error
 
 
 def measured(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,6 +38,21 @@ def divide_cores(processes: int) -> None:
     os.environ[CORES] = share
     for name in _THREADS:
         os.environ.setdefault(name, share)
+
+
+@contextlib.contextmanager
+def shared_cores(processes: int) -> Iterator[None]:
+    """As `divide_cores`, for processes that are started in this block."""
+    before = {name: os.environ.get(name) for name in (CORES, *_THREADS)}
+    divide_cores(processes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _quotas() -> Iterator[float]:

@@ -21,7 +21,8 @@ VARIABLES: dict[str, str] = {
     "PBL_OFFLINE": "1: never fetch anything, fail with the remedy instead",
     "PBL_DB_PREFIX": "prefix of the database schema names (default: pbl)",
     "PBL_MODELS": "folder of the registered keypoint models (default: models/ in PBL_HOME)",
-    "PBL_ONNX_DEVICE": "where ONNX models run: auto, cpu or cuda (default: auto, CUDA where it works)",
+    "PBL_ONNX_DEVICE": "where networks run (BlazePose, ONNX models): auto, cpu or cuda (default: auto, CUDA where it "
+    "works)",
     "PBL_STORE": "folder of the object store that holds arrays (default: store/ in PBL_HOME)",
     "PBL_INCOMING": "folder or s3://BUCKET/PREFIX into which phones upload, for pbl cron import",
     "PBL_ARCHIVE": "folder in which uploaded recordings are kept (default: recordings/ in PBL_HOME)",

@@ -14,7 +14,7 @@ from scipy.special import expit
 
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.models import LiteModel
+from pbl_pipeline.models import Network
 from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
 
@@ -100,10 +100,25 @@ class BlazePoseLandmarks:
         sha256: str = MODEL_SHA256,
         quick_path: str | Path | None = None,
     ) -> None:
-        self._model = LiteModel(model_path, sha256, _OUTPUTS, num_threads)
-        self._quick = LiteModel(quick_path, MODEL_SHA256, _OUTPUTS, num_threads) if quick_path else self._model
+        def load(path: str | Path, sha256: str) -> Network:
+            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=num_threads)
+
+        self._model = load(model_path, sha256)
+        self._quick = load(quick_path, MODEL_SHA256) if quick_path else self._model
         self.model_sha256 = self._model.sha256
         self.mirrored_inference = MirroredInference(NAMES, agree_mm, agree_width_mm)
+
+    @property
+    def side_by_side(self) -> int:
+        """Calls at once that use the device whole; 1: a detector for each core is fastest."""
+        return self._model.side_by_side
+
+    @property
+    def origin(self) -> str:
+        """Where these keypoints were computed, where that is not LiteRT on a machine without a GPU."""
+        if self._model.on_gpu:
+            return f"{self.name} on {self._model.device}"
+        return f"{self.name} {self._model.note}" if self._model.note else ""
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
         """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
@@ -132,10 +147,10 @@ class BlazePoseLandmarks:
         return self._look(self._model, crop, roi_px, camera, mirrored=mirrored)
 
     def _look(
-        self, network: LiteModel, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
+        self, network: Network, crop: np.ndarray, roi_px: np.ndarray, camera: Camera, *, mirrored: bool
     ) -> PersonKeypoints:
         """Return the points that a network finds in the crop, or in its mirror image, in coordinates of the picture."""
-        crop = np.multiply(cv2.cvtColor(crop, cv2.COLOR_BGR2RGB), np.float32(1 / 255), dtype=np.float32)
+        crop = cv2.cvtColor(crop, cv2.COLOR_BGR2RGB)
         output = network(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
         found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
         points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]

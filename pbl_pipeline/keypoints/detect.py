@@ -88,8 +88,12 @@ def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
-    """The detector of the method; one for each core where it says that this is the fastest."""
+    """The detector of the method; one for each core where it says that this is the fastest. One whose network is on a
+    GPU is shared: it is called from as many threads as it asks for."""
     first = method.function(method.params)
+    shared = getattr(first, "side_by_side", 1)
+    if shared > 1:
+        return [first] * shared
     more = n_workers() - 1 if getattr(first, "per_core", False) else 0
     return [first, *(method.function(method.params) for _ in range(more))]
 

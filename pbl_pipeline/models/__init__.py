@@ -1,6 +1,8 @@
 """Networks: BlazePose (tflite) and any as ONNX: folder with graph and spec, the registry, sessions on CPU or CUDA."""
 
 from .devices import DEVICES, asked_device, available_devices, providers_for
+from .gpu_address import gpu_visible
+from .network import Network
 from .onnx_model import OnnxModel, check_frozen
 from .registry import ModelStatus, add, find, is_registered, registered, remove, verify
 from .spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
@@ -14,6 +16,7 @@ __all__ = [
     "ModelInput",
     "ModelSpec",
     "ModelStatus",
+    "Network",
     "OnnxModel",
     "SsdLayout",
     "SsdModel",
@@ -23,6 +26,7 @@ __all__ = [
     "box_iou",
     "check_frozen",
     "find",
+    "gpu_visible",
     "is_registered",
     "load_spec",
     "mirror_pairs",

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from .tflite import LiteModel
+from .network import Network
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,12 +63,13 @@ class SsdLayout:
 
 
 class SsdModel:
-    """A loaded detector of a layout. Not to be shared by threads. Raises `PblError` ASSET_CHECKSUM as `LiteModel`."""
+    """A loaded detector of a layout. Not to be shared by threads. Raises the `PblError`s of `Network`."""
 
     def __init__(
         self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float, min_iou: float = 0.3
     ) -> None:
-        self._model = LiteModel(model_path, sha256)
+        # 0 is black: the letterbox bars must be what the network knows as black (-1), not grey.
+        self._model = Network(model_path, sha256, scale=2 / 255, offset=-1.0)
         self.sha256 = self._model.sha256
         self._layout, self._min_score, self._min_iou = layout, min_score, min_iou
 
@@ -81,10 +82,8 @@ class SsdModel:
         w, h = max(round(width * scale), 1), max(round(height * scale), 1)
         small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         left, top = (size - w) // 2, (size - h) // 2
-        canvas = np.zeros((size, size, 3), np.float32)
-        # -1 is black: the letterbox bars must be what the network knows as black, not grey.
-        canvas -= 1.0
-        canvas[top : top + h, left : left + w] = small[:, :, ::-1] * np.float32(2 / 255) - np.float32(1)
+        canvas = np.zeros((size, size, 3), np.uint8)
+        canvas[top : top + h, left : left + w] = small[:, :, ::-1]
         output = self._model(canvas)
         n = len(self._layout.anchor_centres)
         raw_boxes = output[n * self._layout.n_values].reshape(n, -1)

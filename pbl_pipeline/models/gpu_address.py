@@ -1,0 +1,106 @@
+"""Where the process that owns the GPU for detection listens, and how it is started: by whoever first needs it.
+
+It ends by itself when no one has been connected for a while. Fit and detection want other settings of XLA
+(`jax_setup`), and many processes that decode share one GPU, so it is a process of its own.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+#: A GPU process that does not listen after so long has failed (s): loading JAX and the driver takes some seconds.
+START_S = 120.0
+#: Flags that `jax_setup` sets for the fit. With them convolutions take a slow path.
+_FIT_FLAGS = ("--xla_gpu_autotune_level", "--xla_gpu_enable_triton_gemm")
+_PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+
+
+def gpu_visible() -> bool:
+    """Whether JAX would find an NVIDIA GPU, without loading it: a driver, a GPU that is not hidden, a plugin."""
+    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
+    hidden = listed is not None and listed.split(",")[0].strip() in ("", "-1", "NoDevFiles")
+    other = os.environ.get("JAX_PLATFORMS", "")
+    if hidden or (other and not {"cuda", "gpu"} & set(other.split(","))):
+        return False
+    driver = any(Path(p).exists() for p in ("/dev/nvidiactl", "/proc/driver/nvidia/version", "/dev/dxg"))
+    return driver and any(importlib.util.find_spec(p) is not None for p in _PLUGINS)
+
+
+def running_server() -> str:
+    """Return the address of the GPU process, after starting it where none listens.
+
+    Raises
+    ------
+    RuntimeError
+        It does not start; the text has the last line that it printed.
+    OSError
+        The folder of its socket cannot be made.
+    """
+    folder = _folder()
+    address = str(folder / f"{_name()}.sock")
+    with (folder / f"{_name()}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not _listens(address):
+            _start(address, folder / f"{_name()}.log")
+    return address
+
+
+def _folder() -> Path:
+    """A folder that only this user may enter."""
+    folder = Path(tempfile.gettempdir()) / f"pbl-gpu-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise OSError(f"{folder} can be entered by other users")
+    return folder
+
+
+def _name() -> str:
+    """A name for this code and the GPUs that this process may see."""
+    here = Path(__file__).parent
+    code = b"".join((here / name).read_bytes() for name in ("gpu_server.py", "network.py", "tflite_jax.py"))
+    seen = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
+    return hashlib.sha256(code + seen.encode() + sys.executable.encode()).hexdigest()[:16]
+
+
+def _listens(address: str) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        try:
+            probe.connect(address)
+        except OSError:
+            return False
+    return True
+
+
+def _start(address: str, log: Path) -> None:
+    env = dict(os.environ)
+    flags = [f for f in env.get("XLA_FLAGS", "").split() if f.partition("=")[0] not in _FIT_FLAGS]
+    env["XLA_FLAGS"] = " ".join(flags)
+    # The fit may be another process on the same GPU.
+    env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+    with log.open("wb") as out:
+        # -P: not from the current folder, which may hold another checkout.
+        command = [sys.executable, "-P", "-m", "pbl_pipeline.models.gpu_server", address]
+        process = subprocess.Popen(
+            command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
+        )
+    end = time.monotonic() + START_S
+    while time.monotonic() < end:
+        if _listens(address):
+            return
+        if process.poll() is not None:
+            lines = log.read_text(errors="replace").strip().splitlines()
+            raise RuntimeError(lines[-1][:300] if lines else f"the GPU process ended with {process.returncode}")
+        time.sleep(0.05)
+    process.kill()
+    raise RuntimeError(f"the GPU process did not listen within {START_S:g} s")

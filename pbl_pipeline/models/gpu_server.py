@@ -1,0 +1,244 @@
+"""The process that owns the GPU for detection: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
+
+Each connection is of one network: a `NetworkSpec`, then pictures, each answered with the network's outputs as float32
+in the order of the pictures. What waits on all connections of a network goes through the GPU together. Each network
+has one batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's result
+does not depend on its neighbours.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import selectors
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection, Listener
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from .network import NetworkSpec, read_network
+from .tflite import LiteModel
+
+#: Pictures of one call of a network, and the smallest that is tried where the GPU's memory does not suffice.
+BATCH, LEAST_BATCH = 32, 4
+#: The process ends when no one has been connected for so long (s).
+IDLE_S = 60.0
+#: Largest difference to LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
+MOST_DIFFERENCE = 1e-3
+_POLL_S = 0.001
+
+
+class Program:
+    """A network compiled for the device, checked against LiteRT on one picture.
+
+    Raises
+    ------
+    PblError
+        ASSET_CHECKSUM; MODEL_INVALID: an operation that is not known.
+    RuntimeError
+        The device is no GPU and `any_device` is False, has no room, or computes something else than LiteRT.
+    """
+
+    def __init__(self, spec: NetworkSpec, any_device: bool = False, batch: int = BATCH) -> None:
+        import jax
+
+        from .tflite_jax import read_model
+
+        model = read_model(read_network(spec))
+        device = jax.devices()[0]
+        if device.platform != "gpu" and not any_device:
+            raise RuntimeError(f"JAX finds no GPU, only {device.device_kind}")
+        self.sizes, self.image_shape, self.batch = model.output_sizes, model.image_shape, batch
+        self.device = device.device_kind
+        self._weights = jax.device_put(model.weights)
+        scale, offset = np.float32(spec.scale), np.float32(spec.offset)
+
+        def outputs(weights: Any, images: Any) -> Any:
+            # Factors rounded to ten bits (TensorFloat-32) are a third faster here, and points then differ by 4 px of
+            # 256 where a picture tells little; so results would depend on where they were computed.
+            with jax.default_matmul_precision("highest"):
+                return jax.numpy.concatenate(model(weights, images.astype(np.float32) * scale + offset), axis=1)
+
+        self._run = jax.jit(outputs)
+        self._check(spec)
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """Return the outputs (N, sum of sizes) of pictures (N, H, W, 3) uint8, N at most that of any call before."""
+        while True:
+            try:
+                parts = [self._run(self._weights, part) for part in self._parts(images)]
+                return np.concatenate([np.asarray(p) for p in parts])[: len(images)]
+            except RuntimeError as error:
+                if "RESOURCE_EXHAUSTED" not in str(error) or self.batch <= LEAST_BATCH:
+                    raise
+                self.batch //= 2
+
+    def _parts(self, images: np.ndarray) -> list[np.ndarray]:
+        short = -len(images) % self.batch
+        if short:
+            images = np.concatenate([images, np.zeros((short, *images.shape[1:]), images.dtype)])
+        return [images[i : i + self.batch] for i in range(0, len(images), self.batch)]
+
+    def _check(self, spec: NetworkSpec) -> None:
+        picture = np.random.default_rng(0).integers(0, 256, self.image_shape, np.uint8)
+        got = np.split(self(picture[None])[0], np.cumsum(self.sizes)[:-1])
+        expected = LiteModel(spec.path, spec.sha256, spec.outputs)(spec.entered(picture))
+        for size, values in zip(self.sizes, got, strict=True):
+            wanted = expected[size].ravel()
+            off = float(np.max(np.abs(values - wanted)) / max(float(np.max(np.abs(wanted))), 1.0))
+            if not off < MOST_DIFFERENCE:
+                raise RuntimeError(f"the GPU's output of {size} numbers is {off:.2g} from LiteRT's")
+
+
+class _Served:
+    """A network and the connections that show it pictures."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._selector = selectors.DefaultSelector()
+        self._filled: queue.Queue[tuple[np.ndarray, list[Connection]]] = queue.Queue(1)
+        self._idle = threading.Event()
+        self.n_connections = 0
+        for work in (self._collect, self._compute):
+            threading.Thread(target=work, daemon=True).start()
+
+    def add(self, connection: Connection) -> None:
+        self.n_connections += 1
+        self._selector.register(connection.fileno(), selectors.EVENT_READ, connection)
+
+    def close(self) -> None:
+        """End all connections."""
+        for connection in [key.data for key in self._selector.get_map().values()]:
+            self._drop(connection)
+
+    def _collect(self) -> None:
+        """Fill batches with what waits; hand one on when it is full, or when the device is idle."""
+        while True:
+            size = self._program.batch
+            images, owners = np.empty((size, *self._program.image_shape), np.uint8), []
+            while len(owners) < size:
+                ready = self._selector.select(0.0 if owners and self._idle.is_set() else _POLL_S if owners else 1.0)
+                if not ready and owners and self._idle.is_set():
+                    break
+                for key, _ in ready[: size - len(owners)]:
+                    try:
+                        key.data.recv_bytes_into(images[len(owners)].reshape(-1))
+                        owners.append(key.data)
+                    except (EOFError, OSError):
+                        self._drop(key.data)
+            self._filled.put((images, owners))
+
+    def _drop(self, connection: Connection) -> None:
+        try:
+            self._selector.unregister(connection.fileno())
+            connection.close()
+            self.n_connections -= 1
+        except (KeyError, OSError, ValueError):  # it was closed before
+            return
+
+    def _compute(self) -> None:
+        while True:
+            self._idle.set()
+            images, owners = self._filled.get()
+            self._idle.clear()
+            try:
+                found = self._program(images[: len(owners)])
+            except RuntimeError as error:  # the GPU went away: who is connected lets LiteRT compute
+                sys.stderr.write(f"the GPU does not compute: {error}\n")
+                sys.stderr.flush()
+                os._exit(1)
+            for owner, outputs in zip(owners, found, strict=True):
+                try:
+                    owner.send_bytes(outputs.tobytes())
+                except (OSError, ValueError):
+                    continue
+
+
+class Server:
+    """Serves networks at an address until it is closed or nobody has been connected for `idle_s`."""
+
+    def __init__(self, address: str, any_device: bool = False, idle_s: float = IDLE_S, batch: int = BATCH) -> None:
+        self._listener = Listener(address, "AF_UNIX", backlog=256)
+        self._any_device, self._idle_s, self._batch = any_device, idle_s, batch
+        self._served: dict[NetworkSpec, _Served] = {}
+        self._locks: dict[NetworkSpec, threading.Lock] = {}
+        self._opening = 0
+        # Programs of several networks compile side by side.
+        self._openers = ThreadPoolExecutor(16)
+
+    def run(self) -> None:
+        """Accept connections."""
+        threading.Thread(target=self._watch, daemon=True).start()
+        while True:
+            try:
+                connection = self._listener.accept()
+            except OSError:
+                return
+            self._openers.submit(self._open, connection)
+
+    def close(self) -> None:
+        """Accept no more connections and end those that are open."""
+        self._listener.close()
+        for served in self._served.values():
+            served.close()
+
+    def _open(self, connection: Connection) -> None:
+        self._opening += 1
+        try:
+            given = json.loads(connection.recv_bytes())
+            outputs = None if given["outputs"] is None else tuple(given["outputs"])
+            spec = NetworkSpec(**(given | {"outputs": outputs}))
+            try:
+                with self._locks.setdefault(spec, threading.Lock()):
+                    if spec not in self._served:
+                        self._served[spec] = _Served(Program(spec, self._any_device, self._batch))
+            except Exception as error:  # noqa: BLE001 - whoever asked lets LiteRT compute and says why
+                lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
+                connection.send_bytes(json.dumps({"error": lines[0] if lines else type(error).__name__}).encode())
+                return
+            served = self._served[spec]
+            program = served._program
+            connection.send_bytes(json.dumps({"device": program.device, "sizes": program.sizes}).encode())
+            served.add(connection)
+        except (EOFError, OSError, ValueError):
+            connection.close()
+        finally:
+            self._opening -= 1
+
+    def _watch(self) -> None:
+        """End the process when it is not used any more."""
+        last = time.monotonic()
+        while time.monotonic() - last < self._idle_s:
+            time.sleep(min(1.0, self._idle_s / 4))
+            if self._opening or any(s.n_connections for s in list(self._served.values())):
+                last = time.monotonic()
+        self.close()
+        os._exit(0)
+
+
+def main() -> None:
+    """Entry of the process. Ends at once where JAX finds no GPU."""
+    address = Path(sys.argv[1])
+    address.unlink(missing_ok=True)
+    # Programs are kept on disk as those of the fit, by the same rules.
+    from pbl_pipeline.jax_setup import keep_programs
+
+    keep_programs()
+    import jax
+
+    device = jax.devices()[0]
+    if device.platform != "gpu":
+        raise SystemExit(f"JAX finds no GPU, only {device.device_kind}")
+    Server(str(address)).run()
+
+
+if __name__ == "__main__":
+    main()

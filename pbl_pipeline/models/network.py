@@ -1,0 +1,182 @@
+"""A network of a TensorFlow Lite file that is shown pictures: on the GPU where one is visible, else by LiteRT.
+
+On the GPU one process for each machine and GPU owns the networks (`gpu_server`); every process that detects sends its
+pictures there, so that pictures of many videos make up a batch. What was asked for by `PBL_ONNX_DEVICE` holds here as
+for ONNX models: "cpu" never uses the GPU, "auto" uses it where it works; "cuda" fails where one is visible to JAX
+and does not compute. Where none is, LiteRT computes whatever was asked for: "cuda" may be meant for an ONNX model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import threading
+from collections import deque
+from collections.abc import Collection
+from concurrent.futures import Future
+from multiprocessing.connection import Client
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbl_pipeline.errors import PblError
+
+from . import gpu_address
+from .devices import asked_device, unavailable
+from .tflite import NUM_THREADS, LiteModel
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkSpec:
+    """A network: its file with SHA-256, the sizes of the outputs that are wanted (None: all), and how the values 0 to
+    255 of a picture enter it: times `scale` plus `offset`."""
+
+    path: str
+    sha256: str
+    outputs: tuple[int, ...] | None
+    scale: float
+    offset: float = 0.0
+
+    def entered(self, image: np.ndarray) -> np.ndarray:
+        """Return a picture (H, W, 3) uint8 as the network takes it, float32."""
+        values = np.multiply(image, np.float32(self.scale), dtype=np.float32)
+        return values + np.float32(self.offset) if self.offset else values
+
+
+class Network:
+    """A loaded network, called with a picture (H, W, 3) uint8 RGB; outputs are keyed by their number of elements.
+
+    On the GPU several threads may call it at once, and `side_by_side` of them fill it; by LiteRT one at a time.
+
+    Attributes
+    ----------
+    sha256
+        Of the file.
+    device
+        Name of the GPU that computes, or "" for LiteRT on the CPU.
+    note
+        Why LiteRT computes although a GPU is visible; "" where there is nothing to say.
+
+    Raises
+    ------
+    PblError
+        ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for, a GPU is visible,
+        and it does not compute this network. USAGE: an unknown device.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        sha256: str,
+        scale: float,
+        offset: float = 0.0,
+        outputs: Collection[int] | None = None,
+        num_threads: int = NUM_THREADS,
+    ) -> None:
+        wanted = None if outputs is None else tuple(sorted(outputs))
+        self._spec = NetworkSpec(str(Path(path).resolve()), sha256, wanted, scale, offset)
+        self._threads, self._lock = num_threads, threading.Lock()
+        self.sha256, self.device, self.note = sha256, "", ""
+        self._remote: _Remote | None = None
+        self._lite: LiteModel | None = None
+        if asked_device() == "cpu" or not gpu_address.gpu_visible():
+            self._lite = self._load()
+            return
+        try:
+            self._remote = _Remote(gpu_address.running_server(), self._spec)
+            self.device = self._remote.device
+        except (OSError, EOFError, RuntimeError) as error:
+            self._fall_back(error)
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the GPU computes."""
+        return self._remote is not None
+
+    @property
+    def side_by_side(self) -> int:
+        """Calls at once that keep the device busy while pictures are cut for others."""
+        return 16 if self.on_gpu else 1
+
+    def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
+        remote = self._remote
+        if remote is not None:
+            try:
+                return remote(image)
+            except (OSError, EOFError, RuntimeError) as error:
+                with self._lock:
+                    if self._remote is remote:
+                        self._fall_back(error)
+        with self._lock:
+            assert self._lite is not None
+            return self._lite(self._spec.entered(image))
+
+    def _load(self) -> LiteModel:
+        return LiteModel(self._spec.path, self.sha256, self._spec.outputs, self._threads)
+
+    def _fall_back(self, error: BaseException) -> None:
+        """Let LiteRT compute from now on. Raises DEVICE_UNAVAILABLE where the GPU was asked for."""
+        found = str(error) or type(error).__name__
+        if asked_device() == "cuda":
+            raise unavailable(found) from error
+        self._remote = None
+        self._lite = self._load()
+        self.note = f"on the CPU because the GPU does not compute it: {found}"[:300]
+
+
+class _Remote:
+    """A connection to the process that owns the GPU, for one network; calls of several threads share it."""
+
+    def __init__(self, address: str, spec: NetworkSpec) -> None:
+        self._connection: Any = Client(address, "AF_UNIX")
+        self._connection.send_bytes(json.dumps(dataclasses.asdict(spec)).encode())
+        reply = json.loads(self._connection.recv_bytes())
+        if "error" in reply:
+            raise RuntimeError(reply["error"])
+        self.device, self._sizes = str(reply["device"]), [int(n) for n in reply["sizes"]]
+        self._sending = threading.Lock()
+        self._waiting: deque[Future[bytes]] = deque()
+        self._broken: BaseException | None = None
+        threading.Thread(target=self._listen, name="gpu-network", daemon=True).start()
+
+    def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
+        future: Future[bytes] = Future()
+        with self._sending:
+            if self._broken is not None:
+                raise self._broken
+            self._waiting.append(future)
+            self._connection.send_bytes(np.ascontiguousarray(image).reshape(-1))
+        values = np.frombuffer(future.result(), np.float32)
+        parts = np.split(values, np.cumsum(self._sizes)[:-1])
+        return dict(zip(self._sizes, parts, strict=True))
+
+    def _listen(self) -> None:
+        try:
+            while True:
+                reply = self._connection.recv_bytes()
+                self._waiting.popleft().set_result(reply)
+        except (OSError, EOFError, IndexError) as error:
+            gone = EOFError("the process that owns the GPU ended") if isinstance(error, EOFError) else error
+            with self._sending:
+                self._broken = gone
+                while self._waiting:
+                    self._waiting.popleft().set_exception(gone)
+
+
+def read_network(spec: NetworkSpec) -> bytes:
+    """Return the bytes of the network's file with the wanted outputs. Raises `PblError` ASSET_CHECKSUM."""
+    from .tflite_outputs import keep_outputs
+
+    content = Path(spec.path).read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != spec.sha256:
+        raise PblError(
+            "ASSET_CHECKSUM",
+            found=f"SHA-256 {found}",
+            expected=f"SHA-256 {spec.sha256}",
+            next_step="delete the file and run the command again so that it is fetched anew",
+            key=spec.path,
+        )
+    return content if spec.outputs is None else keep_outputs(content, spec.outputs)

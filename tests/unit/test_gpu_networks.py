@@ -1,0 +1,135 @@
+"""TensorFlow Lite graphs as JAX functions and the process that owns the GPU, here on the CPU: LiteRT's numbers."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pbl_pipeline import assets
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_visible
+from pbl_pipeline.models.gpu_server import Server
+from pbl_pipeline.models.network import NetworkSpec, read_network
+from pbl_pipeline.models.tflite_jax import read_model
+from pbl_pipeline.video import read_frames
+
+LANDMARKS = (195, 117, 1)
+
+
+def spec_of(name: str) -> NetworkSpec:
+    asset = assets.ASSETS[name]
+    outputs = LANDMARKS if "landmarks" in name else None
+    scale, offset = (1 / 255, 0.0) if outputs else (2 / 255, -1.0)
+    return NetworkSpec(str(assets.fetch(name)), asset.sha256, outputs, scale, offset)
+
+
+def pictures(size: int, n: int) -> list[np.ndarray]:
+    """Squares of the demo recording, RGB, around the woman who walks."""
+    video = assets.fetch("demo_video")
+    frames = [f.image for f in read_frames(video, 60, 60 + 20 * n, 20)]
+    squares = [image[:, -image.shape[0] :] if image.shape[1] > image.shape[0] else image for image in frames]
+    return [np.ascontiguousarray(cv2.resize(s, (size, size))[:, :, ::-1]) for s in squares]
+
+
+@pytest.mark.parametrize("name", ["blazepose_detector", "blazepose_landmarks", "blazepose_landmarks_heavy"])
+def test_jax_function_has_litert_s_numbers(name: str) -> None:
+    spec = spec_of(name)
+    model = read_model(read_network(spec))
+    shown = [spec.entered(p) for p in pictures(model.image_shape[0], 2)]
+    got = model(model.weights, np.stack(shown))
+    lite = LiteModel(spec.path, spec.sha256, spec.outputs)
+    for i, picture in enumerate(shown):
+        expected = lite(picture)
+        for size, values in zip(model.output_sizes, got, strict=True):
+            # Of coordinates up to 256 px, logits and metres; float32 sums in another order.
+            largest = max(float(np.abs(expected[size]).max()), 1.0)
+            assert np.abs(np.asarray(values[i]) - expected[size].ravel()).max() < 1e-4 * largest
+
+
+def test_unknown_operation_is_named() -> None:
+    from ai_edge_litert import schema_py_generated as schema
+
+    spec = spec_of("blazepose_landmarks")
+    content = schema.ModelT.InitFromObj(schema.Model.GetRootAs(read_network(spec), 0))
+    for code in content.operatorCodes:
+        if code.builtinCode == schema.BuiltinOperator.LOGISTIC:
+            code.builtinCode = code.deprecatedBuiltinCode = schema.BuiltinOperator.SOFTMAX
+    import flatbuffers
+
+    builder = flatbuffers.Builder(1 << 20)
+    builder.Finish(content.Pack(builder), b"TFL3")
+    with pytest.raises(PblError, match="operation SOFTMAX") as caught:
+        read_model(bytes(builder.Output()))
+    assert caught.value.code == "MODEL_INVALID"
+
+
+def test_without_a_gpu_litert_computes() -> None:
+    if gpu_visible():
+        pytest.skip("a GPU is here")
+    network = network_of("blazepose_detector")
+    assert (network.on_gpu, network.device, network.note, network.side_by_side) == (False, "", "", 1)
+
+
+def network_of(name: str) -> Network:
+    spec = spec_of(name)
+    return Network(spec.path, spec.sha256, spec.scale, spec.offset, spec.outputs)
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A server on the CPU, found as that of a GPU is."""
+    address = str(tmp_path / "gpu.sock")
+    server = Server(address, any_device=True, idle_s=float("inf"), batch=4)
+    threading.Thread(target=server.run, daemon=True).start()
+    monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
+    monkeypatch.setattr(gpu_address, "running_server", lambda: address)
+    yield server
+    server.close()
+
+
+def test_pictures_of_many_videos_share_batches_and_get_their_own_answers(server: Server) -> None:
+    shown = pictures(224, 3)
+    lite = network_of("blazepose_detector")
+    videos = [network_of("blazepose_detector") for _ in range(3)]
+    assert all(v.on_gpu and v.device for v in videos)
+    spec = spec_of("blazepose_detector")
+    model = LiteModel(spec.path, spec.sha256)
+    expected = [model(spec.entered(p)) for p in shown]
+    with ThreadPoolExecutor(9) as threads:
+        jobs = [(i, threads.submit(videos[i % 3], shown[i % 3])) for i in range(18)]
+        for i, job in jobs:
+            for size, values in job.result().items():
+                assert np.allclose(values.ravel(), expected[i % 3][size].ravel(), atol=0.01)
+    assert lite.note == ""
+
+
+def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = pictures(224, 1)[0]
+    network, asked = network_of("blazepose_detector"), network_of("blazepose_detector")
+    before = network(picture)
+    server.close()
+    after = network(picture)
+    assert not network.on_gpu
+    assert "the GPU does not compute it" in network.note
+    assert all(np.allclose(before[s].ravel(), after[s].ravel(), atol=0.01) for s in after)
+    monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
+    with pytest.raises(PblError) as caught:
+        asked(picture)
+    assert caught.value.code == "DEVICE_UNAVAILABLE"
+
+
+def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pbl_pipeline.models import tflite_jax
+
+    monkeypatch.delitem(tflite_jax._OPERATIONS, "DEPTH_TO_SPACE")
+    network = network_of("blazepose_detector")
+    assert not network.on_gpu
+    assert "DEPTH_TO_SPACE" in network.note
