@@ -12,7 +12,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
-from pbl_pipeline.gait import DEFAULT_NORM, GaitParams, gait_metrics, load_norm
+from pbl_pipeline.gait import DEFAULT_NORM, UNKNOWN, Condition, GaitParams, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
 from pbl_pipeline.methods import Method
@@ -39,6 +39,7 @@ def run_visit(
     keypoints: Method[KeypointParams] | None = None,
     people: Method[TrackingParams] | None = None,
     height_m: float | None = None,
+    activity: str | None = None,
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -48,6 +49,7 @@ def run_visit(
     `paramset` is the method of the fit; None: the one that suits the keypoints (`fit.default_fit`). `attitude_files`
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`.
+    `activity`: what the person does in the videos; None: unknown, which counts as walking.
 
     Raises
     ------
@@ -61,6 +63,7 @@ def run_visit(
     method = FIT_METHODS.find(paramset or default_fit(keypoints.params.points()))
     load_norm(norm or DEFAULT_NORM)
     check_height(height_m)
+    condition = Condition(activity or UNKNOWN)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     found: list[Recording] = []
@@ -81,11 +84,12 @@ def run_visit(
             if log is not None:
                 points = points.with_attitude(attitude_of(log[1], log[0], video))
             check_trial(points, name, method)
-            found.append(Recording.of(name, keypoints=points, path=path, video=video, choice=choice))
+            given = {"path": path, "video": video, "choice": choice, "condition": condition}
+            found.append(Recording.of(name, keypoints=points, **given))
         except PblError as error:
             problems[name] = error
             problem = choice.reason if choice is not None and choice.person_id is None else error.short()
-            found.append(Recording(name, path, video, choice, problem=problem))
+            found.append(Recording(name, path, video, choice, condition, problem=problem))
     recordings = [r for r in found if not r.problem]
     if not recordings:
         raise next(iter(problems.values()))

@@ -47,6 +47,7 @@ from .options import (
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--norm", help="Normative set of the GDI.")
 @HEIGHT
+@click.option("--activity", help="What the person does in all VIDEOS: tug, sit_to_stand, squat (else: walking).")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 def run(
     videos: tuple[Path, ...],
@@ -62,6 +63,7 @@ def run(
     params: str | None,
     norm: str | None,
     height_m: float | None,
+    activity: str | None,
     subject: str,
 ) -> None:
     """Put VIDEOS, the trials of one session, through the whole chain.
@@ -94,7 +96,7 @@ def run(
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
-        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m
+        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m, activity
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

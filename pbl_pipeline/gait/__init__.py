@@ -74,6 +74,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, task_motion
 from .types import GaitCycle, Lengths
 
 __all__ = [
@@ -99,7 +100,9 @@ __all__ = [
     "PLUG_IN_GAIT_POINTS",
     "REPORT_PERCENT",
     "SELF_SELECTED",
+    "TASK_MEASURES",
     "THREE_ANGLES",
+    "TRIAL_MEASURES",
     "UNKNOWN",
     "Z90",
     "AngleSeries",
@@ -124,6 +127,7 @@ __all__ = [
     "NormativeSet",
     "SessionMetrics",
     "Spatiotemporal",
+    "TaskMotion",
     "TrialCycles",
     "TrialMetrics",
     "angle_series",
@@ -163,6 +167,8 @@ __all__ = [
     "read_lab_trial",
     "score_gdi",
     "spatiotemporal",
+    "task_measures",
+    "task_motion",
     "trial_poses",
     "variable_scores",
     "worth_of_one_more",

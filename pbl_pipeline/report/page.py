@@ -15,6 +15,7 @@ from pbl_pipeline.gait import (
     Measure,
     NormalBands,
     NormativeSet,
+    Spatiotemporal,
     far_leg_of,
     leg_length_m,
     load_norm,
@@ -36,7 +37,7 @@ from pbl_pipeline.report.words import (
     size,
 )
 from pbl_pipeline.visit import Recording, Visit
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number, significant
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, number, significant
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
@@ -190,7 +191,7 @@ def _interval(gdi: Gdi) -> str:
 
 
 def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
-    name, unit, decimals = MEASURES[key]
+    name, unit, decimals = (MEASURES | TASKS)[key]
     if m is None:
         return {"name": name, "known": False, "reason": reason or "no reason was recorded"}
     return {
@@ -205,6 +206,10 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
         "asymmetry": number(m.asymmetry_percent, 1),
         "unit": unit,
     }
+
+
+def _task_rows(found: Spatiotemporal) -> list[dict]:
+    return [_measure_row(name, m, found.reasons.get(name, "")) for name, m in found.of_task.items()]
 
 
 def _gdi_row(gdi: Gdi) -> dict:
@@ -294,6 +299,7 @@ def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
     return {
         "name": t.name,
         "sentence": " ".join(sentence(x) for x in texts),
+        "task": [] if m is None else _task_rows(m.spatiotemporal),
         "contacts": _figures.contact_chart(t.fit, events) if t.fit is not None and events is not None else None,
         "time_charts": _figures.time_charts(t.fit, events) if t.fit is not None else [],
         "pictures": [_figures.picture(t.name, p) for p in pictures],

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.words import ANGLES, MEASURES, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, TASKS, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
@@ -45,7 +45,7 @@ class Pages:
             number=number,
             significant=significant,
             check_words=check_words,
-            measure_words=MEASURES,
+            measure_words=MEASURES | TASKS,
             angle_words=[title for title, _ in ANGLES.values()],
         )
 
