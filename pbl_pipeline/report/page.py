@@ -83,7 +83,9 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
-        page["index"] = _index(metrics.gdi, metrics.cycles)
+        shipped = _norm(visit)
+        people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
+        page["index"] = _index(metrics.gdi, metrics.cycles, people)
     return page
 
 
@@ -226,7 +228,7 @@ def _gdi_sd(gdi: Gdi) -> float | None:
     return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
-def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
+def _index(gdi: Gdi, cycles: Sequence[GaitCycle], people: str) -> dict:
     values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
     fitted = ""
     if gdi.mean is None:
@@ -252,7 +254,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
         "svg": _figures.index_chart(values, gdi.title),
         "sentence": sentence(text),
         "note": f"Each dot is one gait cycle{fitted}, the bar the mean of its side; the grey area is within one "
-        f"standard deviation of the norm. {which}",
+        f"standard deviation of {people}. {which}",
         "profile": _profile(gdi),
     }
 

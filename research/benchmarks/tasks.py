@@ -6,7 +6,8 @@
 Synthetic tasks (`pbl synth`, 33 points, errors in the picture with a memory) are fitted by the default method; the
 truth is the same measure of the true joint values. The clip is `../shared/data/real/video_mocap/STS` (README there:
 source, licence): its fit against the marker mocap of the same motion, with keypoints as
-`research.benchmarks.real_clips` finds them. It was in sight when the fractions of `gait/tasks.py` were chosen, the seeds below 100 were too.
+`research.benchmarks.real_clips` finds them. It was in sight when the fractions of
+`gait/tasks.py` were chosen, and so were the seeds below 100.
 
 Prints for each measure the number of tasks, the root mean square, the mean and the largest error. Measures that are
 missing in the fit are counted. Exit code 1 where a time is off by more than 0.1 s (rms over the synthetic tasks; on the

@@ -28,6 +28,11 @@ def as_json(request: Request) -> bool:
     return request.scope["path"].endswith(JSON)
 
 
+def reader_language(request: Request) -> str:
+    """Return the language in which a page is asked for."""
+    return texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+
+
 class Pages:
     """Renders the templates of this folder: escaped, in the reader's language, a name that is missing is an error."""
 
@@ -61,7 +66,7 @@ class Pages:
         if as_json(request):
             shown = {name: plain(value) for name, value in values.items() if not callable(value)}
             return JSONResponse(shown, status, dict(headers or {}))
-        language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+        language = reader_language(request)
         session: Session | None = getattr(request.state, "session", None)
         page = self._environment.get_template(template).render(
             t=functools.partial(texts.text, language),

@@ -25,6 +25,11 @@ def text(language: str, name: str, /, **values: Any) -> str:
     return catalogue()[name][language].format(**values)
 
 
+def library_words(language: str, english: str) -> str:
+    """Return what the library says in English in a language, as it stays where there is no such text."""
+    return catalogue().get(f"library.{english}", {}).get(language, english)
+
+
 def library(language: str, english: str) -> str:
     """What the library says in English, in the language of a page: HTML, marked as English where it stays so."""
     own = catalogue().get(f"library.{english}", {}).get(language)

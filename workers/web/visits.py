@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
@@ -10,12 +11,17 @@ from urllib.parse import urlencode
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import SIDED
 from schemas.reading import visit_list
+from schemas.reading.shown import ShownVisit
 
+from . import texts
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
-from .pages import Pages, as_json
+from .curves import curves_of, norm_people
+from .pages import Pages, as_json, reader_language
 from .plain_values import plain
 from .source import Source
 from .tables import Asks, Tables
@@ -30,11 +36,27 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))
         told = told_of(request, await asks.ask(source.progress, about.row.session_id))
         values = {"about": about, "told": told, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
         if as_json(request):  # loads arrays, which not every thread may
             values = await asks.ask(plain, values)
-        return pages.show(request, "visit.html", interval=interval, **values)
+        return pages.show(request, "visit.html", interval=interval, sided=SIDED, **values)
 
     return page("/visits/{session_id:int}", visit, "look")
+
+
+def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
+    """Return the curves of a visit, or why they cannot be shown, and of how many children the norm of its index is."""
+    try:
+        visit = about.visit
+        found = None if visit is None else curves_of(visit, functools.partial(_chart_words, language))
+    except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
+        return {"curves": None, "no_curves": error, "norm_people": None}
+    norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
+    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm)}
+
+
+def _chart_words(language: str, title: str) -> str:
+    return texts.text(language, "curves.chart", name=texts.library_words(language, title))
 
 
 def list_routes(pages: Pages, tables: Tables) -> list[Address]:
