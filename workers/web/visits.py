@@ -11,6 +11,7 @@ from urllib.parse import urlencode
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import SIDED
 from schemas.reading import visit_list
@@ -30,7 +31,7 @@ _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
 def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
-    """Return the address of a visit, which tables and folder have."""
+    """Return the addresses of a visit and of its letter for the record, which tables and folder have."""
 
     async def visit(request: Request) -> Response:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))
@@ -41,7 +42,18 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
             values = await asks.ask(plain, values)
         return pages.show(request, "visit.html", interval=interval, sided=SIDED, **values)
 
-    return page("/visits/{session_id:int}", visit, "look")
+    async def letter(request: Request) -> Response:
+        about = await asks.ask(source.visit, number_of(request), shown_of(request))
+        values = {"about": about, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
+        now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC"
+        more = {"interval": interval, "sided": SIDED, "now": now, "version": code_version()}
+        return pages.show(request, "letter.html", **values, **more)
+
+    return [
+        *page("/visits/{session_id:int}", visit, "look"),
+        Address("/visits/{session_id:int}/letter", letter, "look", look="letter"),
+    ]
 
 
 def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
