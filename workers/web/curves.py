@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 from markupsafe import Markup
@@ -21,6 +20,8 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import ANGLES
+
+from . import texts
 
 #: Angles of the first screen: those of the index of three angles, and the ankle.
 SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
@@ -50,9 +51,8 @@ class Curves:
     adults: AdultRanges
 
 
-def curves_of(visit: Visit, label: Callable[[str], str]) -> Curves | None:
-    """Return the curves of the cycles that count, None without any. `label`: the text of a chart for a screen reader,
-    by the title of its angle."""
+def curves_of(visit: Visit, language: str) -> Curves | None:
+    """Return the curves of the cycles that count, None without any."""
     if visit.measures is None:
         return None
     cycles = [c for c in visit.measures.cycles if c.used and c.curves]
@@ -70,7 +70,8 @@ def curves_of(visit: Visit, label: Callable[[str], str]) -> Curves | None:
         off = {s: [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in cycles if c.side == s] for s in SIDES}
         foot_off = {s: float(np.mean(v)) for s, v in off.items() if v}
         title, positive = ANGLES[name]
-        picture = charts.cycle_chart(label(title), percent, by_side, foot_off, band, far)
+        label = texts.text(language, "curves.chart", name=texts.library_words(language, title))
+        picture = charts.cycle_chart(label, percent, by_side, foot_off, band, far)
         means = {s: charts.mean_curve(curves) for s, curves in by_side.items() if curves}
         ranges = {s: (float(m.min()), float(m.max())) for s, m in means.items() if np.isfinite(m).all()}
         normal = None if band is None else (float(band[1].min()), float(band[1].max()))

@@ -75,6 +75,9 @@ class Pages:
             other_language=next(name for name in texts.LANGUAGES if name != language),
             session=session,
             path=request.scope["path"],
+            number=lambda *args: texts.decimals(language, number(*args)),
+            significant=lambda *args: texts.decimals(language, significant(*args)),
+            decimals=functools.partial(texts.decimals, language),
             **values,
         )
         return HTMLResponse(page, status, dict(headers or {}))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Sequence
 
 from markupsafe import Markup
@@ -34,7 +33,13 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             title = texts.library_words(language, MEASURES[found.measure][0])
         label = texts.text(language, "trend.chart", name=title, n=len(found.points))
         picture = _chart(label, found.points, found.measure == INDEX)
-        values = {"found": found, "title": title, "decimals": decimals, "picture": picture, "index": INDEX}
+        values = {
+            "found": found,
+            "title": title,
+            "decimals": decimals,
+            "picture": picture and texts.in_chart(language, picture),
+            "index": INDEX,
+        }
         return pages.show(request, "trend.html", here=number_of(request), **values)
 
     return page("/visits/{session_id:int}/trend", trend, "look", look="trend")
@@ -50,10 +55,5 @@ def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None
         (p.value, p.bounds, {s: v for s, v in (("left", p.left), ("right", p.right)) if v is not None})
         for _, p in known
     ]
-    return charts.trend_chart(
-        label, days, [_short(day) for day, _ in known], values, (90.0, 110.0) if is_index else None
-    )
-
-
-def _short(day: datetime.date) -> str:
-    return day.isoformat()
+    names = [day.isoformat() for day, _ in known]
+    return charts.trend_chart(label, days, names, values, (90.0, 110.0) if is_index else None)

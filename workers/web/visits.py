@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import functools
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
@@ -17,7 +16,6 @@ from pbl_pipeline.gait import SIDED
 from schemas.reading import visit_list
 from schemas.reading.shown import ShownVisit
 
-from . import texts
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
@@ -60,15 +58,11 @@ def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
     """Return the curves of a visit, or why they cannot be shown, and of how many children the norm of its index is."""
     try:
         visit = about.visit
-        found = None if visit is None else curves_of(visit, functools.partial(_chart_words, language))
+        found = None if visit is None else curves_of(visit, language)
     except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
         return {"curves": None, "no_curves": error, "norm_people": None}
     norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
     return {"curves": found, "no_curves": None, "norm_people": norm_people(norm)}
-
-
-def _chart_words(language: str, title: str) -> str:
-    return texts.text(language, "curves.chart", name=texts.library_words(language, title))
 
 
 def list_routes(pages: Pages, tables: Tables) -> list[Address]:
