@@ -72,7 +72,7 @@ def test_the_page_of_the_trend(visits: None):
     assert "/trend" not in browser.get("/visits/4").text  # one visit is no trend
     page = browser.get("/visits/3/trend").text
     row = re.search(r'<tr class="here">.*?</tr>', page, re.DOTALL)
-    assert row is not None
+    assert row is not None, page[-3000:]
     assert "95.0" in row[0]
     assert "90\N{EN DASH}100" in row[0]
     assert "+10.0 <b>more than chance" in " ".join(row[0].split())

@@ -68,18 +68,18 @@ class Pages:
             return JSONResponse(shown, status, dict(headers or {}))
         language = reader_language(request)
         session: Session | None = getattr(request.state, "session", None)
-        page = self._environment.get_template(template).render(
-            t=functools.partial(texts.text, language),
-            said=functools.partial(texts.library, language),
-            language=language,
-            other_language=next(name for name in texts.LANGUAGES if name != language),
-            session=session,
-            path=request.scope["path"],
-            number=lambda *args: texts.decimals(language, number(*args)),
-            significant=lambda *args: texts.decimals(language, significant(*args)),
-            decimals=functools.partial(texts.decimals, language),
-            **values,
-        )
+        own: dict[str, Any] = {
+            "t": functools.partial(texts.text, language),
+            "said": functools.partial(texts.library, language),
+            "language": language,
+            "other_language": next(name for name in texts.LANGUAGES if name != language),
+            "session": session,
+            "path": request.scope["path"],
+            "number": lambda *args: texts.decimals(language, number(*args)),
+            "significant": lambda *args: texts.decimals(language, significant(*args)),
+            "decimals": functools.partial(texts.decimals, language),
+        }
+        page = self._environment.get_template(template).render({**own, **values})
         return HTMLResponse(page, status, dict(headers or {}))
 
     def refused(self, request: Request, reason: str) -> Response:

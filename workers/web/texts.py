@@ -12,7 +12,7 @@ from markupsafe import Markup, escape
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
-_NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+(\.\d+)?(e[-+]?\d+)?")
+_NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
