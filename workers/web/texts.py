@@ -13,6 +13,8 @@ from markupsafe import Markup, escape
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
+#: Letters of a text with places of its own from which on it is taken where a place is English.
+_LEAST = 12
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
@@ -57,7 +59,7 @@ def _library_words(language: str, english: str) -> str | None:
         # A place that is neither known nor a single word may be a wrong division of the text: another pattern may fit.
         if all(" " not in v or _library_words(language, v) is not None for v in places.values()):
             return made
-        best = best or made
+        best = best or (made if len(re.sub(r"\{\w+\}", "", own)) >= _LEAST else None)
     if best is not None:
         return best
     return decimals(language, english) if _NUMBER.fullmatch(english) else None
