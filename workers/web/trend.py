@@ -47,13 +47,13 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
 def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None:
     """Return the values over the days of their visits; None where fewer than two days with a value are known."""
-    known = [(p.day, p) for p in points if p.day is not None and p.value is not None]
+    known = [(p.day, p.value, p) for p in points if p.day is not None and p.value is not None]
     if len(known) < 2:
         return None
-    days = [(day - known[0][0]).days for day, _ in known]
+    days = [(day - known[0][0]).days for day, _, _ in known]
     values = [
-        (p.value, p.bounds, {s: v for s, v in (("left", p.left), ("right", p.right)) if v is not None})
-        for _, p in known
+        (value, p.bounds, {s: v for s, v in (("left", p.left), ("right", p.right)) if v is not None})
+        for _, value, p in known
     ]
-    names = [day.isoformat() for day, _ in known]
+    names = [day.isoformat() for day, _, _ in known]
     return charts.trend_chart(label, days, names, values, (90.0, 110.0) if is_index else None)
