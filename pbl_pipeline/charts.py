@@ -330,6 +330,42 @@ def index_chart(label: str, values: Mapping[str, Sequence[float]]) -> Markup:
     return axes.svg(label)
 
 
+def trend_chart(
+    label: str,
+    days: Sequence[float],
+    names: Sequence[str],
+    values: Sequence[tuple[float, tuple[float, float] | None, Mapping[str, float]]],
+    norm: tuple[float, float] | None = None,
+) -> Markup:
+    """A value at several visits: a dot at each with its interval, small hollow ones for the sides.
+
+    days, names: of each visit, in order; a name that has no room is left out. values: the value, its interval (None:
+    not known), side -> value. norm: lowest and highest of a grey band.
+    """
+    every = [np.array([v, *(bounds or ()), *sides.values()], float) for v, bounds, sides in values]
+    ticks = nice_ticks(*_extent([*every, np.array(norm or ())], least=1e-3))
+    span = max(days[-1] - days[0], 1.0)
+    axes = Axes(
+        (460, 240), (days[0] - 0.08 * span, days[-1] + 0.08 * span), (ticks[0], ticks[-1]), margin=(44, 10, 10, 26)
+    )
+    if norm is not None:
+        axes.box(axes.left, axes.right, float(axes.y(norm[0])), float(axes.y(norm[1])), _BAND)
+    axes.grid([], ticks)
+    axes.curve(np.array(days, float), np.array([v for v, _, _ in values]), _FAINT, 1.2)
+    written = -np.inf
+    for day, name, (value, bounds, sides) in zip(days, names, values, strict=True):
+        x = float(axes.x(day))
+        if bounds is not None:
+            axes.line((x, float(axes.y(bounds[0]))), (x, float(axes.y(bounds[1]))), _INK, 1.6)
+        for side, of_side in sides.items():
+            axes.dot(x + (-6 if side == "left" else 6), float(axes.y(of_side)), SIDE_COLOUR[side], 2.6, hollow=True)
+        axes.dot(x, float(axes.y(value)), _INK, 4)
+        if x - written > 64:
+            axes.text((x, axes.bottom + 16), name, "middle")
+            written = x
+    return axes.svg(label)
+
+
 def nice_ticks(low: float, high: float, n: int = 5) -> list[float]:
     """Round numbers (steps of 1, 2 or 5 times a power of ten) that enclose low..high, about n of them."""
     span = max(high - low, 1e-9)

@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
-from pbl_pipeline.gait import DEFAULT_NORM, GaitParams, gait_metrics, load_norm
+from pbl_pipeline.gait import DEFAULT_NORM, UNKNOWN, Condition, GaitParams, gait_metrics, load_norm
 from pbl_pipeline.keypoints import METHODS as KEYPOINT_METHODS
 from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
 from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
@@ -47,6 +47,7 @@ def run_visit(
     people: Method[TrackingParams] | None = None,
     height_m: float | None = None,
     mass_kg: float | None = None,
+    activity: str | None = None,
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -56,7 +57,8 @@ def run_visit(
     `paramset` is the method of the fit; None: the one that suits the keypoints (`fit.default_fit`). `attitude_files`
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`;
-    `mass_kg`: as in `visit_kinetics`.
+    `mass_kg`: as in `visit_kinetics`. `activity`: what the person does in the videos; None: unknown, which counts
+    as walking.
 
     Raises
     ------
@@ -71,6 +73,7 @@ def run_visit(
     load_norm(norm or DEFAULT_NORM)
     check_height(height_m)
     check_mass(mass_kg)
+    condition = Condition(activity or UNKNOWN)
     logs = [(file, read_phone_log(file)) for file in attitude_files] or [None] * len(paths)
     camera_motion = camera_motion or ("handheld" if attitude_files else "static")
     problems: dict[str, PblError] = {}
@@ -87,7 +90,7 @@ def run_visit(
         inputs.append(one)
     found: list[Recording] = []
     for one, (recording, error) in zip(inputs, _side_by_side(inputs), strict=True):
-        found.append(recording)
+        found.append(dataclasses.replace(recording, condition=condition))
         if error is not None:
             problems[one.name] = error
     recordings = [r for r in found if not r.problem]

@@ -37,6 +37,22 @@ MEASURES: dict[str, tuple[str, str, int]] = {
     "step_length_m": ("Step length", "m", 2),
     "step_width_m": ("Step width", "m", 2),
 }
+#: Measures of tasks (`gait.TASK_MEASURES`): the same.
+TASKS: dict[str, tuple[str, str, int]] = {
+    "five_rises_time_s": ("Time of five rises", "s", 2),
+    "rise_count": ("Rises", "", 0),
+    "tug_time_s": ("Timed up and go", "s", 2),
+    "squat_count": ("Squats", "", 0),
+    "rise_time_s": ("Time of a rise", "s", 2),
+    "walk_out_time_s": ("Walk out", "s", 2),
+    "turn_time_s": ("Turn", "s", 2),
+    "walk_back_time_s": ("Walk back", "s", 2),
+    "turn_to_sit_time_s": ("Turn before sitting", "s", 2),
+    "sit_time_s": ("Time of sitting down", "s", 2),
+    "squat_time_s": ("Time of a squat", "s", 2),
+    "squat_knee_flexion_deg": ("Deepest knee flexion", "deg", 0),
+    "peak_trunk_lean_deg": ("Furthest lean of the trunk", "deg", 0),
+}
 
 #: Measures of forces and moments: key of kinetics.json -> name, unit, decimals.
 KINETICS: dict[str, tuple[str, str, int]] = {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
 
-from . import fit, keypoints, session, video  # noqa: F401  a definition refers to video
+from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
 from .checks import check_columns, check_row, check_values
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
@@ -345,20 +345,37 @@ class Spatiotemporal(dj.Computed):
 
     class Measure(dj.Part):
         definition = f"""
-        # every measure with both sides and its spread
+        # every measure with both sides and its spread; after those of walking those of a stated task
         {measure_columns("measure")}
         """
 
     def make_fetch(self, key: dict) -> tuple:
         name = one(fit.SessionFit.Trial & key, "trial_name")
         rows = (GaitCycle.Cycle & key).to_dicts(order_by="cycle_no")
-        return name, [{k: v for k, v in r.items() if k not in key} for r in rows]
+        activity = video.condition(key["video_id"]).activity
+        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
+        return name, [{k: v for k, v in r.items() if k not in key} for r in rows], activity, ref, fit.fit_checks(key)
 
     @computes
-    def make_compute(self, key: dict, name: str, rows: Sequence[Mapping[str, Any]]) -> tuple[lib.Spatiotemporal]:
-        from pbl_pipeline.gait import spatiotemporal
+    def make_compute(
+        self,
+        key: dict,
+        name: str,
+        rows: Sequence[Mapping[str, Any]],
+        activity: str,
+        ref: dict,
+        checks: Sequence[tuple],
+    ) -> tuple[lib.Spatiotemporal]:
+        from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
+        from pbl_pipeline.qc import Check
 
-        return (spatiotemporal([cycle_of_row(r, name) for r in rows]),)
+        found = spatiotemporal([cycle_of_row(r, name) for r in rows])
+        if activity in TASK_MEASURES:
+            with stored_file(ref) as path:
+                motion = task_motion(TrialFit.load(path))
+            found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
+        return (found,)
 
     def make_insert(self, key: dict, result: lib.Spatiotemporal, origin: Origin) -> None:
         self.insert1(

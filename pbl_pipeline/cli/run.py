@@ -49,6 +49,7 @@ from .options import (
 @click.option("--norm", help="Normative set of the GDI.")
 @HEIGHT
 @MASS
+@click.option("--activity", help="What the person does in all VIDEOS: tug, sit_to_stand, squat (else: walking).")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 def run(
     videos: tuple[Path, ...],
@@ -65,6 +66,7 @@ def run(
     norm: str | None,
     height_m: float | None,
     mass_kg: float | None,
+    activity: str | None,
     subject: str,
 ) -> None:
     """Put VIDEOS, the trials of one session, through the whole chain.
@@ -97,7 +99,19 @@ def run(
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
-        videos, out, camera, person, paramset, camera_motion, norm, attitude, method, finder, height_m, mass_kg
+        videos,
+        out,
+        camera,
+        person,
+        paramset,
+        camera_motion,
+        norm,
+        attitude,
+        method,
+        finder,
+        height_m,
+        mass_kg,
+        activity,
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

@@ -35,7 +35,8 @@ class ExportTrial:
     table is not at hand. keypoints, measured (events, cycles, measures), log (of the phone that filmed): None where
     they are not known. log_shift_s: added to the log's times it gives the video's. methods: name of a stage to the
     method that made it, in words. activity: as stated of the recording. fitted_with: version and commit of the software
-    that fitted it, where that is known. kinetics, mass_kg: its forces and the person's mass, None where they are not known.
+    that fitted it, where that is known. kinetics, mass_kg: its forces and the person's mass, None where they are not
+    known.
     """
 
     name: str

@@ -247,8 +247,7 @@ _Part = tuple[str, str, Spatiotemporal, Gdi]
 def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
     """Measure, statistic, value and, where there is none, the reason."""
     _, _, spatiotemporal, gdi = part
-    for name in MEASURES:
-        measure = spatiotemporal[name]
+    for name, measure in spatiotemporal.measures.items():
         if measure is None:
             yield name, "mean", np.nan, spatiotemporal.reasons.get(name, "")
             continue
@@ -283,7 +282,8 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
 
 def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
-    wanted = [(m, s) for m in MEASURES for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
+    names = dict.fromkeys((*MEASURES, *(m for part in parts for m in part[2].of_task)))
+    wanted = [(m, s) for m in names for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
     wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])

@@ -5,7 +5,7 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 """
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
-from ._bands import NormalBands, leg_length_m, normal_bands
+from ._bands import AdultRanges, NormalBands, adult_ranges, leg_length_m, normal_bands
 from ._camera_side import camera_side, mostly
 from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
@@ -29,7 +29,7 @@ from ._gdi import (
 from ._own_norm import norm_from_cycles
 from ._profile import MovementProfile, movement_profile, variable_scores
 from .change import IMPORTANT_CHANGE, Chances, chances, change_sd
-from .cycle_measures import MEASURES, Z90, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
+from .cycle_measures import MEASURES, SIDED, Z90, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -74,6 +74,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, task_motion
 from .types import GaitCycle, Lengths
 
 __all__ = [
@@ -100,9 +101,13 @@ __all__ = [
     "PLUG_IN_GAIT_POINTS",
     "REPORT_PERCENT",
     "SELF_SELECTED",
+    "SIDED",
+    "TASK_MEASURES",
     "THREE_ANGLES",
+    "TRIAL_MEASURES",
     "UNKNOWN",
     "Z90",
+    "AdultRanges",
     "AngleSeries",
     "BodyPoses",
     "Chances",
@@ -126,8 +131,10 @@ __all__ = [
     "NormativeSet",
     "SessionMetrics",
     "Spatiotemporal",
+    "TaskMotion",
     "TrialCycles",
     "TrialMetrics",
+    "adult_ranges",
     "angle_series",
     "apply_correction",
     "camera_side",
@@ -167,6 +174,8 @@ __all__ = [
     "read_lab_trial",
     "score_gdi",
     "spatiotemporal",
+    "task_measures",
+    "task_motion",
     "trial_poses",
     "variable_scores",
     "worth_of_one_more",

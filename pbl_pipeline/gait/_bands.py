@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
 from .cycle_measures import Spatiotemporal
 from .normative import BODY_ANGLES, GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
 
+_ADULTS = Path(__file__).parent / "normative" / "curves" / "adult_ranges.json"
 #: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat.
 _SOLE_M = 0.015
 
@@ -39,6 +44,28 @@ class NormalBands:
             "the slowest or fastest group's: the person is slower or faster" if self.clipped else f"{self.speed:.2f}"
         )
         return f"at the same speed for the length of the leg (v / sqrt(g L) = {limit}), matched by {self.matched}"
+
+
+@dataclasses.dataclass(frozen=True)
+class AdultRanges:
+    """Ranges of joint angles over the mean stride of able-bodied adults at the speed that they choose.
+
+    `range_deg`: angle -> mean and sd between people (deg); `age`: youngest and oldest of the `n` people.
+    """
+
+    n: int
+    age: tuple[int, int]
+    range_deg: Mapping[str, tuple[float, float]]
+    source: str
+    licence: str
+
+
+@functools.cache
+def adult_ranges() -> AdultRanges:
+    """Return the ranges that ship with the package (`research/adult_ranges.py` writes them)."""
+    raw = json.loads(_ADULTS.read_text(encoding="utf-8"))
+    ranges = {angle: (float(mean), float(sd)) for angle, (mean, sd) in raw["range_deg"].items()}
+    return AdultRanges(raw["n"], tuple(raw["age"]), ranges, raw["source"], raw["licence"])
 
 
 def leg_length_m(scale: np.ndarray) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -97,6 +97,9 @@ class Measure:
 class Spatiotemporal:
     """Measures by name (`MEASURES`); None where one cannot be trusted, with the reason in `reasons`.
 
+    Those of a trial of a task have its measures (`TASK_MEASURES`) after them, whatever their `status`, which is that of
+    walking.
+
     `reasons["spread"]`, where it is there, says why no measure has a spread. `n_cycles_found` and `n_cycles_used` count
     before and after the exclusions of `find_cycles`.
     """
@@ -111,6 +114,16 @@ class Spatiotemporal:
 
     def __getitem__(self, name: str) -> Measure | None:
         return self.measures.get(name)
+
+    @property
+    def of_task(self) -> dict[str, Measure | None]:
+        """The measures of a task; empty for a trial of walking and for a session."""
+        return {name: m for name, m in self.measures.items() if name not in MEASURES}
+
+    def with_task(self, measures: Mapping[str, Measure | None], reasons: Mapping[str, str]) -> Spatiotemporal:
+        """Return the same with the measures of a task (`task_measures`)."""
+        both = {**self.measures, **measures}, {**self.reasons, **reasons}
+        return dataclasses.replace(self, measures=both[0], reasons=both[1])
 
 
 def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:

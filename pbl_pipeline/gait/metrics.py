@@ -36,6 +36,7 @@ from .laboratory import LabTrial
 from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
+from .tasks import TASK_MEASURES, task_measures, task_motion
 from .types import GaitCycle
 
 if TYPE_CHECKING:
@@ -154,6 +155,11 @@ class GaitMetrics(SessionMetrics):
                 error = "" if m.error_sd is None else _cell(Z90 * m.error_sd)
                 row = f"{name:<24}{_cell(m.left)}{_cell(m.right)}{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}{error}"
                 lines.append(row)
+        for trial in self.trials:
+            for name, m in trial.spatiotemporal.of_task.items():
+                reason = trial.spatiotemporal.reasons.get(name, "")
+                cells = f"{'-':>9}{'-':>8}{'-':>5}" if m is None else f"{_cell(m.mean)}{_cell(m.sd, 8)}{m.n:>5}"
+                lines.append(f"{name:<24}{'':>18}{cells}  {reason or trial.name}")
         g = self.gdi
         lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
         if g.interval is not None:
@@ -201,7 +207,7 @@ def gait_metrics(
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
     given = [Condition()] * len(trials) if conditions is None else conditions
     done = tuple(
-        dataclasses.replace(_trial(t, params.events, index, fit_checks), pooled=c.pooled(params.gdi.pace))
+        dataclasses.replace(_trial(t, params.events, index, fit_checks, c), pooled=c.pooled(params.gdi.pace))
         for t, c in zip(trials, given, strict=True)
     )
     return GaitMetrics(**vars(pool_trials(done, basis, params, model, version, given)), trials=done)
@@ -275,15 +281,22 @@ def with_errors(measures: Spatiotemporal, cycles: Sequence[GaitCycle], events: P
 
 
 def _trial(
-    trial: TrialFit | LabTrial, event_method: Paramset, index: dict[str, Any], fit_checks: Sequence[Check]
+    trial: TrialFit | LabTrial,
+    event_method: Paramset,
+    index: dict[str, Any],
+    fit_checks: Sequence[Check],
+    condition: Condition,
 ) -> TrialMetrics:
+    task: tuple[dict[str, Any], dict[str, str]] = {}, {}
     if isinstance(trial, LabTrial):
         events = trial.events
         cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
     else:
         poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
-    measures, gdi = spatiotemporal(cycles), score_gdi(cycles, **index)
+        if condition.activity in TASK_MEASURES:
+            task = task_measures(task_motion(trial, poses), condition.activity, fit_checks)
+    measures, gdi = spatiotemporal(cycles).with_task(*task), score_gdi(cycles, **index)
     reason = events.reason or measures.reason
     return TrialMetrics(
         name=trial.name,
@@ -412,7 +425,7 @@ def _measures(part: TrialMetrics | GaitMetrics) -> dict:
     reasons = dict(values.reasons)
     if part.gdi.mean is None:
         reasons["gdi"] = part.gdi.reason
-    table = {name: None if (m := values[name]) is None else m.to_dict() for name in MEASURES}
+    table = {name: None if m is None else m.to_dict() for name, m in values.measures.items()}
     return {
         "status": part.status,
         "reason": part.reason,

@@ -15,6 +15,7 @@ from .curves_file import Curves
 from .cycle_measures import MEASURES, Measure, Spatiotemporal
 from .events import GaitEvent, GaitEvents
 from .metrics import GaitMetrics, TrialMetrics
+from .tasks import TRIAL_MEASURES
 
 #: Checks of the index among the checks of a trial or session; the others are of its measures.
 INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
@@ -108,7 +109,8 @@ def _cycle(content: Mapping[str, Any], trial: str, curves: Mapping[int, Curves])
 
 
 def _spatiotemporal(content: Mapping[str, Any], n_steps: int = 0) -> Spatiotemporal:
-    measures = {n: None if content[n] is None else structured(content[n], Measure) for n in MEASURES if n in content}
+    known = (n for n in TRIAL_MEASURES if n in content)
+    measures = {n: None if content[n] is None else structured(content[n], Measure) for n in known}
     counts, used = content["cycles"], bool(content["cycles"]["used"])
     reasons = {n: str(r) for n, r in content["reasons"].items() if n != "gdi"}
     return Spatiotemporal(

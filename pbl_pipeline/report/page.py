@@ -16,6 +16,7 @@ from pbl_pipeline.gait import (
     Measure,
     NormalBands,
     NormativeSet,
+    Spatiotemporal,
     far_leg_of,
     leg_length_m,
     load_norm,
@@ -38,7 +39,7 @@ from pbl_pipeline.report.words import (
     size,
 )
 from pbl_pipeline.visit import Recording, Visit
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number, significant
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, number, significant
 
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
@@ -84,7 +85,9 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
-        page["index"] = _index(metrics.gdi, metrics.cycles)
+        shipped = _norm(visit)
+        people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
+        page["index"] = _index(metrics.gdi, metrics.cycles, people)
         page["forces"] = forces_section(visit)
     return page
 
@@ -193,7 +196,7 @@ def _interval(gdi: Gdi) -> str:
 
 
 def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
-    name, unit, decimals = MEASURES[key]
+    name, unit, decimals = (MEASURES | TASKS)[key]
     if m is None:
         return {"name": name, "known": False, "reason": reason or "no reason was recorded"}
     return {
@@ -216,6 +219,10 @@ def _error(sd: float | None, decimals: int) -> str:
     return "" if sd is None else f"\N{PLUS-MINUS SIGN}{number(Z90 * sd, decimals)}"
 
 
+def _task_rows(found: Spatiotemporal) -> list[dict]:
+    return [_measure_row(name, m, found.reasons.get(name, "")) for name, m in found.of_task.items()]
+
+
 def _gdi_row(gdi: Gdi) -> dict:
     if gdi.mean is None:
         return {"name": gdi.title, "known": False, "reason": gdi.reason}
@@ -236,7 +243,7 @@ def _gdi_sd(gdi: Gdi) -> float | None:
     return float(np.std(values, ddof=1)) if len(values) > 1 else None
 
 
-def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
+def _index(gdi: Gdi, cycles: Sequence[GaitCycle], people: str) -> dict:
     values = {side: [c.gdi for c in gdi.cycles if c.side == side] for side in ("left", "right")}
     fitted = ""
     if gdi.mean is None:
@@ -262,7 +269,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle]) -> dict:
         "svg": _figures.index_chart(values, gdi.title),
         "sentence": sentence(text),
         "note": f"Each dot is one gait cycle{fitted}, the bar the mean of its side; the grey area is within one "
-        f"standard deviation of the norm. {which}",
+        f"standard deviation of {people}. {which}",
         "profile": _profile(gdi),
     }
 
@@ -309,6 +316,7 @@ def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
     return {
         "name": t.name,
         "sentence": " ".join(sentence(x) for x in texts),
+        "task": [] if m is None else _task_rows(m.spatiotemporal),
         "contacts": _figures.contact_chart(t.fit, events) if t.fit is not None and events is not None else None,
         "time_charts": _figures.time_charts(t.fit, events) if t.fit is not None else [],
         "pictures": [_figures.picture(t.name, p) for p in pictures],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .. import fit, gdi, video
+from .. import fit, gait, gdi, video
 from ..rows import counted, delete_below
 
 
@@ -11,7 +11,8 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     returns what changed, in words.
 
     Where a session's measures pool the video now and did not before, or the other way round, they are deleted, so that
-    the next populate computes them anew. Call it inside a transaction.
+    the next populate computes them anew; likewise the measures of a video that is or was one of a task. Call it inside
+    a transaction.
 
     Raises
     ------
@@ -23,7 +24,7 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
 
 
 def _set_condition(video_id: int, activity: str | None, pace: str | None) -> list[str]:
-    from pbl_pipeline.gait import Condition
+    from pbl_pipeline.gait import TASK_MEASURES, Condition
 
     key = {"video_id": video_id}
     before = video.conditions(key).get(video_id)
@@ -37,6 +38,10 @@ def _set_condition(video_id: int, activity: str | None, pace: str | None) -> lis
     if after.pace != before.pace:
         video.Pace.insert1({**key, "pace": after.pace}, replace=True)
         changes.append(f"pace is {after.pace} now")
+    of_task = after.activity != before.activity and not {before.activity, after.activity}.isdisjoint(TASK_MEASURES)
+    made = (gait.Spatiotemporal & key).keys() if of_task else []
+    if rows := counted(delete_below(gait.Spatiotemporal, made)):
+        changes.append(f"measures of the task were deleted: {rows}")
     if after.pool != before.pool:
         sets = fit.FitSet & (fit.FitSet.Video & key).proj()
         if rows := counted(delete_below(gdi.SessionGdi, (gdi.SessionGdi & sets).keys())):

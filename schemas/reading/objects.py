@@ -241,7 +241,7 @@ def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> lib.Spatiot
 
     by_name = {row[prefix]: row for row in rows}
     measures, reasons = {}, {}
-    for name in (*lib.MEASURES, *sorted(set(by_name) - set(lib.MEASURES))):
+    for name in (*lib.TRIAL_MEASURES, *sorted(set(by_name) - set(lib.TRIAL_MEASURES))):
         if name not in by_name:
             continue
         row = by_name[name]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
@@ -44,6 +44,9 @@ class ShownVisit:
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
     measures: Mapping[str, tuple[Measure | None, str]] = dataclasses.field(default_factory=dict)  # or why not known
+    tasks: Mapping[str, Mapping[str, tuple[Measure | None, str]]] = dataclasses.field(
+        default_factory=dict
+    )  # by recording
     checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
     lacks: tuple[str, ...] = ()  # what its files lack
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person
@@ -131,6 +134,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
         shown=shown,
         key=key,
         measures=_measures_of(key),
+        tasks=_tasks_of(key, recordings),
         checks=_checks_of(key),
         computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")),
     )
@@ -216,6 +220,21 @@ def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]
         for n in MEASURES
         if n in rows
     }
+
+
+def _tasks_of(
+    key: Mapping[str, Any], recordings: Sequence[Recording]
+) -> dict[str, dict[str, tuple[Measure | None, str]]]:
+    """Return the measures of tasks of a result by the recording's name, as `_measures_of`."""
+    from pbl_pipeline.words import TASKS
+
+    of_result = {k: v for k, v in key.items() if k in gait.GaitEvents.primary_key}
+    rows = (gait.Spatiotemporal.Measure & of_result & [{"measure": n} for n in TASKS]).to_dicts()
+    found = {(int(r["video_id"]), r["measure"]): r for r in rows}
+    values = {k: (gait.measure_of_row(r, "measure"), str(r["measure_missing"])) for k, r in found.items()}
+    named = [(r.name, r.number) for r in recordings if r.number is not None]
+    of_task = {name: {n: values[v, n] for n in TASKS if (v, n) in values} for name, v in named}
+    return {name: measures for name, measures in of_task.items() if measures}
 
 
 def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:

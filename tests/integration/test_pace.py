@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import GDI_METHODS
+from pbl_pipeline.gait import GDI_METHODS, TASK_MEASURES
 from pbl_pipeline.paramset import Paramset
 from schemas import fit, gait, gdi, load_visit, norms, session, video
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.intake.conditions import set_condition
 from schemas.method_rows import insert_methods
 from schemas.reading import frames
+from schemas.reading.shown import shown_visit
 from tests.command import pbl
 from tests.rows import register
 from workers.populate import populate
@@ -148,3 +149,27 @@ def test_a_pattern_that_cannot_be_read(tables: None, tmp_path: Path, more: list[
     assert done.code == code
     assert said in done.err
     assert not len(video.Video())
+
+
+def test_a_task_has_its_measures_as_rows_and_a_changed_activity_computes_them_anew(tables: None, tmp_path: Path):
+    path = chain.small_video(tmp_path, "chair")
+    assert pbl("ingest", path, "--subject", "P001", "--activity", "Sit-to-stand").code == 0
+    populate()
+    number = int(video.Video().fetch1("video_id"))
+    rows = {r["measure"]: r for r in gait.Spatiotemporal.Measure().to_dicts()}
+    # The person of this video walks: the rises are counted, and there are none.
+    assert rows["rise_count"]["measure_mean"] == 0.0
+    assert rows["five_rises_time_s"]["measure_mean"] is None
+    assert rows["five_rises_time_s"]["measure_missing"] == "five rises are needed, 0 were found"
+    shown = load_visit({"subject": "P001"})
+    assert shown.measures is not None
+    assert list(shown.measures.trials[0].spatiotemporal.of_task) == list(TASK_MEASURES["sit_to_stand"])
+    (of_task,) = shown_visit(int(session.Session().fetch1("session_id"))).tasks.values()
+    assert list(of_task) == list(TASK_MEASURES["sit_to_stand"])
+    changes = set_condition(number, activity="squat")
+    assert any(change.startswith("measures of the task were deleted: ") for change in changes)
+    assert not len(gait.Spatiotemporal())
+    populate()
+    names = set(gait.Spatiotemporal.Measure().to_arrays("measure"))
+    assert set(TASK_MEASURES["squat"]) <= names
+    assert "rise_count" not in names

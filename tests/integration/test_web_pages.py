@@ -132,5 +132,5 @@ def test_german_fits_on_a_phone(chromium: Any, visits: None):
         for kind in PAGES:
             go(page, kind)
             found[kind] = page.evaluate(LAYOUT)
-        assert page.get_by_role("link", name="Begutachtung").count()
+        assert page.get_by_role("link", name="Ganganalyse").count()
     assert not any(found.values()), {kind: bad for kind, bad in found.items() if bad}

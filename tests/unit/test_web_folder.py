@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
-from pbl_pipeline.visit import save_beside
+from pbl_pipeline.visit import load_visit, save_beside
 from tests.exported import with_markers
 from tests.walking_fit import walking_fit
 from workers.web import Options, ResultsFolder, Where, create_app, serve
@@ -86,6 +86,30 @@ def test_a_folder_is_found_looked_at_and_taken_along(results):
     assert (part.status_code, part.content) == (206, b"234")
     files = zipfile.ZipFile(io.BytesIO(browser.get("/visits/1/export").content)).namelist()
     assert any(name.endswith(".mot") for name in files)
+
+
+def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(results):
+    browser = browser_of(ResultsFolder(results))
+    page = " ".join(browser.get("/visits/1").text.split())
+    assert "compares with 166 typically developing children" in page
+    assert page.count('<svg viewBox="0 0 280 200"') == 4
+    assert "138 able-bodied adults (21 to 86 years)" in page
+    shown = browser.get("/visits/1.json").json()["curves"]
+    metrics = load_visit(results / "2026-01-10").measures
+    assert metrics is not None
+    for angle in shown["angles"]:
+        for side, (low, high) in angle["ranges"].items():
+            curves = [c.curves[angle["name"]] for c in metrics.cycles if c.used and c.side == side]
+            mean = np.mean(curves, axis=0)
+            assert (low, high) == pytest.approx((mean.min(), mean.max())), (angle["name"], side)
+            assert f"{high - low:.0f}" in page
+    far = next(c.far_leg for c in metrics.cycles if c.used)
+    assert shown["far"] == far == "right"  # walks from right to left: the camera saw the left side
+    assert "The right leg was behind the left one" in page
+    row = re.search(r"Step time.*?</tr>", page)
+    assert row is not None
+    assert row[0].count("*</td>") == 2  # both sides of a measure of one leg are marked
+    assert "*" not in re.findall(r"Cadence.*?</tr>", page)[0]
 
 
 def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):

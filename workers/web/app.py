@@ -37,6 +37,7 @@ from . import (
     reports,
     sign_in,
     texts,
+    trend,
     visits,
 )
 from .accounts import Accounts, Attempts
@@ -139,6 +140,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),
+            *trend.routes(pages, tables),
         ]
     parts += [
         *visits.routes(pages, asks, source),

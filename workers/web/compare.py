@@ -19,8 +19,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
+from . import texts
 from .address import Address, interval, page, whole_number
-from .pages import Pages, as_json
+from .pages import Pages, as_json, reader_language
 from .plain_values import plain
 from .tables import Tables
 from .videos import Videos
@@ -65,7 +66,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             keys=[charts.series_key(i) for i in range(len(names))],
             measures=[n for n in MEASURES if any(n in c.about.measures for c in found.compared)],
             of_cycles=[n for n in MEASURES if any(_interval(c, n) is not None for c in found.compared)],
-            charts=charts_of(found, names),
+            charts=charts_of(found, names, reader_language(request)),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
             videos=shown,
@@ -81,7 +82,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
     return page("/compare", show, "look")
 
 
-def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]:
+def charts_of(found: comparison.Comparison, names: Sequence[str], language: str = "en") -> list[Chart]:
     """Every angle of which any result has curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
@@ -99,10 +100,12 @@ def charts_of(found: comparison.Comparison, names: Sequence[str]) -> list[Chart]
             means = []
             for i, (name, c) in enumerate(zip(names, curves, strict=True)):
                 if c is not None:
-                    uncertain = " (less certain, the leg behind the other)" if i in far[side] else ""
+                    uncertain = f" ({texts.text(language, 'compare.uncertain')})" if i in far[side] else ""
                     low, high = number(float(c[0].min()), 0), number(float(c[0].max()), 0)
-                    means.append(f"{name} {low} to {high}\N{DEGREE SIGN}{uncertain}")
-            label = f"{title}, {side} leg, in degrees over the gait cycle in percent. Mean curves: {'; '.join(means)}."
+                    bounds = texts.text(language, "entry.range", low=low, high=high)
+                    means.append(f"{name} {bounds}\N{DEGREE SIGN}{uncertain}")
+            of_chart = {"name": texts.library_words(language, title), "side": texts.text(language, f"visit.{side}")}
+            label = texts.text(language, "compare.chart", **of_chart, means="; ".join(means))
             sides[side] = charts.compare_chart(
                 label, first["percent"].to_numpy(float), curves, _norm(of_reference), found.reference, far[side]
             )

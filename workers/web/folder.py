@@ -96,6 +96,7 @@ class ResultsFolder:
             recordings=visit.recordings,
             load_visit=Held(visit),
             measures=_measures(visit),
+            tasks=_tasks(visit),
             lacks=visit.lacks,
             results=() if row.result is None else (dataclasses.replace(row.result, filming=visit.filming),),
             shown=None if row.result is None else 0,
@@ -286,6 +287,14 @@ def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:
         return {}
     found = visit.measures.spatiotemporal
     return {n: (found[n], found.reasons.get(n, "")) for n in MEASURES if n in found.measures or n in found.reasons}
+
+
+def _tasks(visit: Visit) -> dict[str, dict[str, tuple[Measure | None, str]]]:
+    """Return the measures of tasks by the recording's name, as `_measures`."""
+    found = {r.name: r.measured.spatiotemporal for r in visit.recordings if r.measured is not None}
+    return {
+        name: {n: (m, s.reasons.get(n, "")) for n, m in s.of_task.items()} for name, s in found.items() if s.of_task
+    }
 
 
 def _subject(visit: Visit) -> str:

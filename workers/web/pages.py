@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.words import ANGLES, MEASURES, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, TASKS, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
@@ -26,6 +26,11 @@ _REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413
 def as_json(request: Request) -> bool:
     """Return whether the page is asked for as JSON."""
     return request.scope["path"].endswith(JSON)
+
+
+def reader_language(request: Request) -> str:
+    """Return the language in which a page is asked for."""
+    return texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
 
 
 class Pages:
@@ -45,7 +50,7 @@ class Pages:
             number=number,
             significant=significant,
             check_words=check_words,
-            measure_words=MEASURES,
+            measure_words=MEASURES | TASKS,
             angle_words=[title for title, _ in ANGLES.values()],
         )
 
@@ -61,17 +66,20 @@ class Pages:
         if as_json(request):
             shown = {name: plain(value) for name, value in values.items() if not callable(value)}
             return JSONResponse(shown, status, dict(headers or {}))
-        language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+        language = reader_language(request)
         session: Session | None = getattr(request.state, "session", None)
-        page = self._environment.get_template(template).render(
-            t=functools.partial(texts.text, language),
-            said=functools.partial(texts.library, language),
-            language=language,
-            other_language=next(name for name in texts.LANGUAGES if name != language),
-            session=session,
-            path=request.scope["path"],
-            **values,
-        )
+        own: dict[str, Any] = {
+            "t": functools.partial(texts.text, language),
+            "said": functools.partial(texts.library, language),
+            "language": language,
+            "other_language": next(name for name in texts.LANGUAGES if name != language),
+            "session": session,
+            "path": request.scope["path"],
+            "number": lambda *args: texts.decimals(language, number(*args)),
+            "significant": lambda *args: texts.decimals(language, significant(*args)),
+            "decimals": functools.partial(texts.decimals, language),
+        }
+        page = self._environment.get_template(template).render({**own, **values})
         return HTMLResponse(page, status, dict(headers or {}))
 
     def refused(self, request: Request, reason: str) -> Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,12 @@ from markupsafe import Markup, escape
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
+_NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
+#: Letters of a text with places of its own from which on it is taken where a place is English.
+_LEAST = 12
+#: Text between two marks of a chart.
+_TEXT = re.compile(r">[^<]+<")
+_POINT = re.compile(r"(?<=\d)\.(?=\d)")
 
 
 @functools.cache
@@ -25,11 +32,63 @@ def text(language: str, name: str, /, **values: Any) -> str:
     return catalogue()[name][language].format(**values)
 
 
+def library_words(language: str, english: str) -> str:
+    """Return what the library says in English in a language, as it stays where there is no such text."""
+    found = _library_words(language, english)
+    return english if found is None else found
+
+
+@functools.lru_cache(4096)
+def _library_words(language: str, english: str) -> str | None:
+    if language == "en":
+        return english
+    own = catalogue().get(f"library.{english}", {}).get(language)
+    if own is not None:
+        return own
+    for joint in (": ", "; "):
+        for at in (m.start() for m in re.finditer(joint, english)):
+            parts = _library_words(language, english[:at]), _library_words(language, english[at + len(joint) :])
+            if parts[0] is not None and parts[1] is not None:
+                return joint.join(p for p in parts if p is not None)
+    best = None
+    for pattern, own in _patterns(language):
+        if (match := pattern.fullmatch(english)) is None:
+            continue
+        places = match.groupdict()
+        made = own.format(**{k: library_words(language, v) for k, v in places.items()})
+        # A place that is neither known nor a single word may be a wrong division of the text: another pattern may fit.
+        if all(" " not in v or _library_words(language, v) is not None for v in places.values()):
+            return made
+        best = best or (made if len(re.sub(r"\{\w+\}", "", own)) >= _LEAST else None)
+    if best is not None:
+        return best
+    return decimals(language, english) if _NUMBER.fullmatch(english) else None
+
+
+@functools.cache
+def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
+    """The library's texts with places, those with most words of their own first."""
+    names = (n.removeprefix("library.") for n in catalogue() if n.startswith("library.") and "{" in n)
+    of_words = sorted(names, key=lambda n: -len(re.sub(r"\{\w+\}", "", n)))
+    made = [(re.sub(r"\\\{(\w+)\\\}", r"(?P<\1>.+?)", re.escape(n)), n) for n in of_words]
+    return tuple((re.compile(p, re.DOTALL), catalogue()[f"library.{n}"][language]) for p, n in made)
+
+
+def decimals(language: str, text: str) -> str:
+    """Return a text with its decimal points as the language has them."""
+    return _POINT.sub(",", text) if language == "de" else text
+
+
+def in_chart(language: str, chart: Markup) -> Markup:
+    """Return a chart whose numbers have the decimals of a language."""
+    return Markup(_TEXT.sub(lambda m: decimals(language, m[0]), chart))  # noqa: S704  it was escaped when it was drawn
+
+
 def library(language: str, english: str) -> str:
     """What the library says in English, in the language of a page: HTML, marked as English where it stays so."""
-    own = catalogue().get(f"library.{english}", {}).get(language)
-    if own is not None or language == "en":
-        return escape(own or english)
+    own = _library_words(language, english)
+    if own is not None:
+        return escape(own)
     return Markup('<span lang="en">{}</span>').format(english)
 
 

@@ -10,12 +10,17 @@ from urllib.parse import urlencode
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import SIDED
 from schemas.reading import visit_list
+from schemas.reading.shown import ShownVisit
 
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
-from .pages import Pages, as_json
+from .curves import curves_of, norm_people
+from .pages import Pages, as_json, reader_language
 from .plain_values import plain
 from .source import Source
 from .tables import Asks, Tables
@@ -24,17 +29,40 @@ _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
 def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
-    """Return the address of a visit, which tables and folder have."""
+    """Return the addresses of a visit and of its letter for the record, which tables and folder have."""
 
     async def visit(request: Request) -> Response:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))
         told = told_of(request, await asks.ask(source.progress, about.row.session_id))
         values = {"about": about, "told": told, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
         if as_json(request):  # loads arrays, which not every thread may
             values = await asks.ask(plain, values)
-        return pages.show(request, "visit.html", interval=interval, **values)
+        return pages.show(request, "visit.html", interval=interval, sided=SIDED, **values)
 
-    return page("/visits/{session_id:int}", visit, "look")
+    async def letter(request: Request) -> Response:
+        about = await asks.ask(source.visit, number_of(request), shown_of(request))
+        values = {"about": about, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
+        now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC"
+        more = {"interval": interval, "sided": SIDED, "now": now, "version": code_version()}
+        return pages.show(request, "letter.html", **values, **more)
+
+    return [
+        *page("/visits/{session_id:int}", visit, "look"),
+        Address("/visits/{session_id:int}/letter", letter, "look", look="letter"),
+    ]
+
+
+def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
+    """Return the curves of a visit, or why they cannot be shown, and of how many children the norm of its index is."""
+    try:
+        visit = about.visit
+        found = None if visit is None else curves_of(visit, language)
+    except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
+        return {"curves": None, "no_curves": error, "norm_people": None}
+    norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
+    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm)}
 
 
 def list_routes(pages: Pages, tables: Tables) -> list[Address]:

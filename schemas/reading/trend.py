@@ -1,0 +1,124 @@
+"""All visits of a person in time: the index or a measure of each, with its interval and its changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections import Counter
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import Difference
+from pbl_pipeline.words import MEASURES
+
+from .. import session
+from .shown import shown_visit
+from .visit_list import Change, Result, change_since, not_alike, results_of, visits_of
+
+#: Name of the index among the measures.
+INDEX = "gdi"
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """The value of a visit.
+
+    value: None where it is not known, for the reason. bounds: its 90 % interval; of a measure that of the spread of its
+    cycles alone. before: the change since the visit before with a value; first: since the first one.
+    """
+
+    session_id: int
+    label: str
+    day: datetime.date | None
+    role: str
+    value: float | None
+    bounds: tuple[float, float] | None
+    left: float | None
+    right: float | None
+    reason: str
+    before: Change | None = None
+    first: Change | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Trend:
+    """The visits of a person, the earliest first, by the chain of methods that most of them have.
+
+    measure: the one that is shown; measures: all that can be; left_out: labels of the visits without a result of this
+    chain.
+    """
+
+    subject: str
+    measure: str
+    measures: tuple[str, ...]
+    methods: tuple[str, ...]
+    points: tuple[Point, ...]
+    left_out: tuple[str, ...]
+
+
+def trend_of(session_id: int, measure: str = INDEX) -> Trend:
+    """Return all visits of the person of a visit.
+
+    Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an unknown measure.
+    """
+    subjects = (session.Session & {"session_id": session_id}).to_arrays("subject")
+    if not len(subjects):
+        raise session.unknown_visit(session_id)
+    known = (INDEX, *MEASURES)
+    if measure not in known:
+        raise PblError(
+            "USAGE",
+            found=f"the measure {measure[:40]!r}",
+            expected=f"one of {', '.join(known)}",
+            next_step="choose one on the page",
+        )
+    rows = sorted(visits_of(str(subjects[0])), key=lambda v: (v.day or datetime.date.min, v.session_id))
+    results = results_of(v.session_id for v in rows)
+    chains = Counter((r.kind, r.methods) for found in results.values() for r in found)
+    usual = max(chains, key=lambda chain: chains[chain], default=None)
+    points: list[Point] = []
+    with_value: list[tuple[Point, Result]] = []
+    left_out: list[str] = []
+    for v in rows:
+        at = next((i for i, r in enumerate(results[v.session_id]) if (r.kind, r.methods) == usual), None)
+        if at is None:
+            left_out.append(v.label)
+            continue
+        result = results[v.session_id][at]
+        named = {"session_id": v.session_id, "label": v.label, "day": v.day, "role": v.role}
+        point = Point(**named, **_value(v.session_id, at, result, measure))
+        if point.value is not None:
+            if with_value:
+                since = [_change(measure, point, result, *earlier) for earlier in (with_value[-1], with_value[0])]
+                point = dataclasses.replace(point, before=since[0], first=since[1])
+            with_value.append((point, result))
+        points.append(point)
+    methods = () if usual is None else (usual[0], *usual[1])
+    return Trend(str(subjects[0]), measure, known, methods, tuple(points), tuple(left_out))
+
+
+def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
+    """Return value, interval, sides and reason of a result of a visit."""
+    from pbl_pipeline.gait import interval_90
+
+    if measure == INDEX:
+        bounds = interval_90(result.index, result.sd)
+        return {"value": result.index, "bounds": bounds, "left": None, "right": None, "reason": result.reason}
+    found, reason = shown_visit(session_id, at).measures.get(measure, (None, ""))
+    if found is None:
+        return {"value": None, "bounds": None, "left": None, "right": None, "reason": reason}
+    return {
+        "value": found.mean,
+        "bounds": found.interval,
+        "left": found.left,
+        "right": found.right,
+        "reason": "",
+    }
+
+
+def _change(measure: str, point: Point, result: Result, earlier: Point, before: Result) -> Change | None:
+    """Return the change of a value; of a measure the whole error is not known, so it has no verdict."""
+    if measure == INDEX:
+        return change_since(result, before)
+    assert point.value is not None
+    assert earlier.value is not None
+    return Change(point.value - earlier.value, None, None, (*not_alike(result, before), Difference("error")))

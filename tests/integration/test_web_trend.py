@@ -1,0 +1,101 @@
+"""All visits of a person in time, and the letter of a visit, in the review page."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.filming import Difference
+from schemas import gdi
+from schemas.reading import comparison
+from schemas.reading.trend import trend_of
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.rows import register
+from workers.populate import populate
+
+INDICES = {1: 80.0, 2: 85.0, 3: 95.0}
+
+
+@pytest.fixture(scope="module")
+def visits(module_tables: Path) -> None:
+    """Visits 1 to 3 of P001 with indices of an sd of 3 and a minimal change of 6, 4 of P002, and 5 of P001 that is not
+    computed."""
+    days = (("P001", "2026-01-10"), ("P001", "2026-04-10"), ("P001", "2026-07-10"), ("P002", "2026-02-01"))
+    for subject, day in days:
+        register(small_video(module_tables, f"walk {day}"), subject=subject, session_label=day)
+    populate()
+    register(small_video(module_tables, "later"), session_label="2026-09-10")
+    for number, index in INDICES.items():
+        key = comparison.shown_visit(number).key
+        row = {k: key[k] for k in gdi.SessionGdi.primary_key}
+        gdi.SessionGdi.update1({**row, "session_gdi": index, "session_gdi_sd": 3.0, "session_gdi_minimal_change": 6.0})
+
+
+def test_the_index_of_all_visits_with_what_is_more_than_chance(visits: None):
+    found = trend_of(2)
+    assert found == trend_of(1) == trend_of(5)
+    assert (found.subject, [p.session_id for p in found.points]) == ("P001", [1, 2, 3])
+    assert found.left_out == ("2026-09-10",)
+    first, second, third = found.points
+    assert [p.value for p in found.points] == list(INDICES.values())
+    assert first.bounds == pytest.approx((80 - 1.645 * 3, 80 + 1.645 * 3), abs=0.01)
+    assert (first.before, first.first) == (None, None)
+    assert second.before is not None
+    assert (second.before.by, second.before.sure) == (5.0, False)
+    assert third.before is not None
+    assert third.first is not None
+    assert (third.before.by, third.before.sure, third.first.by, third.first.sure) == (10.0, True, 15.0, True)
+
+
+def test_a_measure_has_its_spread_and_no_verdict(visits: None):
+    found = trend_of(1, "stride_time_s")
+    about = comparison.shown_visit(2).measures["stride_time_s"][0]
+    assert about is not None
+    second = found.points[1]
+    assert (second.value, second.bounds) == (about.mean, about.interval)
+    assert (second.left, second.right) == (about.left, about.right)
+    assert second.before is not None
+    assert second.before.sure is None
+    assert Difference("error") in second.before.differs
+    for wrong, code in ((("nothing",), "USAGE"), ((), "DB_NOT_FOUND")):
+        with pytest.raises(PblError, match=code):
+            trend_of(1 if wrong else 99, *wrong)
+
+
+def test_the_page_of_the_trend(visits: None):
+    browser = web.client()
+    assert 'href="/visits/1/trend"' in browser.get("/visits/1").text
+    assert "/trend" not in browser.get("/visits/4").text  # one visit is no trend
+    page = browser.get("/visits/3/trend").text
+    row = re.search(r'<tr class="here">.*?</tr>', page, re.DOTALL)
+    assert row is not None, page[-3000:]
+    assert "95.0" in row[0]
+    assert "90\N{EN DASH}100" in row[0]
+    assert "+10.0 <b>more than chance" in " ".join(row[0].split())
+    assert page.count("<circle") == 3
+    side = browser.get("/visits/3/trend?measure=step_time_s").text
+    assert side.count("<circle") == 9  # left and right beside each
+    assert "cannot be judged" in side
+    assert browser.get("/visits/3/trend?measure=%3Cb%3E").status_code == 400
+    assert browser.get("/visits/99/trend").status_code == 404
+    told = browser.get("/visits/3/trend.json?measure=gdi").json()["found"]
+    assert [p["value"] for p in told["points"]] == list(INDICES.values())
+    assert told["points"][2]["before"]["sure"] is True
+
+
+def test_the_letter_is_one_visit_on_a_page(visits: None):
+    browser = web.client()
+    page = " ".join(browser.get("/visits/3/letter?result=0").text.split())
+    assert "Person: <b>P001</b>. Visit: <b>2026-07-10</b>" in page
+    assert '<span class="big">95.0</span>' in page
+    assert "+10.0 since 2026-04-10: more than chance" in page
+    assert "Stride time" in page
+    assert "Made on" in page
+    assert "R. Viewer" in page
+    assert page.count('<svg viewBox="0 0 280 200"') == 4
+    assert "<form method" not in page.split("<main")[1]  # nothing to decide on paper
+    assert "no measures yet" in browser.get("/visits/5/letter").text

@@ -1,0 +1,59 @@
+"""All visits of a person in time, and the letter of one visit for the record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from markupsafe import Markup
+from starlette.requests import Request
+from starlette.responses import Response
+
+from pbl_pipeline import charts
+from pbl_pipeline.words import MEASURES
+from schemas.reading.trend import INDEX, Point, trend_of
+
+from . import texts
+from .address import Address, number_of, page
+from .pages import Pages, as_json, reader_language
+from .plain_values import plain
+from .tables import Tables
+
+
+def routes(pages: Pages, tables: Tables) -> list[Address]:
+    """Return the address of this part."""
+
+    async def trend(request: Request) -> Response:
+        found = await tables.ask(trend_of, number_of(request), request.query_params.get("measure", INDEX))
+        if as_json(request):
+            return pages.show(request, "", found=plain(found))
+        language = reader_language(request)
+        decimals = 1 if found.measure == INDEX else MEASURES[found.measure][2]
+        title = texts.text(language, "visit.gdi")
+        if found.measure != INDEX:
+            title = texts.library_words(language, MEASURES[found.measure][0])
+        label = texts.text(language, "trend.chart", name=title, n=len(found.points))
+        picture = _chart(label, found.points, found.measure == INDEX)
+        values = {
+            "found": found,
+            "title": title,
+            "decimals": decimals,
+            "picture": picture and texts.in_chart(language, picture),
+            "index": INDEX,
+        }
+        return pages.show(request, "trend.html", here=number_of(request), **values)
+
+    return page("/visits/{session_id:int}/trend", trend, "look", look="trend")
+
+
+def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None:
+    """Return the values over the days of their visits; None where fewer than two days with a value are known."""
+    known = [(p.day, p.value, p) for p in points if p.day is not None and p.value is not None]
+    if len(known) < 2:
+        return None
+    days = [(day - known[0][0]).days for day, _, _ in known]
+    values = [
+        (value, p.bounds, {s: v for s, v in (("left", p.left), ("right", p.right)) if v is not None})
+        for _, value, p in known
+    ]
+    names = [day.isoformat() for day, _, _ in known]
+    return charts.trend_chart(label, days, names, values, (90.0, 110.0) if is_index else None)
