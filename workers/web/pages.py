@@ -43,6 +43,7 @@ class Pages:
         )
         self._environment.globals.update(
             number=number,
+            has_text=lambda name: name in texts.catalogue(),
             significant=significant,
             check_words=check_words,
             measure_words=MEASURES,
