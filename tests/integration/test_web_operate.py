@@ -114,7 +114,7 @@ def test_each_role_sees_only_its_part(three_gone: list[int]):
 
 
 def test_a_page_without_workers_and_jobs_says_how_to_start_one(tables: None):
-    assert "No worker is alive. Start one: pbl worker." in web.client("operator").get("/operate").text
+    assert "No worker is alive. Compute a visit on its page" in web.client("operator").get("/operate").text
 
 
 def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):

@@ -66,7 +66,7 @@ class Pages:
         session: Session | None = getattr(request.state, "session", None)
         page = self._environment.get_template(template).render(
             t=functools.partial(texts.text, language),
-            said=functools.partial(texts.library, language),
+            said=functools.partial(texts.on_page, language),
             language=language,
             other_language=next(name for name in texts.LANGUAGES if name != language),
             session=session,

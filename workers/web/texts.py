@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,9 @@ from markupsafe import Markup, escape
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
+#: A command or its option, and one in brackets behind what it does.
+_COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
+_IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
 
 
 @functools.cache
@@ -31,6 +35,15 @@ def library(language: str, english: str) -> str:
     if own is not None or language == "en":
         return escape(own or english)
     return Markup('<span lang="en">{}</span>').format(english)
+
+
+def on_page(language: str, english: str) -> Markup:
+    """Return what the library says as `library` does, without what names a command: a page says what to click."""
+    shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
+    if not _COMMAND.search(shown):
+        return shown
+    kept = " ".join(part for part in re.split(r"(?<=[.;]) ", english) if not _COMMAND.search(part)).rstrip(" ;")
+    return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
 
 def language_of(cookie: str | None, accepted: str) -> str:
