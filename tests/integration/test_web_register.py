@@ -261,6 +261,7 @@ def test_what_is_no_recording_is_named_and_leaves_nothing(archive: Path, name: s
     answer = upload(browser, (name, content))
     assert answer.status_code == 200
     assert code in answer.text
+    assert ("This is a photo" in answer.text) == name.endswith("HEIC")
     assert everything() == before
     assert not [p for p in archive.rglob("*") if p.is_file()]
 

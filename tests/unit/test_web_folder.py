@@ -90,7 +90,9 @@ def test_a_folder_is_found_looked_at_and_taken_along(results):
 
 def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):
     browser = browser_of(ResultsFolder(results))
-    assert "copy the recording beside its results" in browser.get("/recordings/2").text  # no recording beside the second visit
+    assert (
+        "copy the recording beside its results" in browser.get("/recordings/2").text
+    )  # no recording beside the second visit
     assert browser.get("/recordings/2/video").status_code == 404
     for path in (
         "/visits/9",
