@@ -104,8 +104,9 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         return None, {"": error.with_key(None)}
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)
-    if "height_m" in given:
-        _write(number, given["subject"], {"height_m": given["height_m"]}, by, {"height_m": ""}, "")
+    before = facts(number).values
+    if "height_m" in given and not _same("height_m", given["height_m"], before["height_m"]):
+        _write(number, given["subject"], {"height_m": given["height_m"]}, by, before, "")
     return number, {}
 
 

@@ -60,9 +60,13 @@ def test_a_visit_is_registered_with_its_person(archive: Path):
     page = browser.get("/visits/1")
     assert page.status_code == 200
     assert "/visits/1/upload" in page.text
-    # The next visit of the person, by a label and a day in the German form.
-    assert new(browser, visit="after surgery", date="9.3.2026", role="6_weeks").headers["location"] == "/visits/2"
+    # The next visit of the person, of the same height, by a label and a day in the German form.
+    assert (
+        new(browser, visit="after surgery", date="9.3.2026", role="6_weeks", height_m="1.720").headers["location"]
+        == "/visits/2"
+    )
     assert str((session.Session & {"session_id": 2}).fetch1("session_date")) == "2026-03-09"
+    assert [what for what, _, _ in decided()] == ["visit", "height", "visit"]
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         number, errors = await tables.ask(visit_facts.register_visit, fields, session.name)
         if errors:
             return await new_page(request, fields, errors)
+        if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
+            for visit in await tables.ask(_visits_of_person_of, number):
+                await tables.ask(queue_visit, visit)
         return RedirectResponse(f"/visits/{number}", 303)
 
     async def facts(request: Request) -> Response:
