@@ -68,7 +68,6 @@ def test_from_an_empty_database_to_two_visits_compared(place: None, chromium: An
         assert "2026-01-10" in text
         assert "2026-04-10" in text
     assert len(gdi.SessionGdi()) == len(video.Video()) == 2
-    assert all(index is not None for index in gdi.SessionGdi().to_arrays("session_gdi")) or not REAL
     assert lab.Subject.fetch1("subject_height") == 1.72
     kinds = [str(k) for k in Decision().to_arrays("decision_what")]
     assert sorted(kinds) == ["height", "mass", "recording", "recording", "visit", "visit"]
