@@ -27,6 +27,16 @@ class Session(dj.Manual):
     """
 
 
+@schema
+class BodyMass(dj.Manual):
+    definition = """
+    # body mass of the person at a visit; a visit without a row: not known
+    -> Session
+    ---
+    body_mass           : float64              # (kg)
+    """
+
+
 def unknown_visit(session_id: int) -> PblError:
     """DB_NOT_FOUND for a number that no visit has."""
     return PblError(

@@ -189,8 +189,8 @@ def _said(mark: Unusable | None) -> dict[str, str]:
 
 
 @repeated
-def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "") -> None:
-    """Accept a check of a visit that asks for attention, with one's name; nothing is computed anew.
+def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> None:
+    """Accept a check of a visit that asks for attention, with one's name and a reason; nothing is computed anew.
 
     It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
 
@@ -198,12 +198,23 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str = "")
     ----------
     key, number
         Key of SessionQc and `qc_no` of the check.
+    by, reason
+        Who accepts it, and why (no names).
 
     Raises
     ------
     PblError
-        DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN.
+        DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without a reason or
+        with one of more than 500 characters.
     """
+    reason = " ".join(reason.split())
+    if not 0 < len(reason) <= 500:
+        raise PblError(
+            "USAGE",
+            found=f"a reason of {len(reason)} characters" if reason else "no reason",
+            expected="1 to 500 characters: why this result can be used all the same",
+            next_step="write the reason into the field beside the check; nothing was accepted",
+        )
     key = {k: key[k] for k in qc.SessionQc.primary_key}
     session_id = int((fit.FitSet & key).fetch1("session_id"))
     with locked(session_id):

@@ -73,11 +73,16 @@ def set_height(subject: str, height_m: float | None) -> list[str]:
     Fits of videos of one camera that were told another height are deleted with what was computed from them, so that the
     next populate computes them anew. Call it inside a transaction.
     """
+    return [] if height_m is None else replace_height(subject, height_m)
+
+
+def replace_height(subject: str, height_m: float | None) -> list[str]:
+    """As `set_height`; None removes the height."""
     key = {"subject": subject}
-    if height_m is None or number((lab.Subject & key).fetch1("subject_height")) == height_m:
+    if number((lab.Subject & key).fetch1("subject_height")) == height_m:
         return []
     lab.Subject.update1({**key, "subject_height": height_m})
-    changes = [f"height of {subject} is {height_m:g} m now"]
+    changes = [f"height of {subject} is {'not known' if height_m is None else f'{height_m:g} m'} now"]
     sets = fit.FitSet & {"fit_set_kind": fit.SINGLE} & (session.Session & key).proj()
     if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
         changes.append(f"what was fitted without it was deleted: {rows}")

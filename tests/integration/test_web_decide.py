@@ -172,7 +172,7 @@ def warned(tables: None, tmp_path: Path) -> dict[str, Any]:
 
 
 def accept(browser: Any, row: dict[str, Any], **change: object):
-    fields = {"result": 0, "check": row["qc_no"], "computed": str(row["qc_computed"]), **change}
+    fields = {"result": 0, "check": row["qc_no"], "computed": str(row["qc_computed"]), "reason": "seen", **change}
     return web.post(browser, "/visits/1/accept", **fields)
 
 
@@ -219,6 +219,15 @@ def test_what_was_accepted_is_no_longer_open(warned: dict[str, Any]):
     assert (listed("WARN"), listed("ACCEPTED")) == (1, 0)
 
 
+@pytest.mark.parametrize("reason", ["", "  ", "x" * 501])
+def test_no_check_is_accepted_without_a_reason(warned: dict[str, Any], reason: str):
+    before = everything()
+    answer = accept(web.client(), warned, reason=reason)
+    assert (answer.status_code, "USAGE" in answer.text) == (400, True)
+    assert everything() == before
+    assert re.search(r'<input name="reason"[^>]* required', web.client().get("/visits/1").text)
+
+
 def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
     key = {k: warned[k] for k in (*qc.SessionQc.primary_key, "qc_no")}
     assert accept(web.client(), warned, check=999).status_code == 404
@@ -226,7 +235,7 @@ def test_only_warnings_can_be_accepted(warned: dict[str, Any]):
     assert accept(web.client(), warned, result=5).status_code == 404
     qc.SessionQc.Check.update1({**key, "qc_check_outcome": "FAIL"})
     with pytest.raises(PblError, match="asks for attention"):
-        review_decisions.accept_check(key, warned["qc_no"], "A")
+        review_decisions.accept_check(key, warned["qc_no"], "A", "seen")
     assert len(Decision()) == 0
 
 

@@ -114,7 +114,7 @@ def test_each_role_sees_only_its_part(three_gone: list[int]):
 
 
 def test_a_page_without_workers_and_jobs_says_how_to_start_one(tables: None):
-    assert "No worker is alive. Start one: pbl worker." in web.client("operator").get("/operate").text
+    assert "No worker is alive. Compute a visit on its page" in web.client("operator").get("/operate").text
 
 
 def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
@@ -129,7 +129,7 @@ def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
     page = web.client("operator").get("/operate").text
     assert "gait&lt;b&gt;:42" in page
     assert "No worker is alive" not in page
-    assert "No worker runs; what is being computed now was started with pbl populate or on a page" in page
+    assert "No worker runs; what is being computed now was started on a page or by a command" in page
     assert "2026-01-02 03:04:05" in page
     assert f'href="/recordings/{three_gone[0]}"' not in page  # an operator does not look
 

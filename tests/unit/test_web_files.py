@@ -35,7 +35,7 @@ def test_every_text_that_a_page_names_is_in_the_catalogue():
 
 #: Groups and texts that are named by a value: a state, an outcome, a reason, a filter, an event.
 _BY_VALUE = re.compile(
-    r"(role|state|quality|trend|enter|decided|instruments)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
+    r"(role|state|quality|trend|enter|decided|instruments|register|expects|upload)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
     r"|operate\.(done|empty|pending|reserved|error|waiting|oldest|per_hour|left)$"
     r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\."
 )
@@ -79,6 +79,22 @@ def test_what_the_library_says_is_in_every_language():
         if e not in plain | names | instruments and not any(p.fullmatch(e) for p in placed if len(p.pattern) > 40)
     ]
     assert not dead, dead
+
+
+def test_no_text_of_a_page_names_a_command():
+    said = [(name, t) for name, by_language in texts.catalogue().items() for t in by_language.values()]
+    assert len(said) > 500
+    assert not [s for s in said if re.search(r"\bpbl [a-z]|--[a-z-]+(?!\))", s[1]) and "(--" not in s[1]]
+    for template in WEB.glob("templates/*.html"):
+        assert not re.search(r"\bpbl [a-z]", template.read_text("utf-8")), template.name
+    say = "Use the buttons of this page, or ask the person who runs this server."
+    assert (
+        texts.on_page("en", "TrackedPersons failed (X); next: look at it, then pbl retry")
+        == f"TrackedPersons failed (X) {say}"
+    )
+    assert texts.on_page("en", "give the height (--height-m), or <none>") == "give the height, or &lt;none&gt;"
+    german = texts.on_page("de", "a. `pbl why` says more")
+    assert german.startswith('<span lang="en">a.</span> Die Knöpfe')
 
 
 def test_words_of_the_library_are_marked_where_they_stay_english():

@@ -114,7 +114,9 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
 
 def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):
     browser = browser_of(ResultsFolder(results))
-    assert "--videos" in browser.get("/recordings/2").text  # no recording beside the second visit
+    assert (
+        "copy the recording beside its results" in browser.get("/recordings/2").text
+    )  # no recording beside the second visit
     assert browser.get("/recordings/2/video").status_code == 404
     for path in (
         "/visits/9",

@@ -278,15 +278,24 @@ async def form_of(request: Request) -> Mapping[str, str]:
     PblError
         USAGE for a text with control or invisible characters.
     """
-    session: Session | None = request.state.session
     fields = await read_form(request)
-    sent = fields.pop("token", "") or request.headers.get("x-token", "")
-    if session is None or not hmac.compare_digest(sent.encode(), session.token.encode()):
+    check_token(request, fields.pop("token", "") or request.headers.get("x-token", ""))
+    check_fields(fields)
+    return fields
+
+
+def check_token(request: Request, sent: str) -> None:
+    """Raise `Refused` for another token than that of the session."""
+    session: Session | None = request.state.session
+    if session is None or not hmac.compare_digest(sent.encode(errors="replace"), session.token.encode()):
         raise Refused("token")
+
+
+def check_fields(fields: Mapping[str, str]) -> None:
+    """Raise `PblError` USAGE for a text with control or invisible characters."""
     for name, text in fields.items():
         one_line = re.sub(r"[\r\n\t]", " ", name + text)  # as a text that is pasted may have them
         check_label(f"field {ascii(name)[:80]}", one_line, BODY_BYTES)
-    return fields
 
 
 async def read_form(request: Request) -> dict[str, str]:

@@ -34,6 +34,7 @@ from . import (
     operate,
     people,
     recordings,
+    registration,
     reports,
     sign_in,
     texts,
@@ -51,7 +52,10 @@ from .videos import Videos
 log = logging.getLogger(__name__)
 
 #: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
-STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503}
+STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503} | {
+    "UPLOAD_REFUSED": 422,
+    "FILE_UNWRITABLE": 507,
+}
 #: Cache header of `vendor/`: its file names carry their versions.
 _KEEP = "public, max-age=31536000, immutable"
 
@@ -139,6 +143,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *compute.routes(pages, tables, computing, options.target),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
+            *registration.routes(pages, tables),
             *operate.routes(pages, tables),
             *trend.routes(pages, tables),
         ]

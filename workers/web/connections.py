@@ -14,6 +14,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 #: connection); and in which some of an answer has to be taken: a browser that plays a video stops reading when it has
 #: enough, and asks again for the rest.
 REQUEST_S, TAKE_S = 10.0, 120.0
+#: Seconds without a byte after which an upload (`more_time`) is given up, and those in which all of it has to be here.
+STALL_S, UPLOAD_S = 30.0, 7200.0
+#: Name in the scope of a request of the function `Connection.more_time`.
+MORE_TIME = "pbl.more_time"
 #: Seconds that a client has to take an answer that ended before its request did: a connection that is closed with
 #: bytes unread may lose the answer.
 LINGER_S = 1.0
@@ -47,6 +51,7 @@ class Connection(H11Protocol):
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._until = 0.0  # when the time of an upload ends; 0 for other requests
         self._over = False  # the answer ended before the request: what still comes is not read
         self._made_at = self.loop.time()
         self._customer = ""
@@ -71,7 +76,15 @@ class Connection(H11Protocol):
         """Read more of a request, whose time ends when all of it is here."""
         if not self._over:
             super().data_received(data)
+            if self.scope is not None:
+                self.scope.setdefault(MORE_TIME, self.more_time)  # type: ignore[typeddict-item]
             self._time_request()
+
+    def more_time(self) -> None:
+        """Give the request that is being read the time of an upload. For an address whose sender has its right."""
+        if self.conn.their_state is h11.SEND_BODY:
+            self._until = self.loop.time() + UPLOAD_S
+            self._abort_after("request", STALL_S)
 
     def on_response_complete(self) -> None:
         """Close the connection where the answer ended before the request; else go on with the next."""
@@ -117,6 +130,9 @@ class Connection(H11Protocol):
     def _time_request(self) -> None:
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
             self._end("request")
+            self._until = 0.0
+        elif self._until and not self.transport.is_closing():
+            self._abort_after("request", min(STALL_S, max(0.0, self._until - self.loop.time())))
         elif "request" not in self._timers and not self.transport.is_closing():
             self._abort_after("request", REQUEST_S)
 

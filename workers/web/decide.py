@@ -48,8 +48,8 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
                     next_step="load the page again and look at them",
                     key=f"session_id={number}",
                 )
-            reason = fields.get("reason", "").strip()
-            review_decisions.accept_check(about.key, _number(fields.get("check", "")), session.name, reason)
+            number_of_check = _number(fields.get("check", ""))
+            review_decisions.accept_check(about.key, number_of_check, session.name, fields.get("reason", ""))
 
         await tables.ask(write)
         return RedirectResponse(f"/visits/{number}?result={shown}", 303)

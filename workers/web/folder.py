@@ -147,7 +147,7 @@ class ResultsFolder:
         raise _no_video(
             name,
             f"no {name}.mp4, .mov, ... beside the results",
-            "start the page with --videos and the folder of the recordings; below is the video with the body drawn in",
+            "copy the recording beside its results; below is the video with the body drawn in",
         )
 
     def overlay(self, number: int) -> Path:

@@ -48,6 +48,7 @@ class Pages:
         )
         self._environment.globals.update(
             number=number,
+            has_text=lambda name: name in texts.catalogue(),
             significant=significant,
             check_words=check_words,
             measure_words=MEASURES | TASKS,
@@ -70,7 +71,7 @@ class Pages:
         session: Session | None = getattr(request.state, "session", None)
         own: dict[str, Any] = {
             "t": functools.partial(texts.text, language),
-            "said": functools.partial(texts.library, language),
+            "said": functools.partial(texts.on_page, language),
             "language": language,
             "other_language": next(name for name in texts.LANGUAGES if name != language),
             "session": session,

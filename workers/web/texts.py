@@ -18,6 +18,9 @@ _LEAST = 12
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
+#: A command or its option, and one in brackets behind what it does.
+_COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
+_IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
 
 
 @functools.cache
@@ -90,6 +93,15 @@ def library(language: str, english: str) -> str:
     if own is not None:
         return escape(own)
     return Markup('<span lang="en">{}</span>').format(english)
+
+
+def on_page(language: str, english: str) -> Markup:
+    """Return what the library says as `library` does, without what names a command: a page says what to click."""
+    shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
+    if not _COMMAND.search(shown):
+        return shown
+    kept = " ".join(part for part in re.split(r"(?<=[.;]) ", english) if not _COMMAND.search(part)).rstrip(" ;")
+    return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
 
 def language_of(cookie: str | None, accepted: str) -> str:

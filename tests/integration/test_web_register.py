@@ -1,0 +1,335 @@
+"""Registering in the browser: a visit, its recordings and what is stated of them, from the form to the row."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from schemas import lab, session, study, video
+from schemas.review import Decision
+from schemas.studies.visit_facts import FACTS, NEW, facts
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.rows import everything, register
+from workers.web import multipart
+
+VISIT = {"subject": "P001", "visit": "2026-01-10"}
+
+
+@pytest.fixture(autouse=True)
+def archive(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    return tmp_path / "archive"
+
+
+def new(browser: Any, **values: str):
+    return web.post(browser, "/visits/new", **{**VISIT, **values})
+
+
+def correct(browser: Any, number: int = 1, seen: str = "", **values: str):
+    return web.post(browser, f"/visits/{number}/facts", seen=seen or facts(number).seen, **values)
+
+
+def upload(browser: Any, *files: Path | tuple[str, bytes], number: int = 1, **values: str):
+    given = [(f.name, f.read_bytes()) if isinstance(f, Path) else f for f in files]
+    fields = {"token": web.token(browser), "activity": "walking", "pace": "", **values}
+    parts = [("files", file) for file in given]
+    return browser.post(f"/visits/{number}/upload", data=fields, files=parts, follow_redirects=False)
+
+
+def decided() -> list[tuple[str, object, object]]:
+    rows = Decision().to_dicts(order_by="decision_id")
+    return [(r["decision_what"], r["decision_before"].get("value"), r["decision_after"].get("value")) for r in rows]
+
+
+# ------------------------------------------------------------------------------------------------------------- a visit
+def test_a_visit_is_registered_with_its_person(archive: Path):
+    browser = web.client(name="A. First")
+    assert "/visits/new" in browser.get("/visits").text
+    answer = new(browser, role="baseline", height_m="1,72", population="patient")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1")
+    assert (lab.Subject & VISIT).fetch1("population", "subject_height") == ("patient", 1.72)
+    assert str(session.Session.fetch1("session_date")) == "2026-01-10"
+    assert study.Visit.fetch1("visit_role") == "baseline"
+    assert decided() == [("visit", None, None), ("height", None, 1.72)]
+    assert {r["decision_by"] for r in Decision().to_dicts()} == {"A. First"}
+    page = browser.get("/visits/1")
+    assert page.status_code == 200
+    assert "/visits/1/upload" in page.text
+    # The next visit of the person, of the same height, by a label and a day in the German form.
+    assert (
+        new(browser, visit="after surgery", date="9.3.2026", role="6_weeks", height_m="1.720").headers["location"]
+        == "/visits/2"
+    )
+    assert str((session.Session & {"session_id": 2}).fetch1("session_date")) == "2026-03-09"
+    assert [what for what, _, _ in decided()] == ["visit", "height", "visit"]
+
+
+@pytest.mark.parametrize(
+    ("values", "field", "code"),
+    [
+        ({"subject": ""}, "subject", "SHEET_FORMAT"),
+        ({"subject": "Anna Müller"}, "subject", "USAGE"),
+        ({"subject": "P" * 33}, "subject", "USAGE"),
+        ({"visit": " "}, "visit", "SHEET_FORMAT"),
+        ({"visit": "x" * 65}, "visit", "USAGE"),
+        ({"visit": "first", "date": "03/09/2026"}, "date", "SHEET_FORMAT"),
+        ({"visit": "first", "date": "31.2.2026"}, "date", "SHEET_FORMAT"),
+        ({"role": "After Surgery"}, "role", "SHEET_FORMAT"),
+        ({"role": "x" * 33}, "role", "SHEET_FORMAT"),
+        ({"height_m": "172"}, "height_m", "FIT_INPUT"),
+        ({"height_m": "0"}, "height_m", "FIT_INPUT"),
+        ({"height_m": "tall"}, "height_m", "SHEET_FORMAT"),
+        ({"height_m": "nan"}, "height_m", "SHEET_FORMAT"),
+        ({"height_m": "1,720"}, "height_m", "SHEET_FORMAT"),
+        ({"height_m": "9" * 500}, "height_m", "FIT_INPUT"),
+        ({"population": "x" * 33}, "population", "USAGE"),
+    ],
+)
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_a_wrong_field_is_said_beside_it_and_keeps_what_was_typed(
+    values: dict[str, str], field: str, code: str, language: str
+):
+    browser, before = web.client(), everything()
+    browser.headers["accept-language"] = language
+    given = {"role": "baseline", "height_m": "1.8", "population": "healthy", **values}
+    answer = new(browser, **given)
+    assert answer.status_code == 200
+    page = answer.text
+    assert page.count("aria-invalid") == 1
+    at = page.index('aria-invalid="true"')
+    beside = page[page.rindex('<div class="one">', 0, at) : page.index("</div>", at)]
+    assert f'id="{field}"' in beside
+    assert code in beside
+    assert ('lang="en"' in beside) is False  # said in the language of the page
+    for name, text in {**VISIT, **given}.items():
+        assert f'name="{name}" value="{text}"' in page
+    assert everything() == before
+
+
+def test_a_visit_is_registered_once_and_codes_that_are_alike_are_asked_about():
+    browser = web.client()
+    assert new(browser).status_code == 303
+    before = everything()
+    again = new(browser).text
+    assert "SHEET_CONFLICT" in again
+    assert 'id="visit"' in again
+    alike = new(browser, subject="p1")
+    assert alike.status_code == 200
+    assert "the codes p1 and P001" in alike.text
+    assert "--" not in re.sub(r"<!--|-->", "", alike.text)
+    assert everything() == before
+    assert new(browser, subject="p1", distinct="yes").status_code == 303
+
+
+def test_roles_against_their_days_are_refused_as_those_of_a_sheet():
+    browser = web.client()
+    new(browser, role="baseline")
+    answer = new(browser, visit="2025-12-01", role="6_weeks")
+    assert answer.status_code == 200
+    assert "roles in the order of their dates" not in answer.text  # found and next step are said
+    assert "role 6_weeks on 2025-12-01" in answer.text
+    assert len(session.Session()) == 1
+
+
+# ------------------------------------------------------------------------------------------------- what is stated of it
+def test_what_is_stated_is_corrected_with_what_was_before(tmp_path: Path):
+    browser = web.client(name="A. First")
+    new(browser, role="baseline", height_m="1.8")
+    upload(browser, small_video(tmp_path, "walk", n=30))
+    answer = correct(
+        browser, height_m="1,72", mass_kg="71,5", population="patient", assistive_device="cane", orthosis="none",
+        reason="measured again", **{"activity:1": "tug", "pace:1": "fast"},
+    )  # fmt: skip
+    assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1")
+    assert lab.Subject.fetch1("subject_height", "population") == (1.72, "patient")
+    assert session.BodyMass.fetch1("body_mass") == 71.5
+    assert study.Visit.fetch1("assistive_device", "orthosis", "visit_role") == ("cane", "none", "baseline")
+    condition = video.conditions({"video_id": 1})[1]
+    assert (condition.activity, condition.pace) == ("tug", "fast")
+    rows = {what: (before, after) for what, before, after in decided()}
+    assert rows["height"] == (1.8, 1.72)
+    assert rows["mass"] == (None, 71.5)
+    assert rows["aid"] == (None, "cane")
+    assert rows["activity"] == ("walking", "tug")
+    page = browser.get("/visits/1").text
+    assert "measured again" in page
+    assert "71.5" in page
+    # The same again changes nothing; an empty field removes.
+    n = len(Decision())
+    assert correct(browser, height_m="1.720", mass_kg="71.5").status_code == 303
+    assert len(Decision()) == n
+    assert correct(browser, height_m="", mass_kg="", orthosis="").status_code == 303
+    assert lab.Subject.fetch1("subject_height") is None
+    assert len(session.BodyMass()) == 0
+    assert study.Visit.fetch1("orthosis", "assistive_device") == ("", "cane")
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ({"height_m": "172"}, "FIT_INPUT"),
+        ({"height_m": "1_7"}, "SHEET_FORMAT"),
+        ({"mass_kg": "0"}, "SHEET_FORMAT"),
+        ({"mass_kg": "1e9"}, "SHEET_FORMAT"),
+        ({"mass_kg": "heavy"}, "SHEET_FORMAT"),
+        ({"mass_kg": "inf"}, "SHEET_FORMAT"),
+        ({"population": "x" * 33}, "USAGE"),
+        ({"assistive_device": "x" * 65}, "USAGE"),
+        ({"orthosis": "x" * 65}, "USAGE"),
+        ({"activity:1": "x" * 33}, "USAGE"),
+        ({"pace:1": "x" * 33}, "USAGE"),
+    ],
+)
+def test_a_wrong_statement_is_said_beside_its_field(tmp_path: Path, values: dict[str, str], code: str):
+    browser = web.client()
+    new(browser, role="baseline")
+    register(small_video(tmp_path, "walk", n=30), session_label=VISIT["visit"])
+    before = everything()
+    answer = correct(browser, **{"population": "patient", **values})
+    assert answer.status_code == 200
+    assert code in answer.text
+    (text,) = values.values()
+    assert f'value="{text}"' in answer.text
+    assert everything() == before
+
+
+def test_an_aid_asks_for_the_role_of_the_visit():
+    browser = web.client()
+    new(browser)
+    answer = correct(browser, assistive_device="cane", height_m="1.7")
+    assert answer.status_code == 200
+    assert "SHEET_FORMAT" in answer.text
+    assert lab.Subject.fetch1("subject_height") is None
+
+
+def test_the_second_of_two_and_forged_forms_change_nothing(tmp_path: Path):
+    browser, reader = web.client(name="A. First"), web.client(role="reader")
+    new(browser)
+    seen = facts(1).seen
+    assert correct(browser, height_m="1.7").status_code == 303
+    before = everything()
+    late = correct(web.client(name="B. Second"), seen=seen, height_m="1.8")
+    assert late.status_code == 409
+    assert "A. First changed the height" in late.text
+    assert correct(browser, **{"nothing'--": "x"}).status_code == 400
+    assert correct(browser, 999, seen="x").status_code == 404
+    assert correct(reader, height_m="1.8").status_code == 403
+    assert new(reader, visit="x").status_code == 403
+    assert reader.get("/visits/1/facts").status_code == 200
+    assert reader.get("/visits/1/upload").status_code == 403
+    assert upload(reader, small_video(tmp_path, "walk", n=30)).status_code == 403
+    assert everything() == before
+
+
+# ---------------------------------------------------------------------------------------------------------- recordings
+def test_recordings_are_taken_into_the_archive_and_queued(tmp_path: Path, archive: Path):
+    browser = web.client(name="A. First")
+    new(browser)
+    first, second = (small_video(tmp_path, name, n=30 + i) for i, name in enumerate(("walk", "fast walk")))
+    answer = upload(browser, first, second, activity="walking", pace="fast")
+    assert (answer.status_code, answer.headers["location"]) == (303, "/visits/1")
+    rows = video.Video().to_dicts(order_by="video_id")
+    for row, sent in zip(rows, (first, second), strict=True):
+        assert row["video_path"].startswith(f"{archive}/P001/2026-01-10/")
+        assert Path(row["video_path"]).read_bytes() == sent.read_bytes()
+    assert {c.pace for c in video.conditions(video.Video().proj()).values()} == {"fast"}
+    assert decided().count(("recording", None, None)) == 2
+    assert "Compute now" in browser.get("/visits/1").text
+    assert not list(archive.rglob("browser-*"))
+    # The same again is not stored twice.
+    again = upload(browser, first)
+    assert "was registered before" in again.text
+    assert len(video.Video()) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "code"),
+    [
+        ("IMG_0001.HEIC", b"\0" * 500, "UPLOAD_REFUSED"),
+        ("notes.txt", b"text", "UPLOAD_REFUSED"),
+        ("noending", b"text", "UPLOAD_REFUSED"),
+        ("walk.mp4", b"", "VIDEO_EMPTY"),
+        ("walk.mp4", b"no video at all" * 50, "VIDEO_NOT_A_VIDEO"),
+        ("walk.json", b"{}", "UPLOAD_REFUSED"),
+    ],
+)
+def test_what_is_no_recording_is_named_and_leaves_nothing(archive: Path, name: str, content: bytes, code: str):
+    browser = web.client()
+    new(browser)
+    before = everything()
+    answer = upload(browser, (name, content))
+    assert answer.status_code == 200
+    assert code in answer.text
+    assert ("This is a photo" in answer.text) == name.endswith("HEIC")
+    assert everything() == before
+    assert not [p for p in archive.rglob("*") if p.is_file()]
+
+
+def test_a_good_file_beside_a_bad_one_is_taken(tmp_path: Path):
+    browser = web.client()
+    new(browser)
+    answer = upload(browser, ("../../etc/passwd", b"x"), small_video(tmp_path, "walk", n=30), pace="slow")
+    assert answer.status_code == 200
+    assert "UPLOAD_REFUSED" in answer.text
+    assert ">walk.mp4</a>: registered" in answer.text
+    assert '<option value="slow" selected>' in answer.text
+    assert len(video.Video()) == 1
+    assert upload(browser).status_code in (200, 415)  # nothing was chosen
+
+
+def test_no_file_is_written_without_the_token_of_the_session(tmp_path: Path, archive: Path):
+    browser = web.client()
+    new(browser)
+    film = small_video(tmp_path, "walk", n=30)
+    for token in ("", "x"):
+        assert upload(browser, film, token=token).status_code == 403
+    assert upload(browser, film, number=9).status_code == 404
+    broken = {"content-type": "multipart/form-data; boundary=b"}
+    for body in (b"", b"--b\r\n", b"--b\r\nx: y\r\n\r\nz\r\n--b--", b"--b\r\n" + b"x" * 9999, b"--b--\r\n"):
+        assert browser.post("/visits/1/upload", content=body, headers=broken).status_code in (403, 415), body
+    assert not archive.exists() or not [p for p in archive.rglob("*") if p.is_file()]
+    assert len(video.Video()) == 0
+
+
+@pytest.mark.parametrize("step", [1, 2, 7, 64, 10_000])
+def test_a_form_with_files_is_read_the_same_in_pieces_of_any_length(step: int):
+    content = b"\r\n--b" + bytes(range(256)) * 3 + b"\r\n--"
+    token = b'--bound\r\nContent-Disposition: form-data; name="token"\r\n\r\nabc\r\n'
+    named = 'name="files"; filename="a \u00e4.mp4"'.encode()
+    file = b"--bound\r\nContent-Disposition: form-data; " + named + b"\r\nContent-Type: video/mp4\r\n\r\n" + content
+    body = b"ignored\r\n" + token + file + b"\r\n--bound--\r\n"
+
+    class Sent:
+        headers = {"content-type": "multipart/form-data; boundary=bound"}  # noqa: RUF012
+
+        async def stream(self):
+            for i in range(0, len(body), step):
+                yield body[i : i + step]
+
+    async def read() -> list[Any]:
+        return [found async for found in multipart.parts(Sent())]  # type: ignore[arg-type]
+
+    found: dict[Any, bytes] = {}
+    last = None
+    with ThreadPoolExecutor(1) as pool:  # a browser test before this one has a loop in this thread
+        pieces = pool.submit(asyncio.run, read()).result()
+    for one in pieces:
+        if isinstance(one, bytes):
+            found[last] += one
+        else:
+            last, found[one] = one, b""
+    assert found == {multipart.Part("token", None): b"abc", multipart.Part("files", "a \u00e4.mp4"): content}
+
+
+def test_each_form_is_also_json():
+    browser = web.client()
+    new(browser, height_m="1.7")
+    assert set(browser.get("/visits/new.json").json()["values"]) == {*NEW, "height_m", "distinct"}
+    assert set(FACTS) <= set(browser.get("/visits/1/facts.json").json()["values"])
+    assert browser.get("/visits/1/upload.json").json()["to"]["subject"] == "P001"

@@ -1,0 +1,185 @@
+"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in as an upload
+of the drop folder is."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
+from pbl_pipeline.video import read_first
+from schemas import session, video, worker
+from schemas.decisions.review_decisions import record
+from schemas.intake import Registered, VisitRecord
+from schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
+from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
+
+from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, take_in
+
+#: What opening a recording may take (s, bytes), and the age at which the rest of a broken upload is removed (s).
+_OPEN_S, _OPEN_BYTES, _REST_S = 60.0, 2**31, 86_400.0
+_PREFIX = "browser-"
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """The visit that files are sent for."""
+
+    session_id: int
+    subject: str
+    label: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of a file: its name as it was sent; status as in `Registered`."""
+
+    name: str
+    status: str
+    video_id: int | None = None
+    error: PblError | None = None
+
+
+def place(session_id: int) -> Place:
+    """Return the visit. Raises `PblError` DB_NOT_FOUND."""
+    rows = (session.Session & {"session_id": session_id}).to_dicts()
+    if not rows:
+        raise session.unknown_visit(session_id)
+    return Place(session_id, rows[0]["subject"], rows[0]["session_label"])
+
+
+class Arriving:
+    """A file that arrives: written under a new name in the person's folder of the archive, and hashed.
+
+    Raises `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes;
+    OSError.
+    """
+
+    def __init__(self, to: Place, name: str) -> None:
+        self.name = plain_name(PurePosixPath(name.replace("\\", "/")).name)
+        ending = PurePosixPath(self.name).suffix.lower()
+        if ending not in (*VIDEO_ENDINGS, *LOG_ENDINGS):
+            photo = ending in (".heic", ".heif", ".jpg", ".jpeg", ".png")
+            raise _refused(
+                self.name,
+                "a photo" if photo else f"a file that ends in {ending!r}",
+                f"a video ({', '.join(VIDEO_ENDINGS)}), or the sensor log beside it ({', '.join(LOG_ENDINGS)})",
+                "choose the video itself",
+            )
+        self._most = LARGEST_LOG if ending in LOG_ENDINGS else LARGEST
+        folder = folder_of(archive_dir(), PHONE, to.subject)
+        for rest in folder.glob(f"{_PREFIX}*"):  # of a server that was ended
+            if time.time() - rest.stat().st_mtime > _REST_S:
+                rest.unlink(missing_ok=True)
+        self.path = folder / f"{_PREFIX}{secrets.token_hex(6)}{ending}"
+        self._file = open(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")  # noqa: SIM115
+        self._sum, self._n = hashlib.sha256(), 0
+
+    @property
+    def is_log(self) -> bool:
+        """Whether it is a sensor log, by its ending."""
+        return self.path.suffix in LOG_ENDINGS
+
+    def write(self, piece: bytes) -> None:
+        """Write the next bytes."""
+        self._n += len(piece)
+        if self._n > self._most:
+            found, most = f"a file of more than {self._most / 1e9:g} GB", f"at most {self._most / 1e9:g} GB"
+            raise _refused(self.name, found, most, "send a shorter recording")
+        self._sum.update(piece)
+        self._file.write(piece)
+
+    def finish(self) -> Copy:
+        """Return the whole file, which is on disk then."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        return Copy(self.path, self._sum.hexdigest())
+
+    def discard(self) -> None:
+        """Remove it; what was taken into the archive has another name and stays."""
+        self._file.close()
+        self.path.unlink(missing_ok=True)
+
+
+def check_room(n_bytes: int) -> None:
+    """Raise `PblError` FILE_UNWRITABLE where so many bytes do not fit into the archive."""
+    here = archive_dir()
+    while not here.is_dir():
+        here = here.parent
+    if shutil.disk_usage(here).free < n_bytes + KEPT_FREE:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
+            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
+            next_step="tell who runs the server",
+        )
+
+
+def check(arrived: Arriving) -> PblError | None:
+    """Return what is wrong with a file that is to be a video: VIDEO_..., or None. Its first picture is decoded."""
+    try:
+        limited(read_first, arrived.path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
+    except LimitExceeded as error:
+        return PblError(
+            "VIDEO_NOT_A_VIDEO",
+            found=f"a file that takes {error} to open",
+            expected="a video file",
+            next_step="copy it from the phone again",
+            key=arrived.name,
+        )
+    except PblError as error:
+        return error.with_key(arrived.name)
+    return None
+
+
+def register(
+    to: Place, arrived: Sequence[tuple[Arriving, Copy]], activity: str, pace: str, by: str
+) -> list[Outcome] | None:
+    """Register files that arrived whole; a sensor log goes with the video of its name. One outcome for each video and
+    each log without a video; None, with nothing done, while the drop folder is being taken over or a person removed.
+
+    Raises `PblError` DB_NOT_FOUND where the visit is gone, DB_..., FILE_UNWRITABLE.
+    """
+    logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
+    out = []
+    with worker.alone(LOCK, video.Video.connection) as obtained:
+        if not obtained:
+            return None
+        place(to.session_id)  # a visit that was removed is not made again
+        visit = VisitRecord(to.subject, to.label, activity=activity or None, pace=pace or None)
+        for one, copy in arrived:
+            if not one.is_log:
+                log = logs.pop(PurePosixPath(one.name).stem, None)
+                out.append(_take_in(visit, one.name, [copy, log] if log else [copy], by))
+    expected, next_step = "the video of the same name with it", "send both together"
+    out += [
+        Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused(stem, "a sensor log alone", expected, next_step))
+        for stem, copy in logs.items()
+    ]
+    remove_folders(archive_dir(), to.subject)
+    return out
+
+
+def _take_in(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
+    try:
+        result: Registered = take_in(visit, name, copies, archive_dir())
+    except PblError as error:
+        if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
+            raise
+        return Outcome(name, "refused", error=error.with_key(name))
+    assert result.video_id is not None
+    if result.status == "registered":
+        record("recording", by, {}, {}, {"recording": "registered"}, video_id=result.video_id)
+    return Outcome(name, result.status, result.video_id)
+
+
+def _refused(name: str, found: str, expected: str, next_step: str) -> PblError:
+    return PblError("UPLOAD_REFUSED", found=found, expected=expected, next_step=next_step, key=name)

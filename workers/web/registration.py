@@ -1,0 +1,260 @@
+"""Register visits, send recordings for them, and correct what is stated of them. Each change is a row of Decision."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+
+from pbl_pipeline.errors import PblError
+from schemas import lab
+from schemas import session as sessions
+from schemas.studies import visit_facts
+from schemas.studies.visit_entry import USUAL_ROLES
+
+from .. import browser_uploads
+from ..browser_uploads import Arriving, Outcome, Place
+from ..incoming import VIDEO_ENDINGS, Copy
+from ..refresh import queue_visit
+from .access import BODY_BYTES, Refused, Session, check_fields, check_token, form_of
+from .address import Address, number_of, page
+from .connections import MORE_TIME
+from .multipart import Part, is_multipart, parts
+from .pages import Pages
+from .tables import Tables
+
+T = TypeVar("T")
+
+#: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
+_BLOCK, _WAIT_S = 2**20, 60.0
+
+
+def routes(pages: Pages, tables: Tables) -> list[Address]:
+    """Return the addresses of this part."""
+
+    async def new(request: Request) -> Response:
+        today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
+        return await new_page(request, {"visit": today}, {})
+
+    async def new_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+        known = {name: values.get(name, "") for name in (*visit_facts.NEW, "height_m", visit_facts.DISTINCT)}
+        return pages.show(
+            request,
+            "new_visit.html",
+            values=known,
+            errors=errors,
+            longest={**visit_facts.NEW, "height_m": visit_facts.FACTS["height_m"]},
+            usual_roles=USUAL_ROLES,
+            populations=await tables.ask(_populations),
+        )
+
+    async def register(request: Request) -> Response:
+        fields = await form_of(request)
+        session: Session = request.state.session
+        number, errors = await tables.ask(visit_facts.register_visit, fields, session.name)
+        if errors:
+            return await new_page(request, fields, errors)
+        if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
+            for visit in await tables.ask(_visits_of_person_of, number):
+                await tables.ask(queue_visit, visit)
+        return RedirectResponse(f"/visits/{number}", 303)
+
+    async def facts(request: Request) -> Response:
+        return await facts_page(request, {}, {})
+
+    async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        stored = await tables.ask(visit_facts.facts, number_of(request))
+        return pages.show(
+            request,
+            "facts.html",
+            facts=stored,
+            values={**stored.values, **values},
+            errors=errors,
+            longest=visit_facts.FACTS,
+            choices={"activity": ACTIVITIES, "pace": PACES},
+            populations=await tables.ask(_populations),
+        )
+
+    async def correct(request: Request) -> Response:
+        fields = dict(await form_of(request))
+        session: Session = request.state.session
+        number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
+        changed, errors = await tables.ask(visit_facts.correct, number, fields, session.name, seen, reason)
+        if errors:
+            return await facts_page(request, fields, errors)
+        if changed:
+            for visit in await tables.ask(_visits_of_person_of, number) if "height_m" in changed else [number]:
+                await tables.ask(queue_visit, visit)
+        return RedirectResponse(f"/visits/{number}", 303)
+
+    async def upload(request: Request) -> Response:
+        return upload_page(request, await tables.ask(browser_uploads.place, number_of(request)), {}, [])
+
+    def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        return pages.show(
+            request,
+            "upload.html",
+            to=to,
+            values={"activity": "walking", "pace": "", **values},
+            outcomes=outcomes,
+            choices={"activity": ACTIVITIES, "pace": PACES},
+            accepted=", ".join(VIDEO_ENDINGS),
+        )
+
+    async def send(request: Request) -> Response:
+        if not is_multipart(request):
+            await form_of(request)
+            raise Refused("form")
+        to = await tables.ask(browser_uploads.place, number_of(request))
+        request.scope.get(MORE_TIME, lambda: None)()
+        await _on_disk(browser_uploads.check_room, int(request.headers.get("content-length", "0")))
+        arriving: list[Arriving] = []
+        try:
+            fields, outcomes, whole = await _receive(request, to, arriving)
+            stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
+            good = []
+            for one, copy in whole:
+                error = None if one.is_log else await _on_disk(browser_uploads.check, one)
+                if error is None:
+                    good.append((one, copy))
+                else:
+                    outcomes.append(Outcome(one.name, "refused", error=error))
+            if not whole and not outcomes:
+                outcomes.append(Outcome("", "refused", error=_no_file()))
+            outcomes += await taken_in(request, to, good, stated)
+        finally:
+            for one in arriving:
+                await asyncio.to_thread(one.discard)
+        if any(one.video_id is not None for one in outcomes):
+            await tables.ask(queue_visit, to.session_id)
+        if all(one.status == "registered" for one in outcomes):
+            return RedirectResponse(f"/visits/{to.session_id}", 303)
+        return upload_page(request, to, stated, outcomes)
+
+    async def taken_in(
+        request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
+    ) -> list[Outcome]:
+        session: Session = request.state.session
+        for _ in range(int(_WAIT_S) if good else 0):
+            done = await tables.ask(
+                browser_uploads.register, to, good, stated["activity"], stated["pace"], session.name
+            )
+            if done is not None:
+                return done
+            await asyncio.sleep(1.0)
+        return [Outcome(one.name, "refused", error=_busy(one.name)) for one, _ in good]
+
+    return [
+        *page("/visits/new", new, "decide"),
+        Address("/visits/new", register, "decide", methods=["POST"]),
+        *page("/visits/{session_id:int}/facts", facts, "look"),
+        Address("/visits/{session_id:int}/facts", correct, "decide", methods=["POST"]),
+        *page("/visits/{session_id:int}/upload", upload, "decide"),
+        Address("/visits/{session_id:int}/upload", send, "decide", methods=["POST"]),
+    ]
+
+
+async def _receive(
+    request: Request, to: Place, arriving: list[Arriving]
+) -> tuple[dict[str, str], list[Outcome], list[tuple[Arriving, Copy]]]:
+    """Return the fields of a form, the files that are refused at once, and those that are on disk.
+
+    `arriving` gets every file that was begun. Nothing is written before the form's token was read.
+
+    Raises `Refused` "token", "form", "size"; `PblError` USAGE, UPLOAD_REFUSED, FILE_UNWRITABLE.
+    """
+    fields: dict[str, bytearray] = {}
+    outcomes: list[Outcome] = []
+    whole: list[tuple[Arriving, Copy]] = []
+    text: bytearray | None = None
+    file: Arriving | None = None
+    kept = bytearray()
+
+    async def end() -> None:
+        if file is not None:
+            await _on_disk(file.write, bytes(kept))
+            whole.append((file, await _on_disk(file.finish)))
+
+    async for found in parts(request):
+        if isinstance(found, bytes):
+            if text is not None:
+                text += found
+                if len(text) > BODY_BYTES:
+                    raise Refused("size")
+            elif file is not None:
+                kept += found
+                if len(kept) >= _BLOCK:
+                    await _on_disk(file.write, bytes(kept))
+                    kept.clear()
+            continue
+        await end()
+        text, file = None, None
+        kept.clear()
+        if found.file is None:
+            text = fields[found.name] = bytearray()
+        elif found.file:  # an empty one: nothing was chosen
+            check_token(request, fields.get("token", bytearray()).decode(errors="replace"))
+            file = await _begin(to, found, outcomes)
+            arriving += [] if file is None else [file]
+    await end()
+    stated = {name: bytes(value).decode(errors="replace") for name, value in fields.items()}
+    check_token(request, stated.pop("token", ""))
+    check_fields(stated)
+    return stated, outcomes, whole
+
+
+async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | None:
+    """Return the file that begins; one that is refused becomes an outcome, and its bytes are not kept."""
+    assert part.file is not None
+    check_fields({part.name: part.file})
+    try:
+        return await _on_disk(Arriving, to, part.file)
+    except PblError as error:
+        if error.code != "UPLOAD_REFUSED":
+            raise
+        outcomes.append(Outcome(str(error.key), "refused", error=error))
+        return None
+
+
+async def _on_disk(work: Callable[..., T], *args: Any) -> T:
+    """Return what a function returns that writes to the archive. Raises its `PblError`, or FILE_UNWRITABLE."""
+    try:
+        return await asyncio.to_thread(work, *args)
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="room and rights in the archive of the server",
+            next_step="tell who runs the server",
+        ) from error
+
+
+def _visits_of_person_of(session_id: int) -> list[int]:
+    subject = (sessions.Session & {"session_id": session_id}).fetch1("subject")
+    return [int(n) for n in (sessions.Session & {"subject": subject}).to_arrays("session_id")]
+
+
+def _populations() -> list[str]:
+    return [str(p) for p in lab.Population().to_arrays("population") if p != "unknown"]
+
+
+def _no_file() -> PblError:
+    return PblError("USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it")
+
+
+def _busy(name: str) -> PblError:
+    return PblError(
+        "DB_REFUSED",
+        found="recordings of the drop folder are being taken over",
+        expected="one import at a time",
+        next_step="send it again in some minutes",
+        key=name,
+    )
