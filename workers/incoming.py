@@ -28,7 +28,7 @@ from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.video import read_phone_log, sha256_of
 from schemas import video, worker
 from schemas.connection import dj
-from schemas.intake import OneCamera, Sensors, VisitRecord, register
+from schemas.intake import OneCamera, Registered, Sensors, VisitRecord, register
 from schemas.intake.uploads import LOG_ENDINGS, Bucket, Folder, StillChanging, Upload, drop_folder, incoming_url
 from schemas.operations.archive import (
     COPIES,
@@ -73,7 +73,7 @@ class Taken:
 
 
 @dataclasses.dataclass
-class _Copy:
+class Copy:
     """A copy in the archive, with its SHA-256."""
 
     path: Path
@@ -174,7 +174,9 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
             end = time.monotonic() + UPLOAD_S
             for upload in given:
                 copies.append(_copy(drop, upload, archive, end))
-            note = _register(recording.name, copies, archive)
+            subject, session, file = recording.name.parts
+            check_subject(subject, "rename the folder and upload again", recording.name)
+            registered = take_in(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
         except Exception as error:  # whatever it is, one upload never stops the others
@@ -184,8 +186,8 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
             out.refused[name] = coded
             _set_aside(drop, given, copies, archive, coded)
         else:
-            if note:
-                out.known[name] = note
+            if registered.status != "registered":
+                out.known[name] = registered.note
             else:
                 out.registered.append(name)
         copies, done = [], len(copies)
@@ -201,7 +203,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
                 copy.path.unlink(missing_ok=True)
 
 
-def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> _Copy:
+def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> Copy:
     """Copy into the archive under a new name, on disk when this returns.
 
     Raises
@@ -236,20 +238,19 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> _
         if isinstance(error, Exception) and not isinstance(error, (OSError, PblError, StillChanging)):
             raise OSError(f"{type(error).__name__}: {error}") from error  # the client of an object store
         raise
-    return _Copy(part, digest.hexdigest())
+    return Copy(part, digest.hexdigest())
 
 
-def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> str:
-    """Move the copies to their place and register them; "" where the recording is new, else what is known of it.
+def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
+    """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
+    them; return the outcome. `file`: the name that the recording came with.
 
     Raises
     ------
     PblError
         What is wrong with the recording.
     """
-    subject, session, file = name.parts
     recording, *logs = copies
-    check_subject(subject, "rename the folder and upload again", name)
     for log in logs:
         try:
             limited(read_phone_log, log.path, seconds=LOG_S, n_bytes=LOG_BYTES)
@@ -260,25 +261,25 @@ def _register(name: PurePosixPath, copies: Sequence[_Copy], archive: Path) -> st
                 expected="the log of some minutes",
                 next_step="upload the recording without it, or with the log as its app wrote it",
             ) from error
-    folder = private_folder(folder_of(archive, "", subject) / plain_name(session))
+    folder = private_folder(folder_of(archive, "", visit.subject) / plain_name(visit.session_label))
     target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
-    (result,) = register([OneCamera(target, VisitRecord(subject, session), sensors)])
+    (result,) = register([OneCamera(target, visit, sensors)])
     if result.error is not None:
         raise result.error
     if result.status == "registered":
-        return ""
+        return result
     registered = Path((video.Video & {"video_id": result.video_id}).fetch1("video_path"))
     if registered != target and registered.is_file() and sha256_of(registered) == recording.sha256:
         target.unlink()
-    return result.note
+    return result
 
 
 def _set_aside(
-    drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[_Copy], archive: Path, why: PblError
+    drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[Copy], archive: Path, why: PblError
 ) -> None:
     """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
 

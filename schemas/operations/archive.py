@@ -2,6 +2,7 @@
 
     SUBJECT/SESSION/HASH-FILE    registered recordings, with the logs beside them
     _refused/SUBJECT/HASH-FILE   what could not be registered, with its reason in HASH-FILE.txt
+    _phone/SUBJECT/NUMBER/       parts of a recording that a phone sends, until it is registered
     .incoming/SUBJECT/           copies that are being made; while no import runs, the remains of a killed one
     .incoming/seen.json          what lay in the drop folder when it was last listed
 
@@ -24,7 +25,7 @@ from .json_files import write_json
 
 #: Name of the installation-wide lock that whoever changes the archive holds (`worker.alone`).
 LOCK = "incoming"
-REFUSED, COPIES = "_refused", ".incoming"
+REFUSED, COPIES, PHONE = "_refused", ".incoming", "_phone"
 _SEEN = "seen.json"
 
 
@@ -34,7 +35,7 @@ def archive_dir() -> Path:
 
 
 def folder_of(archive: Path, part: str, subject: str) -> Path:
-    """The folder of a person in a part of the archive ("", `REFUSED`, `COPIES`); made if missing.
+    """The folder of a person in a part of the archive ("", `REFUSED`, `PHONE`, `COPIES`); made if missing.
 
     Raises
     ------
@@ -45,7 +46,7 @@ def folder_of(archive: Path, part: str, subject: str) -> Path:
     return private_folder(private_folder(archive / part) / (subject if SUBJECT_CODE.fullmatch(subject) else "_"))
 
 
-def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED)) -> list[Path]:
+def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED, PHONE)) -> list[Path]:
     """All files in the folders of a person, by default without `COPIES`; links are listed, not followed."""
     folders = [archive / part / subject for part in parts]
     return sorted(
@@ -59,7 +60,7 @@ def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED
 
 def remove_folders(archive: Path, subject: str) -> None:
     """Remove the folders of a person as far as they are empty."""
-    for part in ("", REFUSED):
+    for part in ("", REFUSED, PHONE):
         folder = archive / part / subject
         for path in (*sorted(folder.rglob("*"), reverse=True), folder):
             remove_empty(path, 1)

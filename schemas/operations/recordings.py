@@ -41,7 +41,7 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
 
 def find_recordings(subject: str) -> list[str]:
     """Return the person's files in the archive, copies of a killed import included, and in the drop folder."""
-    parts = ("", archive.REFUSED, archive.COPIES)
+    parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)
     return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
 
 

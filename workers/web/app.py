@@ -33,6 +33,7 @@ from . import (
     folder,
     operate,
     people,
+    phone,
     recordings,
     reports,
     sign_in,
@@ -50,7 +51,11 @@ from .videos import Videos
 log = logging.getLogger(__name__)
 
 #: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
-STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503}
+STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503} | {
+    "PHONE_LINK": 403,
+    "UPLOAD_REFUSED": 422,
+    "FILE_UNWRITABLE": 507,
+}
 #: Cache header of `vendor/`: its file names carry their versions.
 _KEEP = "public, max-age=31536000, immutable"
 
@@ -140,6 +145,9 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *entry.routes(pages, tables),
             *operate.routes(pages, tables),
         ]
+    phones = phone.Phones(tables, options.secure) if options.folder is None else None
+    if phones is not None:
+        parts += phone.routes(pages, tables, phones, computing, options.target)
     parts += [
         *visits.routes(pages, asks, source),
         *recordings.routes(pages, asks, source),
@@ -174,7 +182,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         lifespan=life,
     )
     app.state.sessions, app.state.way_in = sessions, way
-    app.state.computing = computing
+    app.state.computing, app.state.phones = computing, phones
     app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
     app.router.default, app.router.redirect_slashes = unknown, False
     return app

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Visit
 from schemas.decisions import candidates, review_decisions
+from schemas.intake import phone_recordings
 from schemas.reading import shown
 from schemas.reading.visit_progress import Progress, visit_progress
 
@@ -107,4 +108,5 @@ class TablesSource:
             "decisions": review_decisions.decisions(number),
             "accepted": review_decisions.accepted(about.key) if about.key else {},
             "entry": entry(number),
+            "film": phone_recordings.filming(number),
         }

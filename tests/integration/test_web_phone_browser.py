@@ -1,0 +1,261 @@
+"""The phone's page in a Chromium that takes a film of numbered frames as its camera. Skips where there is none."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from pbl_pipeline.video import probe, read_phone_log
+from schemas import video
+from schemas.capture import PhoneRecording
+from schemas.intake import phone_recordings
+from tests.integration.compute_target import nothing
+from tests.integration.test_web_accounts import running
+from tests.integration.test_web_phone import link_of, new_visit
+from tests.videos import numbered_frames
+from workers import phone_uploads
+from workers.web import Options, Where, create_app, phone
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
+#: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.
+UPRIGHT, TURNED = (0.7071, 0.7071, 0.0, 0.0), (0.7044, 0.7044, 0.0616, 0.0616)
+
+
+@pytest.fixture(scope="module")
+def camera(chromium: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A Chromium whose camera is a film of 640 x 480."""
+    path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    with av.open(str(path), "w", format="mjpeg") as out:
+        stream = out.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 640, 480, "yuvj420p"
+        for frame in numbered_frames(60, 480, 640):
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        out.mux(stream.encode(None))
+    executable = chromium.browser_type.executable_path
+    args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
+            f"--use-file-for-fake-video-capture={path}"]  # fmt: skip
+    from conftest import _CHROMIUM
+
+    browser = chromium.browser_type.launch(executable_path=_CHROMIUM or executable, args=args)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    for module in (phone_recordings, phone_uploads, phone):
+        monkeypatch.setattr(module, "PART_BYTES", 65536)
+    return new_visit("2026-01-10")
+
+
+@contextlib.contextmanager
+def filming(
+    browser: Any, visit: int, orientation: bool = True, torn: bool = False, denied: bool = False, **context: Any
+) -> Iterator[Any]:
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
+    with running(create_app(Options(target=nothing)), Where()) as port:
+        base = f"http://127.0.0.1:{port}"
+        made = browser.new_context(base_url=base, locale="en", **{**PHONE, **context})
+        try:
+            if not denied:
+                made.grant_permissions(["camera", "accelerometer", "gyroscope"], origin=base)
+            page, errors = made.new_page(), []
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+            if orientation:
+                sensor(page, "setSensorOverrideEnabled", enabled=True)
+                turn(page, UPRIGHT)
+            page.goto(f"/phone/open?key={link_of(visit)}")
+            page.wait_for_selector("main[data-ready]")
+            yield page
+            assert not [e for e in errors if not (torn and "net::ERR" in e)]
+        finally:
+            made.close()
+
+
+def sensor(page: Any, what: str, **values: Any) -> None:
+    if not hasattr(page, "cdp"):
+        page.cdp = page.context.new_cdp_session(page)
+    page.cdp.send(f"Emulation.{what}", {"type": "relative-orientation", **values})
+
+
+def turn(page: Any, wxyz: tuple[float, ...]) -> None:
+    reading = dict(zip("wxyz", wxyz, strict=True))
+    sensor(page, "setSensorOverrideReadings", reading={"quaternion": reading})
+
+
+def film(page: Any, seconds: float = 3.0) -> None:
+    """From the opened page to the end of a take: one tap for the camera, one to begin."""
+    if page.locator(".allow").is_visible():
+        page.locator(".allow").click()
+    page.locator(".record").click()
+    page.wait_for_selector("main[data-filming='yes']")
+    page.wait_for_timeout(1000 * seconds)
+    page.locator(".record").click()
+    page.wait_for_selector(".after:not([hidden])")
+
+
+def arrived(page: Any, n: int = 1) -> None:
+    page.wait_for_function(
+        "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has it/.test(e.textContent)).length === n",
+        arg=n,
+        timeout=30_000,
+    )
+
+
+def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.get_by_label("fast").check()
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(1500)
+        before = page.evaluate("performance.now()")
+        turn(page, TURNED)
+        page.wait_for_timeout(50)
+        after = page.evaluate("performance.now()")
+        page.wait_for_timeout(1500)
+        page.locator(".record").click()
+        page.wait_for_selector(".after:not([hidden])")
+        times = np.array(json.loads(page.locator("main").get_attribute("data-times")), float) / 1e6
+        start_ms = float(page.locator("main").get_attribute("data-start"))
+        page.locator("[name=note]").fill("first pass")
+        page.locator(".keep").click()
+        arrived(page)
+        assert (
+            page.evaluate("(async () => (await Array.fromAsync((await navigator.storage.getDirectory()).keys())))()")
+            == []
+        )
+    sent = PhoneRecording().fetch1()
+    about = sent["phone_about"] if isinstance(sent["phone_about"], dict) else json.loads(sent["phone_about"])
+    assert about["note"] == "first pass" and about["sensor"] == "RelativeOrientationSensor"
+    assert about["dropped"] <= 0.1 * about["frames"], about
+    row = (video.Video & {"session_id": visit}).fetch1()
+    assert row["camera_motion"] == "handheld" and (video.Pace & row).fetch1("pace") == "fast"
+    # Every frame has the time at which the camera delivered it.
+    info = probe(row["video_path"])
+    assert info.n_frames == len(times) == about["frames"] > 45
+    assert (info.width_px, info.height_px) == (640, 480)
+    assert np.abs(info.time_s - (times - times[0])).max() < 0.002
+    # The turn stands in the log at its moment of the video's clock.
+    (path,) = Path(row["video_path"]).parent.glob("*.json")
+    log = read_phone_log(path)
+    moved = log.time_s[np.argmax(np.abs(log.quat_wxyz - log.quat_wxyz[0]).max(axis=1) > 0.01)]
+    assert (before - start_ms) / 1000 - 0.01 <= moved <= (after - start_ms) / 1000 + 0.01
+
+
+def test_reloads_in_the_middle_of_an_upload(camera: Any, visit: int):
+    with filming(camera, visit, torn=True) as page:
+        film(page)
+        sent = []
+
+        def tear(route: Any) -> None:
+            """One part arrives, then the network is gone."""
+            sent.append(route.request.url)
+            route.continue_() if len(sent) == 1 else route.abort()
+
+        page.route("**/phone/recordings/*.json", tear)
+        page.locator(".keep").click()
+        page.wait_for_function("() => document.querySelector('.said').textContent.startsWith('No network')")
+        assert len(sent) > 1
+        page.unroute("**/phone/recordings/*.json")
+        page.reload()
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == len(PhoneRecording()) == 1
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 45
+
+
+def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int):
+    with filming(camera, visit, torn=True) as page:
+        page.wait_for_function("() => navigator.serviceWorker.ready.then(() => true)")
+        page.reload()  # now the service worker serves it
+        page.wait_for_selector("main[data-ready]")
+        page.context.set_offline(True)
+        page.reload()
+        page.wait_for_selector("main[data-ready]")
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.get_by_text("No network").wait_for()
+        page.context.set_offline(False)
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == 1
+
+
+def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(4500)
+        page.evaluate("window.addEventListener('pagehide', (e) => e.stopImmediatePropagation(), true)")
+        page.reload()
+        page.wait_for_selector("main[data-ready]")
+        page.get_by_role("button", name="Keep and send").last.click()
+        arrived(page)
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+
+
+def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
+    with filming(camera, visit, orientation=False) as page:
+        page.locator(".allow").click()
+        page.get_by_text("tells no orientation").wait_for()
+        film(page, 1.5)
+        page.locator(".again").click()
+        page.get_by_text("None yet").wait_for()
+        film(page, 1.5)
+        page.locator(".keep").click()
+        arrived(page)
+    assert (video.Video & {"session_id": visit}).fetch1("camera_motion") == "static"
+    assert len(video.PhoneAttitude()) == 0 and len(PhoneRecording()) == 1
+
+
+def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
+    with filming(chromium, visit, denied=True) as page:  # has none
+        page.locator(".allow").click()
+        page.locator(".said", has_text="camera").wait_for()
+    with filming(camera, visit, denied=True) as page:
+        page.evaluate(
+            "navigator.mediaDevices.getUserMedia = () => Promise.reject(new DOMException('', 'NotAllowedError'))"
+        )
+        page.locator(".allow").click()
+        page.locator(".said", has_text="Permissions").wait_for()
+
+
+def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate("delete globalThis.VideoEncoder")
+        film(page)
+        page.locator(".said", has_text="less exact").wait_for()
+        page.locator(".keep").click()
+        arrived(page)
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: str, tmp_path: Path):
+    """At three widths, upright and on its side: nothing sticks out, and axe finds nothing."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    folder = Path(os.environ.get("PBL_PICTURES") or tmp_path)
+    with filming(camera, visit, color_scheme=scheme, locale="de" if scheme == "dark" else "en") as page:
+        page.locator(".allow").click()
+        page.wait_for_timeout(800)
+        for width, height in ((360, 740), (390, 844), (430, 932), (844, 390)):
+            page.set_viewport_size({"width": width, "height": height})
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            page.screenshot(path=folder / f"phone-{width}-{scheme}.png", full_page=True)
+            found = Axe().run(page).response["violations"]
+            assert not [v["id"] for v in found if v["impact"] in ("serious", "critical")], found
+        film(page, 1.0)
+        page.screenshot(path=folder / f"phone-after-{scheme}.png", full_page=True)
+        page.locator(".again").click()
