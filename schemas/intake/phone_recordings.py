@@ -230,15 +230,15 @@ def recordings(session_id: int) -> list[Sent]:
 
 
 def filming(session_id: int) -> dict[str, Any]:
-    """Return how a visit is filmed with phones: "links" that are open, without their sums; recordings "sent" that are
-    not registered as videos; "several", whether more than one phone sent some."""
+    """Return how a visit is filmed with phones: "links" that are open, without their sums; the recordings "sent";
+    "several", whether more than one phone sent some."""
     links = open_links(session_id)
     kept = ("phone_link", "link_by", "link_expires")
     sent = recordings(session_id)
     phones = {int(n) for n in (PhoneRecording & {"session_id": session_id}).to_arrays("phone_link")}
     return {
         "links": [{**{name: link[name] for name in kept}, "used": bool(link["link_phone_sha256"])} for link in links],
-        "sent": [one for one in sent if one.state != RECEIVED],
+        "sent": sent,
         "several": len(phones) > 1,
     }
 
@@ -259,8 +259,7 @@ def upload_refused(found: str, next_step: str = "film again; if it happens again
     return PblError(
         "UPLOAD_REFUSED",
         found=found,
-        expected=f"a recording of at most {PART_BYTES * MOST_PARTS / 1e6:.0f} MB in parts of {PART_BYTES >> 20} MiB, as "
-        "the page of a phone sends it",
+        expected=f"a recording of at most {PART_BYTES * MOST_PARTS / 1e6:.0f} MB, as the page of a phone sends it",
         next_step=next_step,
     )
 

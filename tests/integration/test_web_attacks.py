@@ -25,7 +25,16 @@ from workers.web import Options, Where, connections, create_app
 #: What a page must never run, whatever it stands in.
 EVIL = '"><img src=x onerror=alert(1)><script>document.title="pwned"</script>'
 #: Addresses that anybody may open, and that any session may.
-OPEN = {"/", "/enter", "/static/1", "/vendor/1", "/phone/open", "/phone/offline.js"}
+OPEN = {
+    "/",
+    "/enter",
+    "/static/1",
+    "/vendor/1",
+    "/phone/open",
+    "/phone/offline.js",
+    "/phone/store.js",
+    "/phone/authority.crt",
+}
 ANY_ROLE = {"/leave", "/language"}
 #: Addresses for phones, attacked in test_web_phone.py: no session is one, and no form is sent to them.
 OF_PHONES = {"/phone/recordings.json", "/phone/finish/1.json"}

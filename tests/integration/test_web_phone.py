@@ -15,12 +15,15 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from schemas import session, video
+from pbl_pipeline.qc import Check
+from schemas import keypoints, session, video
 from schemas.capture import PhoneLink, PhoneRecording
+from schemas.checks import check_row
 from schemas.intake import VisitRecord, phone_recordings
 from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from schemas.intake.visits import session_ids
 from schemas.jobs import jobs_of
+from schemas.reading.usable import Next
 from schemas.transactions import in_transaction
 from tests.integration import web
 from tests.integration.chain import small_video
@@ -28,7 +31,9 @@ from tests.integration.compute_target import nothing
 from tests.integration.test_web_accounts import running
 from tests.rows import register
 from workers import phone_uploads, queue
+from workers.populate import populate
 from workers.web import Options, Where, create_app
+from workers.web.phone import next_words
 
 
 @pytest.fixture
@@ -54,7 +59,8 @@ def link_of(visit: int) -> str:
     answer = web.post(web.client(target=nothing), f"/visits/{visit}/film", hours=2)
     assert answer.status_code == 200, answer.text
     found = re.search(r"/phone/open\?key=([\w-]+)", answer.text)
-    assert found and 'class="qr"' in answer.text
+    assert found
+    assert 'class="qr"' in answer.text
     return found[1]
 
 
@@ -127,17 +133,20 @@ def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
     mine, other = stranger(), stranger()
     assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
     page = mine.get("/phone")
-    assert page.status_code == 200 and "P001" in page.text
+    assert page.status_code == 200
+    assert "P001" in page.text
     assert "camera=(self)" in page.headers["permissions-policy"]
     # The same phone may scan it again; another one may not, and neither can take it by a wrong key.
     assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
     answer = other.get("/phone/open", params={"key": key}, follow_redirects=False)
-    assert answer.status_code == 403 and "PHONE_LINK" in answer.text
+    assert answer.status_code == 403
+    assert "PHONE_LINK" in answer.text
     assert other.get("/phone").status_code == 401
     assert other.get("/phone/open", params={"key": key + "x"}, follow_redirects=False).status_code == 403
     # No key and no cookie is in the tables.
     row = PhoneLink().fetch1()
-    assert key not in str(row) and mine.cookies["pbl_phone"] not in str(row)
+    assert key not in str(row)
+    assert mine.cookies["pbl_phone"] not in str(row)
     reviewer = web.client(target=nothing)
     assert "opened by a phone" in reviewer.get(f"/visits/{visit}").text
     web.post(reviewer, f"/visits/{visit}/film/end", link=row["phone_link"])
@@ -179,7 +188,8 @@ def test_a_recording_arrives_with_its_log_in_the_visit_and_is_computed_first(vis
     assert PhoneRecording().fetch1("video_id") == row["video_id"]
     # Its job is the first in the queue, and nothing of the parts is left.
     waiting = jobs_of(video.VideoInfo).pending.to_dicts(order_by="priority")
-    assert [j["video_id"] for j in waiting][0] == row["video_id"] and len(waiting) == 2
+    assert waiting[0]["video_id"] == row["video_id"]
+    assert len(waiting) == 2
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
 
@@ -227,8 +237,9 @@ def test_torn_down_a_hundred_times_every_recording_arrives_once(visit: int, tmp_
         waiting = list(films)
         while waiting:
             whole = rng.choice(waiting)
-            told = request("POST", "/phone/recordings.json", json.dumps(stated(whole, log)).encode(), "application/json",
-                           torn < 100 and rng.random() < 0.1)  # fmt: skip
+            body = json.dumps(stated(whole, log)).encode()
+            cut = torn < 100 and rng.random() < 0.1
+            told = request("POST", "/phone/recordings.json", body, "application/json", cut)
             if told is None:
                 torn += 1
                 continue
@@ -266,6 +277,44 @@ def test_torn_down_a_hundred_times_every_recording_arrives_once(visit: int, tmp_
 def serving() -> Iterator[int]:
     with running(create_app(Options(target=nothing)), Where()) as port:
         yield port
+
+
+def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tmp_path: Path):
+    browser, reviewer = phone(visit), web.client(target=nothing)
+    send(browser, small_video(tmp_path, "walk").read_bytes())
+    told = browser.get("/phone/state.json").json()
+    assert told["recordings"][0]["verdict"] == "The server has it and looks at it."
+    assert told["next"] == ""
+    send(browser, small_video(tmp_path, "empty", people="nobody").read_bytes())
+    populate()
+    walked, empty = sorted(browser.get("/phone/state.json").json()["recordings"], key=lambda r: r["number"])
+    assert re.fullmatch(r"Usable.*[1-9]\d* gait cycles left, \d+ right\.", walked["verdict"]), walked["verdict"]
+    assert walked["verdict"] in reviewer.get(f"/visits/{visit}").text
+    german = browser.get("/phone/state.json", headers={"accept-language": "de"}).json()["recordings"]
+    assert any("Gangzyklen links" in r["verdict"] for r in german)
+    assert empty["state"] == "received"
+
+
+def test_what_cannot_be_used_is_said_with_what_to_do(visit: int, tmp_path: Path):
+    browser = phone(visit)
+    send(browser, film(tmp_path))
+    populate()
+    key = keypoints.Keypoints().fetch1("KEY")
+    (keypoints.Keypoints.Check & key).delete_quick()
+    check = Check("feet_cut_share", "FAIL", 0.4, 0.3, "the feet leave the picture below: tilt the phone or step back")
+    keypoints.Keypoints.Check.insert1({**key, **check_row("keypoints", check)})
+    said = browser.get("/phone/state.json").json()["recordings"][0]["verdict"]
+    assert said.startswith("Film again: the feet leave the picture below: tilt the phone or step back (40%)")
+
+
+@pytest.mark.parametrize(("now", "then", "side", "words"), [
+    (9.0, 6.0, "right", "Index so far: +-9 (90 %). One more pass filmed from the right side makes it +-6."),
+    (9.0, 6.2, "", "Index so far: +-9 (90 %). One more pass filmed from the front or back makes it +-6."),
+    (5.2, 5.0, "left", "Index so far: +-5 (90 %)."),
+])  # fmt: skip
+def test_what_to_film_next(now: float, then: float, side: str, words: str):
+    assert next_words("en", Next(side, now, then)) == words
+    assert next_words("de", Next(side, now, then)).startswith("Index bisher")
 
 
 # ------------------------------------------------------------------------------------------------------------ attacks
@@ -322,7 +371,8 @@ def test_what_is_not_a_part_is_refused(visit: int, tmp_path: Path):
     number, part, size = begin(browser, whole)["number"], parts_of(whole)[0], len(whole)
     for content_range in (f"bytes 1-4096/{size}", f"bytes 0-4094/{size}", f"bytes 0-4095/{size + 1}", "bytes 0-4095/*",
                           f"bytes {size // 4096 * 4096 + 4096}-{size + 4096}/{size}", "", "bytes -1-4095/9",
-                          f"bytes 00-4095/{size}", f"bytes 0-{size - 1}/{size}", f"bytes 0-4095/{size}, 0-1/2"):  # fmt: skip
+                          f"bytes 00-4095/{size}", f"bytes 0-{size - 1}/{size}",
+                          f"bytes 0-4095/{size}, 0-1/2"):  # fmt: skip
         answer = put(browser, number, 0, part, size, **{"content-range": content_range})
         assert code(answer) in ("UPLOAD_REFUSED", "WEB_REFUSED"), content_range
     assert code(put(browser, number, 0, part[:-1] + b"?", size, **{"x-sha256": "0" * 64})) == "UPLOAD_REFUSED"
@@ -330,7 +380,7 @@ def test_what_is_not_a_part_is_refused(visit: int, tmp_path: Path):
         assert put(browser, number, 0, part, size, **{"content-type": kind}).status_code == 415
     # A body of 10 GB is refused by what it announces, one that announces nothing by what comes.
     assert put(browser, number, 0, part, size, **{"content-length": str(10 * 2**30)}).status_code == 413
-    endless = (b"x" * 4096 for _ in range(10**6))
+    endless = (b"x" * 4096 for _ in range(1000))
     own = {"content-type": "application/octet-stream", "content-range": f"bytes 0-4095/{size}"}
     answer = browser.put(f"/phone/recordings/{number}.json", content=endless, headers=own)
     assert answer.status_code in (413, 422)
@@ -351,9 +401,11 @@ def test_no_page_from_elsewhere_makes_a_phone_send(visit: int, tmp_path: Path):
 def test_what_is_no_video_or_comes_with_a_bad_log_is_refused_by_its_code(visit: int, tmp_path: Path):
     browser = phone(visit)
     told = send(browser, b"no video at all" * 1000)
-    assert told["state"] == "refused" and told["error"].startswith("VIDEO_NOT_A_VIDEO")
+    assert told["state"] == "refused"
+    assert told["error"].startswith("VIDEO_NOT_A_VIDEO")
     told = send(browser, film(tmp_path), b'{"time_s": [1]}')
-    assert told["state"] == "refused" and told["error"].startswith("PHONE_LOG")
+    assert told["state"] == "refused"
+    assert told["error"].startswith("PHONE_LOG")
     assert len(video.Video()) == 0
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
     assert "cannot be used" in web.client(target=nothing).get(f"/visits/{visit}").text

@@ -67,6 +67,8 @@ EXPECTED = {
     "POST /visits/1/film/end": (DECIDE, ""),
     "GET /phone/open": ("*", ""),
     "GET /phone/offline.js": ("*", ""),
+    "GET /phone/store.js": ("*", ""),
+    "GET /phone/authority.crt": ("*", ""),
     "GET /phone": (PHONE, ""),
     "GET /phone/state.json": (PHONE, ""),
     "POST /phone/recordings.json": (PHONE, ""),

@@ -12,6 +12,7 @@ from typing import Any
 
 import segno
 from markupsafe import Markup
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
@@ -19,10 +20,11 @@ from pbl_pipeline.errors import PblError
 from schemas.capture import UPLOADING
 from schemas.intake import phone_recordings
 from schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
+from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
 from ..process_queue import ProcessQueue
-from . import texts
+from . import certificates, texts
 from .access import BODY_BYTES, Cookie, Refused, Session, form_of
 from .address import FILM, OPEN, Address, number_of, whole_number
 from .computing import Target
@@ -37,6 +39,8 @@ _MAY = {
 }
 #: Hours for which a link can be made on the page.
 HOURS = ("2", "8")
+#: Visits of which is kept what one more pass would bring.
+_KEPT = 20
 _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
 #: Group of the catalogue with the texts that the script says.
 _SAID = "capture."
@@ -67,9 +71,16 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         if hours not in HOURS:
             raise Refused("form")
         link, key = await tables.ask(phone_recordings.make_link, number, session.name, float(hours))
-        address = f"{request.url.scheme}://{request.headers['host']}/phone/open?key={key}"
-        secure = request.url.scheme == "https"
-        shown = {"number": number, "link": link, "address": address, "hours": hours, "secure": secure}
+        page = f"{request.url.scheme}://{request.headers['host']}/phone"
+        address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
+        shown = {
+            "number": number,
+            "link": link,
+            "address": address,
+            "hours": hours,
+            "secure": request.url.scheme == "https",
+            "trust": qr_code(trust) if certificates.authority().is_file() else "",
+        }
         return pages.show(request, "film.html", code=qr_code(address), **shown)
 
     async def end(request: Request) -> Response:
@@ -99,14 +110,28 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def state(request: Request) -> Response:
         phone: Phone = request.state.phone
-        found = await tables.ask(phone_recordings.recordings, phone.session_id)
+        language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+        recordings, more = await tables.ask(known, phone.session_id)
         return JSONResponse(
             {
                 "visit": phone.session_id,
                 "expires": f"{phone.expires.isoformat()}Z",
-                "recordings": [_shown(sent) for sent in found],
+                "recordings": [{**_shown(sent), "verdict": verdict(language, judged)} for sent, judged in recordings],
+                "next": next_words(language, more),
             }
         )
+
+    #: What one more pass would bring, of the visits asked for last, by what their results are told apart by.
+    worth: dict[int, tuple[tuple[str, ...], Next | None]] = {}
+
+    def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None]:
+        sent = phone_recordings.recordings(session_id)
+        judged = [(one, None if one.video_id is None else usable(one.video_id)) for one in sent]
+        if worth.get(session_id, ((), None))[0] != (now := computed(session_id)):
+            if len(worth) >= _KEPT:
+                worth.clear()
+            worth[session_id] = now, next_pass(session_id)
+        return judged, worth.get(session_id, ((), None))[1]
 
     async def begin(request: Request) -> Response:
         try:
@@ -158,8 +183,16 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         return JSONResponse({**_shown(sent), "missing": missing})
 
     async def worker(request: Request) -> Response:
-        path = Path(__file__).parent / "static" / "capture_offline.js"
+        """A script with a thread of its own; below the page's address, so that it is there without network as well."""
+        path = Path(__file__).parent / "static" / f"capture_{request.url.path.rpartition('/')[2]}"
         return FileResponse(path, media_type="text/javascript", headers={"service-worker-allowed": "/phone"})
+
+    async def authority(request: Request) -> Response:
+        if not certificates.authority().is_file():
+            raise HTTPException(404)
+        return FileResponse(
+            certificates.authority(), media_type="application/x-x509-ca-cert", filename="laboratory.crt"
+        )
 
     return [
         Address("/visits/{session_id:int}/film", make, "decide", methods=["POST"]),
@@ -167,11 +200,37 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         Address("/phone/open", opened, OPEN),
         Address("/phone", page, FILM),
         Address("/phone/offline.js", worker, OPEN),
+        Address("/phone/store.js", worker, OPEN),
+        Address("/phone/authority.crt", authority, OPEN),
         Address("/phone/state.json", state, FILM),
         Address("/phone/recordings.json", begin, FILM, methods=["POST"]),
         Address("/phone/recordings/{phone_recording:int}.json", part, FILM, methods=["PUT"]),
         Address("/phone/finish/{phone_recording:int}.json", finish, FILM, methods=["POST"]),
     ]
+
+
+def verdict(language: str, judged: Usable | None) -> str:
+    """Return in a sentence whether a recording can be used; empty of one that is not registered."""
+    if judged is None:
+        return ""
+    why = [texts.plain_library(language, said) for said in judged.said]
+    if judged.cycles is not None and not any(judged.cycles):
+        why.append(texts.text(language, "capture.no_cycles"))
+    said = texts.text(language, f"capture.{judged.state}", why="; ".join(why))
+    if judged.cycles is not None and any(judged.cycles):
+        left, right = judged.cycles
+        said = f"{said}. {texts.text(language, 'capture.cycles', left=left, right=right)}"
+    return said + "."
+
+
+def next_words(language: str, more: Next | None) -> str:
+    """Return what one more pass would bring, in two sentences; empty where that is not known."""
+    if more is None:
+        return ""
+    now = texts.text(language, "capture.index", now=f"{more.now:.0f}")
+    if round(more.then) >= round(more.now):
+        return now
+    return f"{now} {texts.text(language, f'capture.next_{more.side}', then=f'{more.then:.0f}')}"
 
 
 def qr_code(address: str) -> Markup:

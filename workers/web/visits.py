@@ -16,6 +16,7 @@ from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
 from .pages import Pages, as_json
+from .phone import verdict
 from .plain_values import plain
 from .source import Source
 from .tables import Asks, Tables
@@ -32,7 +33,7 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         values = {"about": about, "told": told, **await asks.ask(source.around, about)}
         if as_json(request):  # loads arrays, which not every thread may
             values = await asks.ask(plain, values)
-        return pages.show(request, "visit.html", interval=interval, **values)
+        return pages.show(request, "visit.html", interval=interval, verdict=verdict, **values)
 
     return page("/visits/{session_id:int}", visit, "look")
 

@@ -117,7 +117,7 @@ async function decided(kept) {
   $(".film").hidden = false, $(".after").hidden = true;
   if (kept) {
     const { file, ...facts } = { ...taken, complete: true };
-    await keep({ ...facts, about: { ...facts.about, note: $("[name=note]").value } });
+    await keep({ ...facts, about: { ...facts.about, ...stated() } });
     $("[name=note]").value = "";
   } else await remove(taken.name);
   say("ready");
@@ -191,7 +191,8 @@ async function show() {
     return line;
   });
   for (const one of told?.recordings ?? [])
-    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict ?? (one.error ? t("refused", { why: one.error }) : t("received"))));
+    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict || t("refused", { why: one.error })));
+  $(".next").textContent = told?.next ?? "";
   list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);

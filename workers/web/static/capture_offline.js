@@ -2,7 +2,7 @@
 
 const CACHE = "phone-1";
 const PARTS = ["/phone", "/static/page.css", "/static/capture.css", "/static/icon.svg", "/static/capture.js", "/static/capture_film.js",
-  "/static/capture_sensors.js", "/static/capture_takes.js", "/static/capture_store.js", "/vendor/mediabunny-1.61.0.min.js"];
+  "/static/capture_sensors.js", "/static/capture_takes.js", "/phone/store.js", "/vendor/mediabunny-1.61.0.min.js"];
 const worker = /** @type {any} */ (self);
 
 worker.addEventListener("install", (/** @type {any} */ event) => {

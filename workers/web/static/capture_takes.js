@@ -2,7 +2,7 @@
 
 /** @typedef {{name: string, visit: number, made: number, about: Record<string, any>, log: any, complete: boolean}} Facts */
 
-const worker = new Worker("/static/capture_store.js");
+const worker = new Worker("/phone/store.js");
 /** @type {Map<number, {done: () => void, failed: (error: any) => void}>} */
 const asked = new Map();
 let count = 0;
