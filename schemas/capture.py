@@ -12,12 +12,34 @@ UPLOADING, RECEIVED, REFUSED = "uploading", "received", "refused"
 
 
 @schema
+class Protocol(dj.Manual):
+    definition = """
+    # what is filmed in a visit; a phone's page leads through it
+    protocol         : varchar(32)
+    ---
+    protocol_created : datetime                # when registered, UTC
+    """
+
+    class Step(dj.Part):
+        definition = """
+        -> master
+        step_no        : int16                 # from 1, in the order of filming
+        ---
+        step_activity  : varchar(32)           # as in Video
+        step_pace=''   : varchar(32)           # as in Pace; empty for any
+        step_view      : enum('left', 'right', 'front', 'any')  # side from which the person is filmed; front: or back
+        step_passes    : int16                 # recordings that are wanted
+        """
+
+
+@schema
 class PhoneLink(dj.Manual):
     definition = """
     # a link by which one phone films for one visit; it opens nothing after its time, or once it was ended
     phone_link           : int32
     ---
     -> session.Session
+    -> [nullable] Protocol
     link_key_sha256      : char(64)            # of the key in the link, which itself is kept nowhere
     link_phone_sha256='' : varchar(64)         # of the cookie of the phone that opened it first; empty before
     link_by              : varchar(64)         # name of who made it, as the page or the command knows it

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
 from .. import session
-from ..capture import RECEIVED, REFUSED, UPLOADING, PhoneLink, PhoneRecording
+from ..capture import RECEIVED, REFUSED, UPLOADING, PhoneLink, PhoneRecording, Protocol
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id
 
@@ -61,13 +61,20 @@ class Sent:
 
 
 # --------------------------------------------------------------------------------------------------------------- links
-def make_link(session_id: int, by: str, hours: float = HOURS) -> tuple[int, str]:
+def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | None = None) -> tuple[int, str]:
     """Insert a link for a visit; return its number and its key, which is kept nowhere.
 
-    Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for a time that is too long.
+    Raises `PblError` DB_NOT_FOUND for an unknown visit or protocol, USAGE for a time that is too long.
     """
     if not session.Session & {"session_id": session_id}:
         raise session.unknown_visit(session_id)
+    if protocol is not None and not Protocol & {"protocol": protocol}:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no protocol {protocol}",
+            expected="a registered protocol",
+            next_step="`pbl capture protocol NAME SHEET` registers one",
+        )
     if not 0 < hours <= MOST_HOURS:
         raise PblError(
             "USAGE",
@@ -83,6 +90,7 @@ def make_link(session_id: int, by: str, hours: float = HOURS) -> tuple[int, str]
             {
                 "phone_link": number,
                 "session_id": session_id,
+                "protocol": protocol,
                 "link_key_sha256": hashed(key),
                 "link_by": by[:64],
                 "link_created": now,
@@ -175,7 +183,8 @@ def begin(phone: Phone, stated: object) -> Sent:
     """
     if not isinstance(stated, dict):
         raise upload_refused("no statement of a recording")
-    sha256, sizes = stated.get("sha256"), [stated.get("video_bytes"), stated.get("log_bytes")]
+    sha256: Any = stated.get("sha256")
+    sizes: list[Any] = [stated.get("video_bytes"), stated.get("log_bytes")]
     if not isinstance(sha256, str) or len(sha256) != 64 or set(sha256) - set("0123456789abcdef"):
         raise upload_refused("a recording without its SHA-256")
     if any(type(n) is not int or n < 0 for n in sizes) or not sizes[0]:

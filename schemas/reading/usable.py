@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from pbl_pipeline.gait import intervals_with_one_more
 from pbl_pipeline.qc import FAIL, PASS
 
 from .. import gait, keypoints, qc, video
@@ -61,13 +60,15 @@ def usable(video_id: int) -> Usable:
 def next_pass(session_id: int) -> Next | None:
     """Return what one more pass of a visit would bring most; None before its index is known, or where its error is
     not known. Loads the visit."""
+    from pbl_pipeline.gait import intervals_with_one_more
+
     about = shown_visit(session_id)
     visit = about.visit
-    if about.shown is None or visit is None or visit.judged is None or visit.judged.gdi.interval is None:
+    if about.shown is None or visit is None or visit.judged is None:
         return None
     index = visit.judged.gdi
     after = intervals_with_one_more(visit.judged.cycles, index)
-    if not after:
+    if not after or index.interval is None:
         return None
     side = min(after, key=lambda s: after[s])
     low, high = index.interval

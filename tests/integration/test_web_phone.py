@@ -13,14 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from starlette.testclient import TestClient
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
+from pbl_pipeline.words import UNUSABLE
 from schemas import keypoints, session, video
 from schemas.capture import PhoneLink, PhoneRecording
 from schemas.checks import check_row
+from schemas.cli.capture import capture
 from schemas.intake import VisitRecord, phone_recordings
 from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
+from schemas.intake.protocols import add_protocol, read_protocol
 from schemas.intake.visits import session_ids
 from schemas.jobs import jobs_of
 from schemas.reading.usable import Next
@@ -54,9 +59,9 @@ def stranger() -> TestClient:
     return web.client(signed_in=False, target=nothing)
 
 
-def link_of(visit: int) -> str:
+def link_of(visit: int, **fields: object) -> str:
     """The key of a new link, as the page of the visit makes it."""
-    answer = web.post(web.client(target=nothing), f"/visits/{visit}/film", hours=2)
+    answer = web.post(web.client(target=nothing), f"/visits/{visit}/film", **{"hours": 2, **fields})
     assert answer.status_code == 200, answer.text
     found = re.search(r"/phone/open\?key=([\w-]+)", answer.text)
     assert found
@@ -64,10 +69,10 @@ def link_of(visit: int) -> str:
     return found[1]
 
 
-def phone(visit: int) -> TestClient:
+def phone(visit: int, **fields: object) -> TestClient:
     """A phone that has opened a new link of the visit."""
     browser = stranger()
-    answer = browser.get("/phone/open", params={"key": link_of(visit)}, follow_redirects=False)
+    answer = browser.get("/phone/open", params={"key": link_of(visit, **fields)}, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/phone")
     return browser
 
@@ -305,6 +310,57 @@ def test_what_cannot_be_used_is_said_with_what_to_do(visit: int, tmp_path: Path)
     keypoints.Keypoints.Check.insert1({**key, **check_row("keypoints", check)})
     said = browser.get("/phone/state.json").json()["recordings"][0]["verdict"]
     assert said.startswith("Film again: the feet leave the picture below: tilt the phone or step back (40%)")
+
+
+def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
+    sheet = tmp_path / "clinic.csv"
+    sheet.write_text("activity,pace,view,passes\nwalking,self_selected,left,1\ntug,,any,2\n")
+    steps = read_protocol(sheet)
+    assert add_protocol("clinic", steps)
+    assert not add_protocol("clinic", steps)
+    with pytest.raises(PblError, match="USAGE"):
+        add_protocol("clinic", steps[:1])
+    reviewer = web.client(target=nothing)
+    assert "<option>clinic</option>" in reviewer.get(f"/visits/{visit}").text
+    browser = phone(visit, protocol="clinic")
+    for n, step in enumerate((1, 2, 2)):
+        done = [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]]
+        assert done == [min(n, 1), max(0, n - 1)]
+        send(browser, film(tmp_path, f"walk{n}"), activity=steps[step - 1].activity, step=str(step))
+    assert "complete by its protocol" in reviewer.get(f"/visits/{visit}").text
+    assert sorted((video.Video & {"session_id": visit}).to_arrays("activity")) == ["tug", "tug", "walking"]
+    # What cannot be used does not count.
+    video.NotUsable.insert1(
+        {
+            "video_id": 1,
+            "unusable_reason": next(iter(UNUSABLE)),
+            "unusable_by": "R",
+            "unusable_created": "2026-01-01 00:00:00",
+        }
+    )
+    assert [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]] == [0, 2]
+    answer = web.post(reviewer, f"/visits/{visit}/film", hours=2, protocol="unknown")
+    assert answer.status_code == 404
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["activity,view\nwalking,above\n", "view\nleft\n", "activity\n"]
+    + [f"activity,passes\nwalking,{n}\n" for n in ("0", "1.5", "x")],
+)
+def test_a_protocol_that_cannot_be_is_refused(text: str, tmp_path: Path):
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(PblError, match="SHEET_FORMAT"):
+        read_protocol(tmp_path / "p.csv")
+
+
+def test_the_command_prints_a_link_that_opens(visit: int):
+    done = CliRunner().invoke(capture, ["link", "--visit", str(visit), "--url", "https://gait.example:8484/"])
+    assert done.exit_code == 0, done.output
+    address = done.output.splitlines()[-1]
+    assert address.startswith("https://gait.example:8484/phone/open?key=")
+    answer = stranger().get(address.removeprefix("https://gait.example:8484"), follow_redirects=False)
+    assert answer.status_code == 303
 
 
 @pytest.mark.parametrize(("now", "then", "side", "words"), [

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,9 @@ def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     info = probe(row["video_path"])
     assert info.n_frames == len(times) == about["frames"] > 45
     assert (info.width_px, info.height_px) == (640, 480)
+    assert (bool(info.make), bool(info.model)) == (True, True)  # by which a calibration of the phone is found
+    assert info.lens.endswith("camera.mjpeg")
+    assert info.recorded_utc.startswith(f"{datetime.now(UTC):%Y-%m-%d}")
     assert np.abs(info.time_s - (times - times[0])).max() < 0.002
     # The turn stands in the log at its moment of the video's clock.
     (path,) = Path(row["video_path"]).parent.glob("*.json")

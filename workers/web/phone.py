@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
+import functools
 import io
 import json
 import re
@@ -20,6 +22,7 @@ from pbl_pipeline.errors import PblError
 from schemas.capture import UPLOADING
 from schemas.intake import phone_recordings
 from schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
+from schemas.intake.protocols import Step, steps_of
 from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
@@ -70,7 +73,8 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         number, hours = number_of(request), fields.get("hours", "")
         if hours not in HOURS:
             raise Refused("form")
-        link, key = await tables.ask(phone_recordings.make_link, number, session.name, float(hours))
+        make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
+        link, key = await tables.ask(make_link, number, session.name, float(hours))
         page = f"{request.url.scheme}://{request.headers['host']}/phone"
         address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
         shown = {
@@ -111,27 +115,28 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
     async def state(request: Request) -> Response:
         phone: Phone = request.state.phone
         language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
-        recordings, more = await tables.ask(known, phone.session_id)
+        recordings, more, steps = await tables.ask(known, phone.session_id)
         return JSONResponse(
             {
                 "visit": phone.session_id,
                 "expires": f"{phone.expires.isoformat()}Z",
                 "recordings": [{**_shown(sent), "verdict": verdict(language, judged)} for sent, judged in recordings],
                 "next": next_words(language, more),
+                "protocol": [dataclasses.asdict(step) for step in steps],
             }
         )
 
     #: What one more pass would bring, of the visits asked for last, by what their results are told apart by.
     worth: dict[int, tuple[tuple[str, ...], Next | None]] = {}
 
-    def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None]:
+    def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None, list[Step]]:
         sent = phone_recordings.recordings(session_id)
         judged = [(one, None if one.video_id is None else usable(one.video_id)) for one in sent]
         if worth.get(session_id, ((), None))[0] != (now := computed(session_id)):
             if len(worth) >= _KEPT:
                 worth.clear()
             worth[session_id] = now, next_pass(session_id)
-        return judged, worth.get(session_id, ((), None))[1]
+        return judged, worth.get(session_id, ((), None))[1], steps_of(session_id)
 
     async def begin(request: Request) -> Response:
         try:

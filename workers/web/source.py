@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Visit
 from schemas.decisions import candidates, review_decisions
-from schemas.intake import phone_recordings
+from schemas.intake import phone_recordings, protocols
 from schemas.reading import shown
 from schemas.reading.usable import usable
 from schemas.reading.visit_progress import Progress, visit_progress
@@ -116,4 +116,4 @@ class TablesSource:
 def _filming(session_id: int) -> dict[str, Any]:
     found = phone_recordings.filming(session_id)
     sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in found["sent"]]
-    return {**found, "sent": sent}
+    return {**found, "sent": sent, "steps": protocols.steps_of(session_id), "protocols": protocols.protocols()}

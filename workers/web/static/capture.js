@@ -30,6 +30,8 @@ let take = null;
 /** @type {any} */
 let taken = null;
 let why = "";
+/** The step of the protocol that is filmed. @type {any} */
+let chosen = null;
 
 allow.onclick = async () => {
   if (!navigator.mediaDevices) return say("not_secure");
@@ -61,7 +63,7 @@ async function start() {
   taken = { name, visit, made: Date.now(), about: stated(), log: null, complete: false, file };
   why = "";
   sensors.trim();
-  take = new Take(/** @type {MediaStream} */ (stream), video, file, (name) => stop(name));
+  take = new Take(/** @type {MediaStream} */ (stream), video, file, await phoneModel(), (name) => stop(name));
   await keepFacts();
   await take.start();
   page.dataset.filming = "yes";
@@ -72,7 +74,8 @@ async function start() {
 /** What is stated of the recording that is filmed now. */
 function stated() {
   const form = new FormData($("form"));
-  return Object.fromEntries([...form].filter(([, value]) => value).map(([name, value]) => [name, String(value)]));
+  const told = Object.fromEntries([...form].filter(([, value]) => value).map(([name, value]) => [name, String(value)]));
+  return { ...(chosen ? { activity: chosen.activity, pace: chosen.pace } : {}), ...told };
 }
 
 /** Its facts on the phone, with the log so far: also of one that is never ended. */
@@ -84,8 +87,9 @@ async function keepFacts() {
 }
 
 async function phoneModel() {
-  const about = await /** @type {any} */ (navigator).userAgentData?.getHighEntropyValues(["model"]).catch(() => null);
-  return { make: "", model: (about?.model || /\(([^;)]+)/.exec(navigator.userAgent)?.[1] || "").slice(0, 64) };
+  const about = await /** @type {any} */ (navigator).userAgentData?.getHighEntropyValues(["model", "platform"]).catch(() => null);
+  const [, told = ""] = /\(([^;)]+)/.exec(navigator.userAgent) ?? [];
+  return { make: about?.platform || (/^iP/.test(told) ? "Apple" : "browser"), model: (about?.model || told).slice(0, 64) };
 }
 
 /** @param {string} reason a text, where it ended by itself */
@@ -173,6 +177,30 @@ async function sendAll() {
   await show();
 }
 
+/** The steps of the protocol: what came is ticked off, a tap chooses what is filmed now. @param {any[]} steps */
+function lead(steps) {
+  const form = $("form");
+  $(".protocol").hidden = !steps.length;
+  $(".complete").textContent = steps.length && steps.every((step) => step.done >= step.passes) ? t("complete") : "";
+  $(".steps").replaceChildren(...steps.map((step) => {
+    const line = document.createElement("li"), button = document.createElement("button");
+    const of = (/** @type {string} */ name) => (texts[`is_${step[name]}`] ? t(`is_${step[name]}`) : step[name]);
+    button.type = "button";
+    button.textContent = `${step.done >= step.passes ? "\u2713 " : ""}${[of("activity"), of("pace"), t(`view_${step.view}`)].filter(Boolean).join(", ")}: ${t("done", { n: step.done, all: step.passes })}`;
+    button.ariaPressed = String(form.elements.step.value === String(step.number));
+    button.onclick = () => {
+      form.elements.step.value = step.number;
+      for (const name of ["activity", "pace"])
+        for (const choice of form.querySelectorAll(`[name=${name}]`)) choice.checked = choice.value === step[name];
+      chosen = step;
+      lead(steps);
+    };
+    line.append(button);
+    return line;
+  }));
+  if (!form.elements.step.value && steps.length) (/** @type {any} */ ($(".steps button:not([aria-pressed='true'])")))?.click();
+}
+
 /** The recordings of this phone and of the visit. */
 async function show() {
   const found = await all(), told = await request("/phone/state.json").catch(() => null);
@@ -193,6 +221,7 @@ async function show() {
   for (const one of told?.recordings ?? [])
     if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict || t("refused", { why: one.error })));
   $(".next").textContent = told?.next ?? "";
+  if (told && !take) lead(told.protocol);
   list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);

@@ -50,9 +50,9 @@ async function configuration(frame, rate) {
 
 /** One take. `ended` is called with a name of the texts where it ends by itself. */
 export class Take {
-  /** @param {MediaStream} stream @param {HTMLVideoElement} video @param {{write: (at: number, bytes: Uint8Array) => Promise<void>}} file @param {(why: string) => void} ended */
-  constructor(stream, video, file, ended) {
-    this.stream = stream, this.video = video, this.file = file, this.ended = ended;
+  /** @param {MediaStream} stream @param {HTMLVideoElement} video @param {{write: (at: number, bytes: Uint8Array) => Promise<void>}} file @param {{make: string, model: string}} phone @param {(why: string) => void} ended */
+  constructor(stream, video, file, phone, ended) {
+    this.stream = stream, this.video = video, this.file = file, this.phone = phone, this.ended = ended;
     this.track = stream.getVideoTracks()[0];
     this.frames = 0, this.dropped = 0, this.how = "", this.startMs = 0, this.endMs = 0;
     /** Times of the frames that were written (us, of the camera's clock); for tests. @type {number[]} */
@@ -78,11 +78,14 @@ export class Take {
     const { kind, wanted } = await configuration(frame, rate);
     const size = [frame.codedWidth, frame.codedHeight].join();
     const output = new Output({
-      format: new Mp4OutputFormat({ fastStart: "fragmented", minimumFragmentDuration: 1 }),
+      format: new Mp4OutputFormat({ fastStart: "fragmented", minimumFragmentDuration: 1, metadataFormat: "mdta" }),
       target: new StreamTarget(new WritableStream({ write: ({ data, position }) => this.file.write(position, data) })),
     });
     const packets = new EncodedVideoPacketSource(kind);
     output.addVideoTrack(packets, { rotation: frame.rotation ?? 0 });
+    // As phones name themselves and their lens: a calibration that is registered for them is found (`pbl camera`).
+    const { make, model } = this.phone;
+    output.setMetadataTags({ date: new Date(), raw: { "com.android.manufacturer": make, "com.android.model": model, "com.apple.quicktime.camera.lens_model": this.track.label } });
     await output.start();
     frame.close();
     let first = NaN, last = NaN, key = -Infinity, apart = Infinity, usual = 1e6 / rate;
