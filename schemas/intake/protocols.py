@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pbl_pipeline.names import check_label
 
-from ..capture import REFUSED, PhoneLink, PhoneRecording, Protocol
+from ..capture import PhoneLink, PhoneRecording, Protocol
 from ..reading.usable import UNUSABLE, usable
 from ..rows import utc_now
 from ..transactions import in_transaction
@@ -22,8 +21,8 @@ COLUMNS = ("activity", "pace", "view", "passes")
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A step of a visit's protocol. view: side from which it is filmed; done: usable recordings, or such of which it is
-    not known yet."""
+    """A step of a visit's protocol. view: side from which it is filmed; done: registered recordings, without those that
+    cannot be used."""
 
     number: int
     activity: str
@@ -99,13 +98,9 @@ def steps_of(session_id: int) -> list[Step]:
     links = (PhoneLink & {"session_id": session_id}).to_dicts(order_by="phone_link DESC")
     if not links or links[0]["protocol"] is None:
         return []
-    sent = (PhoneRecording & {"session_id": session_id} & f"phone_state != '{REFUSED}'").to_dicts()
-    done = [str(row["phone_about"].get("step")) for row in sent if _counts(row)]
+    sent = (PhoneRecording & {"session_id": session_id} & "video_id IS NOT NULL").to_dicts()
+    done = [str(row["phone_about"].get("step")) for row in sent if usable(int(row["video_id"])).state != UNUSABLE]
     return [dataclasses.replace(step, done=done.count(str(step.number))) for step in _steps(links[0]["protocol"])]
-
-
-def _counts(row: dict[str, Any]) -> bool:
-    return row["video_id"] is None or usable(int(row["video_id"])).state != UNUSABLE
 
 
 def _steps(name: str) -> list[Step]:

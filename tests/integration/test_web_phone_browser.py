@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pbl_pipeline.video import probe, read_phone_log
 from schemas import video
 from schemas.capture import PhoneRecording
 from schemas.intake import phone_recordings
+from schemas.intake.protocols import Step, add_protocol
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_accounts import running
 from tests.integration.test_web_phone import link_of, new_visit
@@ -34,18 +36,25 @@ UPRIGHT, TURNED = (0.7071, 0.7071, 0.0, 0.0), (0.7044, 0.7044, 0.0616, 0.0616)
 def camera(chromium: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A Chromium whose camera is a film of 640 x 480."""
     path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    with with_camera(chromium, path, numbered_frames(60, 480, 640)) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iterator[Any]:
+    """A Chromium whose camera shows these frames (BGR) at 30 a second, from the first when it is opened."""
     with av.open(str(path), "w", format="mjpeg") as out:
-        stream = out.add_stream("mjpeg", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 640, 480, "yuvj420p"
-        for frame in numbered_frames(60, 480, 640):
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        stream = out.add_stream("mjpeg", rate=30, options={"q:v": "2"})
+        stream.pix_fmt = "yuvj420p"
+        for frame in frames:
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = frame.shape[:2]
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="bgr24")))
         out.mux(stream.encode(None))
-    executable = chromium.browser_type.executable_path
     args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
             f"--use-file-for-fake-video-capture={path}"]  # fmt: skip
-    from conftest import _CHROMIUM
-
-    browser = chromium.browser_type.launch(executable_path=_CHROMIUM or executable, args=args)
+    executable = shutil.which("chromium") or shutil.which("google-chrome")
+    browser = chromium.browser_type.launch(executable_path=executable, args=args)
     yield browser
     browser.close()
 
@@ -60,7 +69,13 @@ def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
 
 @contextlib.contextmanager
 def filming(
-    browser: Any, visit: int, orientation: bool = True, torn: bool = False, denied: bool = False, **context: Any
+    browser: Any,
+    visit: int,
+    orientation: bool = True,
+    torn: bool = False,
+    denied: bool = False,
+    protocol: str = "",
+    **context: Any,
 ) -> Iterator[Any]:
     """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
     with running(create_app(Options(target=nothing)), Where()) as port:
@@ -75,7 +90,7 @@ def filming(
             if orientation:
                 sensor(page, "setSensorOverrideEnabled", enabled=True)
                 turn(page, UPRIGHT)
-            page.goto(f"/phone/open?key={link_of(visit)}")
+            page.goto(f"/phone/open?key={link_of(visit, protocol=protocol)}")
             page.wait_for_selector("main[data-ready]")
             yield page
             assert not [e for e in errors if not (torn and "net::ERR" in e)]
@@ -149,8 +164,8 @@ def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     assert info.n_frames == len(times) == about["frames"] > 45
     assert (info.width_px, info.height_px) == (640, 480)
     assert (bool(info.make), bool(info.model)) == (True, True)  # by which a calibration of the phone is found
-    assert info.lens.endswith("camera.mjpeg")
-    assert info.recorded_utc.startswith(f"{datetime.now(UTC):%Y-%m-%d}")
+    assert (info.lens or "").endswith("camera.mjpeg")
+    assert (info.recorded_utc or "").startswith(f"{datetime.now(UTC):%Y-%m-%d}")
     assert np.abs(info.time_s - (times - times[0])).max() < 0.002
     # The turn stands in the log at its moment of the video's clock.
     (path,) = Path(row["video_path"]).parent.glob("*.json")
@@ -223,6 +238,22 @@ def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     assert (video.Video & {"session_id": visit}).fetch1("camera_motion") == "static"
     assert len(video.PhoneAttitude()) == 0
     assert len(PhoneRecording()) == 1
+
+
+def test_the_page_leads_through_a_protocol(camera: Any, visit: int):
+    add_protocol("clinic", [Step(1, "walking", "fast", "left", 1), Step(2, "tug", "", "any", 1)])
+    with filming(camera, visit, protocol="clinic") as page:
+        pressed = page.locator(".steps [aria-pressed='true']")
+        assert pressed.inner_text() == "Walk, fast, from the left side: 0 of 1"
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.locator(".steps [aria-pressed='true']", has_text="TUG").wait_for()
+        assert page.locator(".steps button").first.inner_text().startswith("\u2713")
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.get_by_text("complete by its protocol").wait_for()
+    assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
+    assert list(video.Pace().to_arrays("pace")) == ["fast"]
 
 
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):

@@ -75,7 +75,7 @@ async function start() {
 function stated() {
   const form = new FormData($("form"));
   const told = Object.fromEntries([...form].filter(([, value]) => value).map(([name, value]) => [name, String(value)]));
-  return { ...(chosen ? { activity: chosen.activity, pace: chosen.pace } : {}), ...told };
+  return { ...told, ...(chosen ? { activity: chosen.activity, pace: chosen.pace } : {}) };
 }
 
 /** Its facts on the phone, with the log so far: also of one that is never ended. */
@@ -179,26 +179,27 @@ async function sendAll() {
 
 /** The steps of the protocol: what came is ticked off, a tap chooses what is filmed now. @param {any[]} steps */
 function lead(steps) {
-  const form = $("form");
+  const open = steps.find((step) => step.done < step.passes), now = steps.find((step) => step.number === chosen?.number);
+  if (!chosen || (now && chosen.done < chosen.passes && now.done >= now.passes)) choose(open ?? now ?? steps[0]);
+  else chosen = now ?? chosen;
   $(".protocol").hidden = !steps.length;
-  $(".complete").textContent = steps.length && steps.every((step) => step.done >= step.passes) ? t("complete") : "";
+  $(".complete").textContent = steps.length && !open ? t("complete") : "";
   $(".steps").replaceChildren(...steps.map((step) => {
     const line = document.createElement("li"), button = document.createElement("button");
     const of = (/** @type {string} */ name) => (texts[`is_${step[name]}`] ? t(`is_${step[name]}`) : step[name]);
     button.type = "button";
     button.textContent = `${step.done >= step.passes ? "\u2713 " : ""}${[of("activity"), of("pace"), t(`view_${step.view}`)].filter(Boolean).join(", ")}: ${t("done", { n: step.done, all: step.passes })}`;
-    button.ariaPressed = String(form.elements.step.value === String(step.number));
-    button.onclick = () => {
-      form.elements.step.value = step.number;
-      for (const name of ["activity", "pace"])
-        for (const choice of form.querySelectorAll(`[name=${name}]`)) choice.checked = choice.value === step[name];
-      chosen = step;
-      lead(steps);
-    };
+    button.ariaPressed = String(step.number === chosen?.number);
+    button.onclick = () => { choose(step); lead(steps); };
     line.append(button);
     return line;
   }));
-  if (!form.elements.step.value && steps.length) (/** @type {any} */ ($(".steps button:not([aria-pressed='true'])")))?.click();
+}
+
+/** @param {any} step */
+function choose(step) {
+  chosen = step ?? null;
+  $("form").elements.step.value = step?.number ?? "";
 }
 
 /** The recordings of this phone and of the visit. */
