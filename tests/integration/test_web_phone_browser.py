@@ -25,11 +25,24 @@ from tests.integration.test_web_accounts import running
 from tests.integration.test_web_phone import link_of, new_visit
 from tests.videos import numbered_frames
 from workers import phone_uploads
-from workers.web import Options, Where, create_app, phone
+from workers.web import Options, Where, certificates, create_app, phone
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 #: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.
 UPRIGHT, TURNED = (0.7071, 0.7071, 0.0, 0.0), (0.7044, 0.7044, 0.0616, 0.0616)
+#: In the page: a camera of 640 x 480 that is the element `canvas`.
+CANVAS = """
+() => {
+  const canvas = globalThis.canvas = Object.assign(document.createElement("canvas"), {width: 640, height: 480});
+  let n = 0;
+  setInterval(() => {
+    const c = canvas.getContext("2d");
+    c.fillStyle = `rgb(${n++ % 256}, 90, 90)`;
+    c.fillRect(0, 0, 640, 640);
+  }, 33);
+  navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
+}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -75,11 +88,17 @@ def filming(
     torn: bool = False,
     denied: bool = False,
     protocol: str = "",
+    tls: bool = False,
     **context: Any,
 ) -> Iterator[Any]:
     """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
-    with running(create_app(Options(target=nothing)), Where()) as port:
-        base = f"http://127.0.0.1:{port}"
+    where, scheme = Where(), "https" if tls else "http"
+    if tls:
+        cert, key = certificates.server_certificate(("127.0.0.1",))
+        where = Where(tls_cert=cert, tls_key=key)
+        context["ignore_https_errors"] = True  # the authority is not installed here
+    with running(create_app(Options(target=nothing, secure=tls)), where) as port:
+        base = f"{scheme}://127.0.0.1:{port}"
         made = browser.new_context(base_url=base, **{"locale": "en", **PHONE, **context})
         try:
             if not denied:
@@ -93,7 +112,9 @@ def filming(
             page.goto(f"/phone/open?key={link_of(visit, protocol=protocol)}")
             page.wait_for_selector("main[data-ready]")
             yield page
-            assert not [e for e in errors if not (torn and "net::ERR" in e)]
+            # A service worker needs a certificate that the browser trusts.
+            known = ("net::ERR",) if torn else ("fetching the script",) if tls else ()
+            assert not [e for e in errors if not any(k in e for k in known)]
         finally:
             made.close()
 
@@ -254,6 +275,37 @@ def test_the_page_leads_through_a_protocol(camera: Any, visit: int):
         page.get_by_text("complete by its protocol").wait_for()
     assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
     assert list(video.Pace().to_arrays("pace")) == ["fast"]
+
+
+def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
+    with filming(camera, visit, tls=True) as page:
+        (cookie,) = (c for c in page.context.cookies() if "pbl_phone" in c["name"])
+        assert (cookie["name"], cookie["secure"], cookie["httpOnly"]) == ("__Host-pbl_phone", True, True)
+        film(page, 1.5)
+        page.locator(".keep").click()
+        arrived(page)
+        answer = page.request.get("/phone/authority.crt")
+        assert answer.body() == certificates.authority().read_bytes()
+    assert len(video.Video() & {"session_id": visit}) == 1
+
+
+def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate(CANVAS)  # a camera whose picture can be turned
+        page.locator(".allow").click()
+        for why, act in (
+            ("interrupted", "() => { Object.defineProperty(document, 'hidden', {get: () => true, configurable: true});"
+                            " document.dispatchEvent(new Event('visibilitychange')); delete document.hidden; }"),
+            ("turned", "() => { canvas.width = 480; canvas.height = 640; }"),
+        ):  # fmt: skip
+            page.locator(".record").click()
+            page.wait_for_selector("main[data-filming='yes']")
+            page.wait_for_timeout(1200)
+            page.evaluate(act)
+            page.locator(".said", has_text=why).wait_for()
+            page.locator(".keep" if why == "interrupted" else ".again").click()
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == 1
 
 
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):

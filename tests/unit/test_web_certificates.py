@@ -10,8 +10,11 @@ import threading
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from cryptography import x509
 
+from pbl_pipeline.errors import PblError
+from workers.cli.web import web
 from workers.web import certificates
 
 NAMES = ("127.0.0.1", "gait.example")
@@ -99,3 +102,13 @@ def test_keys_are_private(home: Path):
 
 def test_names_of_this_machine():
     assert socket.gethostname() in certificates.own_names()
+
+
+def test_the_command_makes_it_and_asks_for_accounts(home: Path):
+    done = CliRunner().invoke(web, ["--tls", "--port", "0"])
+    assert certificates.authority().is_file()
+    assert str(certificates.authority()) in done.output
+    assert isinstance(done.exception, PblError)
+    assert done.exception.code == "WEB_ACCOUNT"
+    both = CliRunner().invoke(web, ["--tls", "--tls-cert", "a.pem", "--tls-key", "b.pem"])
+    assert both.exit_code == 2
