@@ -10,6 +10,7 @@ STAGES = (
     "lab",
     "session",
     "video",
+    "capture",
     "tracking",
     "keypoints",
     "fit",

@@ -39,7 +39,7 @@ class Commands(click.Group):
 #: What people want to do, and the commands for it, in the order of doing it.
 TASKS = {
     "From files to files": ("run", "detect", "fit", "events", "gait", "study", "deidentify"),
-    "Begin with the tables": ("demo", "db", "ingest", "list", "populate", "status", "report", "export"),
+    "Begin with the tables": ("demo", "db", "capture", "ingest", "list", "populate", "status", "report", "export"),
     "Correct and decide": ("web", "why", "choose", "move", "retry", "reprocess", "forget"),
     "Cameras, models, methods, norms": ("calibrate", "camera", "models", "method", "norm"),
     "Run it for many": ("worker", "cron", "doctor"),

@@ -23,3 +23,7 @@ def compute(session_id: int, again: bool) -> None:
         time.sleep(0.05)
     chain.install(pytest.MonkeyPatch())
     compute_visit(session_id, again)
+
+
+def nothing(session_id: int, again: bool) -> None:
+    """Compute nothing."""

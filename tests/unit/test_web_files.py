@@ -37,7 +37,7 @@ def test_every_text_that_a_page_names_is_in_the_catalogue():
 _BY_VALUE = re.compile(
     r"(role|state|quality|trend|enter|decided|instruments|register|expects|upload)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
     r"|operate\.(done|empty|pending|reserved|error|waiting|oldest|per_hour|left)$"
-    r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\."
+    r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\.|capture\.|film\.is_"
 )
 
 
@@ -107,7 +107,7 @@ def test_scripts_of_others_are_those_that_the_readme_names():
     rows = re.findall(r"^\| `([^`]+)` \|.*\| ([0-9a-f]{64}) \|$", (WEB / "vendor/README.md").read_text(), re.MULTILINE)
     found = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in WEB.glob("vendor/*.min.*")}
     assert dict(rows) == found
-    assert len(list(WEB.glob("vendor/*.LICENSE"))) == 2
+    assert len(list(WEB.glob("vendor/*.LICENSE"))) == 3
 
 
 def test_scripts_of_others_are_named_with_their_versions():

@@ -13,7 +13,7 @@ _ROLE = click.Choice(["reader", "reviewer", "operator"])
 
 @click.group(invoke_without_command=True, epilog="Example: pbl web --visit 3")
 @click.option("--port", type=click.IntRange(0, 65535), default=8484, show_default=True, help="0: a free one.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--host", metavar="ADDRESS", help="Address to listen on (default: 127.0.0.1, all with --tls).")
 @click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Open this visit (`pbl list visits`).")
 @click.option(
     "--folder", type=click.Path(path_type=Path, file_okay=False), metavar="DIR",
@@ -28,6 +28,11 @@ _ROLE = click.Choice(["reader", "reviewer", "operator"])
     "--role", "roles", type=_ROLE, multiple=True, default=("reviewer", "operator"), show_default=True,
     help="What may be done: look; also decide and enter; see queues and try errors again. Can be repeated.",
 )  # fmt: skip
+@click.option(
+    "--tls", is_flag=True,
+    help="Serve phones and other machines of this network by a certificate of the laboratory's own authority, made "
+    "once, which they are told to trust (docs/capture.md).",
+)  # fmt: skip
 @click.option("--tls-cert", type=_FILE, metavar="FILE", help="Certificate (PEM), to serve more than this machine.")
 @click.option("--tls-key", type=_FILE, metavar="FILE", help="Its key (PEM).")
 @click.option(
@@ -41,12 +46,13 @@ _ROLE = click.Choice(["reader", "reviewer", "operator"])
 def web(
     context: click.Context,
     port: int,
-    host: str,
+    host: str | None,
     visit: int | None,
     folder: Path | None,
     videos: Path | None,
     name: str | None,
     roles: tuple[str, ...],
+    tls: bool,
     tls_cert: Path | None,
     tls_key: Path | None,
     behind_proxy: str,
@@ -66,7 +72,15 @@ def web(
         raise click.UsageError("--videos goes with --folder.")
     shown = None if folder is None else ResultsFolder(folder, videos)
 
-    where = Where(host, port, tls_cert, tls_key, behind_proxy, hostnames)
+    if tls:
+        if tls_cert is not None or behind_proxy:
+            raise click.UsageError("--tls makes a certificate: it goes without --tls-cert and --behind-proxy.")
+        from workers.web import certificates
+
+        host, hostnames = host or "0.0.0.0", hostnames or certificates.own_names()  # noqa: S104
+        tls_cert, tls_key = certificates.server_certificate(hostnames)
+        click.echo(f"Phones trust this page once they have {certificates.authority()}: docs/capture.md")
+    where = Where(host or "127.0.0.1", port, tls_cert, tls_key, behind_proxy, hostnames)
     serve(where, (name or getpass.getuser())[:64], roles, visit, folder=shown)
 
 

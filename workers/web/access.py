@@ -168,14 +168,16 @@ class Sessions:
 
 @dataclasses.dataclass(frozen=True)
 class Cookie:
-    """The session's cookie. secure: sent by TLS alone, and by its name (`__Host-`) bound to this very host."""
+    """A cookie, by default the session's. secure: sent by TLS alone, and by its name (`__Host-`) bound to this very
+    host."""
 
     secure: bool = False
+    called: str = "pbl_session"
 
     @property
     def name(self) -> str:
         """Its name."""
-        return "__Host-pbl_session" if self.secure else "pbl_session"
+        return f"__Host-{self.called}" if self.secure else self.called
 
     def of(self, request: Request) -> str:
         """Its value in a request, empty for none."""

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 #: Right of an address that is open without a session; the others are those of `access.RIGHTS`, and "" for any session.
 OPEN = "open"
+#: Right of an address that answers phones alone, which opened the link of a visit (`phone.Phones`).
+FILM = "film"
 #: Ending of the address of a page as JSON.
 JSON = ".json"
 _NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
@@ -26,7 +28,7 @@ class Address(Route):
     """An address of the page, which answers those who have its right.
 
     right
-        Of `access.RIGHTS`; "" for any session, `OPEN` without one.
+        Of `access.RIGHTS`; "" for any session, `OPEN` without one, `FILM` for phones.
     look
         What is looked at of the recording (`{video_id:int}` in the path) or visit (`{session_id:int}`), such as
         "video": a row of `schemas.review.Viewing` before it is shown. Empty where no person is looked at.
@@ -42,7 +44,12 @@ class Address(Route):
         """Answer a request. Raises `Refused` for a sender without the right, `PblError` for a look without its row."""
         request = Request(scope)
         session: Session | None = request.state.session
-        if self.right != OPEN:
+        if self.right == FILM:
+            phones = request.app.state.phones
+            request.state.phone = None if phones is None else await phones.find(request)
+            if request.state.phone is None:
+                raise Refused("session" if session is None else "right")
+        elif self.right != OPEN:
             if session is None:
                 raise Refused("session")
             if not session.may(self.right):

@@ -33,6 +33,7 @@ from . import (
     folder,
     operate,
     people,
+    phone,
     recordings,
     registration,
     reports,
@@ -53,6 +54,7 @@ log = logging.getLogger(__name__)
 
 #: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
 STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503} | {
+    "PHONE_LINK": 403,
     "UPLOAD_REFUSED": 422,
     "FILE_UNWRITABLE": 507,
 }
@@ -147,6 +149,9 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *operate.routes(pages, tables),
             *trend.routes(pages, tables),
         ]
+    phones = phone.Phones(tables, options.secure) if options.folder is None else None
+    if phones is not None:
+        parts += phone.routes(pages, tables, phones, computing, options.target)
     parts += [
         *visits.routes(pages, asks, source),
         *recordings.routes(pages, asks, source),
@@ -181,7 +186,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         lifespan=life,
     )
     app.state.sessions, app.state.way_in = sessions, way
-    app.state.computing = computing
+    app.state.computing, app.state.phones = computing, phones
     app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
     app.router.default, app.router.redirect_slashes = unknown, False
     return app

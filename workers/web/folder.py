@@ -183,7 +183,7 @@ class ResultsFolder:
 
     def around(self, about: ShownVisit) -> dict[str, Any]:
         """Return nothing: decisions and entered scores are in tables alone."""
-        return {"decisions": None, "accepted": {}, "entry": None}
+        return {"decisions": None, "accepted": {}, "entry": None, "film": None}
 
     def _place(self, number: int) -> _Place:
         if number not in self._places:

@@ -165,6 +165,8 @@ def serve(
     if where.by_accounts:
         app = create_app(Options(hosts=where.names, accounts=accounts, secure=True))
         shown = ", ".join(sorted(where.names))
+        if where.tls_cert is not None:
+            shown = ", ".join(f"https://{name}:{port}" for name in sorted(where.names))
         click.echo(f"Serving on {where.host}:{port} for {shown}, to those who have an account (pbl web account list).")
     else:
         roles = roles if folder is None else ("reader",)

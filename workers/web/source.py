@@ -9,7 +9,9 @@ from typing import Any, Protocol
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Visit
 from schemas.decisions import candidates, review_decisions
+from schemas.intake import phone_recordings, protocols
 from schemas.reading import shown
+from schemas.reading.usable import usable
 from schemas.reading.visit_progress import Progress, visit_progress
 
 from .corrections import Judged, judged
@@ -107,4 +109,11 @@ class TablesSource:
             "decisions": review_decisions.decisions(number),
             "accepted": review_decisions.accepted(about.key) if about.key else {},
             "entry": entry(number),
+            "film": _filming(number),
         }
+
+
+def _filming(session_id: int) -> dict[str, Any]:
+    found = phone_recordings.filming(session_id)
+    sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in found["sent"]]
+    return {**found, "sent": sent, "steps": protocols.steps_of(session_id), "protocols": protocols.protocols()}

@@ -21,6 +21,7 @@ from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
 from .curves import curves_of, norm_people
 from .pages import Pages, as_json, reader_language
+from .phone import verdict
 from .plain_values import plain
 from .source import Source
 from .tables import Asks, Tables
@@ -38,7 +39,7 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         values |= await asks.ask(_drawn, about, reader_language(request))
         if as_json(request):  # loads arrays, which not every thread may
             values = await asks.ask(plain, values)
-        return pages.show(request, "visit.html", interval=interval, sided=SIDED, **values)
+        return pages.show(request, "visit.html", interval=interval, sided=SIDED, verdict=verdict, **values)
 
     async def letter(request: Request) -> Response:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))

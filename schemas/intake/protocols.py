@@ -1,0 +1,110 @@
+"""Protocols: what is filmed in a visit, in which order, and how much of it a visit has."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from pbl_pipeline.names import check_label
+
+from ..capture import PhoneLink, PhoneRecording, Protocol
+from ..reading.usable import UNUSABLE, usable
+from ..rows import utc_now
+from ..transactions import in_transaction
+from .records import usage
+from .sheets import needed, number_of, read_sheets, refused
+
+VIEWS = ("left", "right", "front", "any")
+COLUMNS = ("activity", "pace", "view", "passes")
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """A step of a visit's protocol. view: side from which it is filmed; done: registered recordings, without those that
+    cannot be used."""
+
+    number: int
+    activity: str
+    pace: str
+    view: str
+    passes: int
+    done: int = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether the visit has all of its passes."""
+        return self.done >= self.passes
+
+
+def read_protocol(path: Path) -> list[Step]:
+    """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`.
+
+    Raises `PblError` FILE_MISSING, SHEET_FORMAT.
+    """
+    (sheet,) = read_sheets(path)[:1] or [None]
+    steps = []
+    for number, row in enumerate(sheet.rows if sheet else (), 1):
+        if row.error is not None:
+            raise row.error
+        activity, pace, view = needed(row, "activity"), row.cells.get("pace", ""), row.cells.get("view", "any")
+        for what, text in (("activity", activity), ("pace", pace)):
+            check_label(what, text, 32)
+        passes = number_of(row, "passes", row.cells.get("passes", "1"))
+        if view not in VIEWS or not 1 <= passes <= 99 or passes % 1:
+            raise refused(
+                row.where, f"view {view!r}, passes {passes:g}", f"view {', '.join(VIEWS)}; passes 1 to 99", "correct it"
+            )
+        steps.append(Step(number, activity, pace, view, int(passes)))
+    if not steps:
+        raise refused(str(path), "no rows", f"a row for each step: {', '.join(COLUMNS)}", "add the steps")
+    return steps
+
+
+def add_protocol(name: str, steps: Sequence[Step]) -> bool:
+    """Register a protocol; return whether it is new. Raises `PblError` USAGE for the name of one with other steps."""
+    check_label("protocol", name, 32, 1)
+    if Protocol & {"protocol": name}:
+        if _steps(name) == list(steps):
+            return False
+        expected = "a new name: visits were filmed by the old one"
+        raise usage(f"protocol {name} with other steps", expected, name, f"call it {name}-2")
+
+    def insert() -> None:
+        Protocol.insert1({"protocol": name, "protocol_created": utc_now()})
+        Protocol.Step.insert(
+            {
+                "protocol": name,
+                "step_no": step.number,
+                "step_activity": step.activity,
+                "step_pace": step.pace,
+                "step_view": step.view,
+                "step_passes": step.passes,
+            }
+            for step in steps
+        )
+
+    in_transaction(insert)
+    return True
+
+
+def protocols() -> list[str]:
+    """Return the names of the protocols, in their order."""
+    return sorted(str(name) for name in Protocol.to_arrays("protocol"))
+
+
+def steps_of(session_id: int) -> list[Step]:
+    """Return the steps of the protocol of a visit's newest link, with what is done; none without a protocol."""
+    links = (PhoneLink & {"session_id": session_id}).to_dicts(order_by="phone_link DESC")
+    if not links or links[0]["protocol"] is None:
+        return []
+    sent = (PhoneRecording & {"session_id": session_id} & "video_id IS NOT NULL").to_dicts()
+    done = [str(row["phone_about"].get("step")) for row in sent if usable(int(row["video_id"])).state != UNUSABLE]
+    return [dataclasses.replace(step, done=done.count(str(step.number))) for step in _steps(links[0]["protocol"])]
+
+
+def _steps(name: str) -> list[Step]:
+    rows = (Protocol.Step & {"protocol": name}).to_dicts(order_by="step_no")
+    return [
+        Step(int(r["step_no"]), r["step_activity"], r["step_pace"], r["step_view"], int(r["step_passes"])) for r in rows
+    ]

@@ -1,0 +1,511 @@
+"""Filming with a phone: its link, the upload in parts, and what it may not do. Without a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import random
+import re
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from starlette.testclient import TestClient
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import Check
+from pbl_pipeline.words import UNUSABLE
+from schemas import keypoints, session, video
+from schemas.capture import PhoneLink, PhoneRecording
+from schemas.checks import check_row
+from schemas.cli.capture import capture
+from schemas.intake import VisitRecord, phone_recordings
+from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
+from schemas.intake.protocols import add_protocol, read_protocol
+from schemas.intake.visits import session_ids
+from schemas.jobs import jobs_of
+from schemas.reading.usable import Next
+from schemas.transactions import in_transaction
+from tests.integration import web
+from tests.integration.chain import small_video
+from tests.integration.compute_target import nothing
+from tests.integration.test_web_accounts import running
+from tests.rows import register
+from workers import phone_uploads, queue
+from workers.populate import populate
+from workers.web import Options, Where, create_app
+from workers.web.phone import next_words
+
+
+@pytest.fixture
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+    """A visit without recordings; the archive is a folder of the test, and its parts are small."""
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    for module in (phone_recordings, phone_uploads):
+        monkeypatch.setattr(module, "PART_BYTES", 4096)
+    return new_visit("2026-01-10")
+
+
+def new_visit(label: str, subject: str = "P001") -> int:
+    (number,) = in_transaction(lambda: session_ids([VisitRecord(subject, label)])).values()
+    return number
+
+
+def stranger() -> TestClient:
+    return web.client(signed_in=False, target=nothing)
+
+
+def link_of(visit: int, **fields: object) -> str:
+    """The key of a new link, as the page of the visit makes it."""
+    answer = web.post(web.client(target=nothing), f"/visits/{visit}/film", **{"hours": 2, **fields})
+    assert answer.status_code == 200, answer.text
+    found = re.search(r"/phone/open\?key=([\w-]+)", answer.text)
+    assert found
+    assert 'class="qr"' in answer.text
+    return found[1]
+
+
+def phone(visit: int, **fields: object) -> TestClient:
+    """A phone that has opened a new link of the visit."""
+    browser = stranger()
+    answer = browser.get("/phone/open", params={"key": link_of(visit, **fields)}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/phone")
+    return browser
+
+
+def parts_of(body: bytes) -> list[bytes]:
+    return [body[i : i + 4096] for i in range(0, len(body), 4096)]
+
+
+def identity(body: bytes) -> str:
+    """As the page of the phone names a recording: the SHA-256 of the sums of its parts."""
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts_of(body))).hexdigest()
+
+
+def stated(film: bytes, log: bytes = b"", **about: Any) -> dict[str, Any]:
+    return {"sha256": identity(film + log), "video_bytes": len(film), "log_bytes": len(log), **about}
+
+
+def begin(browser: TestClient, film: bytes, log: bytes = b"", **about: Any) -> dict[str, Any]:
+    answer = browser.post("/phone/recordings.json", json=stated(film, log, **about))
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def put(browser: TestClient, number: int, start: int, part: bytes, total: int, **headers: str) -> Any:
+    own = {
+        "content-type": "application/octet-stream",
+        "content-range": f"bytes {start}-{start + len(part) - 1}/{total}",
+        "x-sha256": hashlib.sha256(part).hexdigest(),
+    }
+    return browser.put(f"/phone/recordings/{number}.json", content=part, headers={**own, **headers})
+
+
+def send(browser: TestClient, film: bytes, log: bytes = b"", **about: Any) -> dict[str, Any]:
+    """A whole recording; the answer to its end."""
+    told = begin(browser, film, log, **about)
+    for n in told["missing"]:
+        part = parts_of(film + log)[n]
+        assert put(browser, told["number"], n * 4096, part, len(film + log)).status_code == 204
+    return finish(browser, told["number"]).json()
+
+
+def finish(browser: TestClient, number: int) -> Any:
+    return browser.post(f"/phone/finish/{number}.json", json={})
+
+
+def film(tmp_path: Path, name: str = "walk") -> bytes:
+    folder = tmp_path / "films"
+    folder.mkdir(exist_ok=True)
+    return small_video(folder, name, n=60).read_bytes()
+
+
+def attitude_log() -> bytes:
+    time_s = [i / 60 for i in range(150)]
+    half = 0.5**0.5
+    values = {"qw": half, "qx": half, "qy": 0.0, "qz": 0.0}
+    sensor = {"time_s": time_s, **{name: [v] * len(time_s) for name, v in values.items()}}
+    return json.dumps({"frame": "device", "phone": {"make": "T", "model": "One"}, "orientation": sensor}).encode()
+
+
+# ----------------------------------------------------------------------------------------------------------- the link
+def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
+    key = link_of(visit)
+    mine, other = stranger(), stranger()
+    assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
+    page = mine.get("/phone")
+    assert page.status_code == 200
+    assert "P001" in page.text
+    assert "camera=(self)" in page.headers["permissions-policy"]
+    # The same phone may scan it again; another one may not, and neither can take it by a wrong key.
+    assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
+    answer = other.get("/phone/open", params={"key": key}, follow_redirects=False)
+    assert answer.status_code == 403
+    assert "PHONE_LINK" in answer.text
+    assert other.get("/phone").status_code == 401
+    assert other.get("/phone/open", params={"key": key + "x"}, follow_redirects=False).status_code == 403
+    # No key and no cookie is in the tables.
+    row = PhoneLink().fetch1()
+    assert key not in str(row)
+    assert mine.cookies["pbl_phone"] not in str(row)
+    reviewer = web.client(target=nothing)
+    assert "opened by a phone" in reviewer.get(f"/visits/{visit}").text
+    web.post(reviewer, f"/visits/{visit}/film/end", link=row["phone_link"])
+    ended = mine.get("/phone/state.json")
+    assert (ended.status_code, ended.json()["error"]["code"]) == (403, "PHONE_LINK")
+    assert "opened by a phone" not in reviewer.get(f"/visits/{visit}").text
+
+
+def test_a_link_ends_by_its_time(visit: int):
+    browser = phone(visit)
+    assert browser.get("/phone/state.json").json()["visit"] == visit
+    PhoneLink.connection.query(
+        f"UPDATE {PhoneLink.full_table_name} SET link_expires = UTC_TIMESTAMP() - INTERVAL 1 SECOND"
+    )
+    assert browser.get("/phone/state.json").json()["error"]["code"] == "PHONE_LINK"
+    assert browser.post("/phone/recordings.json", json=stated(b"x")).status_code == 403
+
+
+def test_the_link_of_another_visit_cannot_be_ended_from_here(visit: int):
+    browser, other = phone(visit), new_visit("2026-02-01")
+    number = PhoneLink().fetch1("phone_link")
+    web.post(web.client(target=nothing), f"/visits/{other}/film/end", link=number)
+    assert browser.get("/phone/state.json").status_code == 200
+
+
+# --------------------------------------------------------------------------------------------------------- the upload
+def test_a_recording_arrives_with_its_log_in_the_visit_and_is_computed_first(visit: int, tmp_path: Path):
+    register(small_video(tmp_path, "waiting", n=30), session_label="2026-03-01")
+    queue.fill(video.VideoInfo)
+    whole = film(tmp_path)
+    told = send(phone(visit), whole, attitude_log(), activity="walking", pace="fast", aid="cane", frames=60, dropped=1)
+    assert told["state"] == "received"
+    row = (video.Video & {"session_id": visit}).fetch1()
+    assert Path(row["video_path"]).read_bytes() == whole
+    assert (row["activity"], row["camera_motion"]) == ("walking", "handheld")
+    assert (video.Pace & {"video_id": row["video_id"]}).fetch1("pace") == "fast"
+    log = (video.PhoneAttitude & {"video_id": row["video_id"]}).fetch1()
+    assert (log["attitude_n"], log["attitude_device"]) == (150, "T One")
+    assert PhoneRecording().fetch1("video_id") == row["video_id"]
+    # Its job is the first in the queue, and nothing of the parts is left.
+    waiting = jobs_of(video.VideoInfo).pending.to_dicts(order_by="priority")
+    assert waiting[0]["video_id"] == row["video_id"]
+    assert len(waiting) == 2
+    assert not list((tmp_path / "archive" / "_phone").rglob("*"))
+
+
+def test_the_same_recording_twice_arrives_once(visit: int, tmp_path: Path):
+    browser, whole = phone(visit), film(tmp_path)
+    first = send(browser, whole)
+    again = begin(browser, whole)
+    assert (again["number"], again["state"], again["missing"]) == (first["number"], "received", [])
+    assert finish(browser, first["number"]).json()["state"] == "received"
+    assert send(phone(visit), whole)["number"] == first["number"]  # by a new link as well
+    assert len(video.Video()) == len(PhoneRecording()) == 1
+
+
+def test_two_phones_at_one_visit_are_both_kept_and_the_page_says_so(visit: int, tmp_path: Path):
+    for name in ("walk", "other"):
+        assert send(phone(visit), film(tmp_path, name))["state"] == "received"
+    assert len(video.Video & {"session_id": visit}) == 2
+    assert "More than one phone" in web.client(target=nothing).get(f"/visits/{visit}").text
+
+
+def test_torn_down_a_hundred_times_every_recording_arrives_once(visit: int, tmp_path: Path):
+    """Connections cut within a request and before its answer, pages that forget what they sent, servers that end."""
+    rng = random.Random(37)
+    films = [film(tmp_path, name) for name in ("walk", "other", "third")]
+    log, browser = attitude_log(), phone(visit)
+    cookie = f"pbl_phone={browser.cookies['pbl_phone']}"
+    torn = 0
+    with contextlib.ExitStack() as stack:
+        port = stack.enter_context(serving())
+
+        def request(method: str, path: str, body: bytes, kind: str, cut: bool = False, **headers: str) -> Any:
+            lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Cookie: {cookie}", "Connection: close",
+                     f"Content-Type: {kind}", f"Content-Length: {len(body)}"]  # fmt: skip
+            raw = "\r\n".join([*lines, *(f"{k.replace('_', '-')}: {v}" for k, v in headers.items()), "", ""]).encode()
+            with socket.create_connection(("127.0.0.1", port), timeout=30) as sent:
+                if cut:
+                    sent.sendall((raw + body)[: rng.randrange(1, len(raw) + len(body) + 1)])
+                    return None
+                sent.sendall(raw + body)
+                answer = b"".join(iter(lambda: sent.recv(65536), b""))
+            status = int(answer.split(b" ")[1])
+            assert status in (200, 204), answer
+            return json.loads(answer.split(b"\r\n\r\n", 1)[1]) if status == 200 else None
+
+        waiting = list(films)
+        while waiting:
+            whole = rng.choice(waiting)
+            body = json.dumps(stated(whole, log)).encode()
+            cut = torn < 100 and rng.random() < 0.1
+            told = request("POST", "/phone/recordings.json", body, "application/json", cut)
+            if told is None:
+                torn += 1
+                continue
+            if not told["missing"] and (torn >= 100 or rng.random() < 0.3):
+                end = request("POST", f"/phone/finish/{told['number']}.json", b"{}", "application/json")
+                assert end["state"] == "received"
+                waiting.remove(whole)
+                if not waiting and torn < 100:
+                    films.append(film(tmp_path, f"walk{len(films)}"))
+                    waiting.append(films[-1])
+                continue
+            for n in rng.sample(told["missing"], len(told["missing"])):
+                part = parts_of(whole + log)[n]
+                ranged = f"bytes {n * 4096}-{n * 4096 + len(part) - 1}/{len(whole + log)}"
+                cut = torn < 100 and rng.random() < 0.7
+                request("PUT", f"/phone/recordings/{told['number']}.json", part, "application/octet-stream", cut,
+                        content_range=ranged, x_sha256=hashlib.sha256(part).hexdigest())  # fmt: skip
+                if cut:
+                    torn += 1
+                    break  # the page is loaded again: it knows nothing but the file
+            if not told["missing"]:
+                request("POST", f"/phone/finish/{told['number']}.json", b"{}", "application/json", True)
+                torn += 1
+            if torn < 100 and rng.random() < 0.05:
+                stack.pop_all().close()
+                port = stack.enter_context(serving())
+    assert torn >= 100
+    paths = [Path(p) for p in (video.Video & {"session_id": visit}).to_arrays("video_path")]
+    assert sorted(p.read_bytes() for p in paths) == sorted(films)
+    assert len(video.PhoneAttitude()) == len(PhoneRecording()) == len(films)
+    assert not list((tmp_path / "archive" / "_phone").rglob("*"))
+
+
+@contextlib.contextmanager
+def serving() -> Iterator[int]:
+    with running(create_app(Options(target=nothing)), Where()) as port:
+        yield port
+
+
+def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tmp_path: Path):
+    browser, reviewer = phone(visit), web.client(target=nothing)
+    send(browser, small_video(tmp_path, "walk").read_bytes())
+    told = browser.get("/phone/state.json").json()
+    assert told["recordings"][0]["verdict"] == "The server has it and looks at it."
+    assert told["next"] == ""
+    send(browser, small_video(tmp_path, "empty", people="nobody").read_bytes())
+    populate()
+    walked, empty = sorted(browser.get("/phone/state.json").json()["recordings"], key=lambda r: r["number"])
+    assert re.fullmatch(r"Usable.*[1-9]\d* gait cycles left, \d+ right\.", walked["verdict"]), walked["verdict"]
+    assert walked["verdict"] in reviewer.get(f"/visits/{visit}").text
+    german = browser.get("/phone/state.json", headers={"accept-language": "de"}).json()["recordings"]
+    assert any("Gangzyklen links" in r["verdict"] for r in german)
+    assert empty["state"] == "received"
+
+
+def test_what_cannot_be_used_is_said_with_what_to_do(visit: int, tmp_path: Path):
+    browser = phone(visit)
+    send(browser, film(tmp_path))
+    populate()
+    key = keypoints.Keypoints().fetch1("KEY")
+    (keypoints.Keypoints.Check & key).delete_quick()
+    check = Check("feet_cut_share", "FAIL", 0.4, 0.3, "the feet leave the picture below: tilt the phone or step back")
+    keypoints.Keypoints.Check.insert1({**key, **check_row("keypoints", check)})
+    said = browser.get("/phone/state.json").json()["recordings"][0]["verdict"]
+    assert said.startswith("Film again: the feet leave the picture below: tilt the phone or step back (40%)")
+
+
+def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
+    sheet = tmp_path / "clinic.csv"
+    sheet.write_text("activity,pace,view,passes\nwalking,self_selected,left,1\ntug,,any,2\n")
+    steps = read_protocol(sheet)
+    assert add_protocol("clinic", steps)
+    assert not add_protocol("clinic", steps)
+    with pytest.raises(PblError, match="USAGE"):
+        add_protocol("clinic", steps[:1])
+    reviewer = web.client(target=nothing)
+    assert "<option>clinic</option>" in reviewer.get(f"/visits/{visit}").text
+    browser = phone(visit, protocol="clinic")
+    for n, step in enumerate((1, 2, 2)):
+        done = [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]]
+        assert done == [min(n, 1), max(0, n - 1)]
+        send(browser, film(tmp_path, f"walk{n}"), activity=steps[step - 1].activity, step=str(step))
+    assert "complete by its protocol" in reviewer.get(f"/visits/{visit}").text
+    assert sorted((video.Video & {"session_id": visit}).to_arrays("activity")) == ["tug", "tug", "walking"]
+    # What cannot be used does not count.
+    video.NotUsable.insert1(
+        {
+            "video_id": 1,
+            "unusable_reason": next(iter(UNUSABLE)),
+            "unusable_by": "R",
+            "unusable_created": "2026-01-01 00:00:00",
+        }
+    )
+    assert [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]] == [0, 2]
+    answer = web.post(reviewer, f"/visits/{visit}/film", hours=2, protocol="unknown")
+    assert answer.status_code == 404
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["activity,view\nwalking,above\n", "view\nleft\n", "activity\n"]
+    + [f"activity,passes\nwalking,{n}\n" for n in ("0", "1.5", "x")],
+)
+def test_a_protocol_that_cannot_be_is_refused(text: str, tmp_path: Path):
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(PblError, match="SHEET_FORMAT"):
+        read_protocol(tmp_path / "p.csv")
+
+
+def test_the_command_prints_a_link_that_opens(visit: int):
+    done = CliRunner().invoke(capture, ["link", "--visit", str(visit), "--url", "https://gait.example:8484/"])
+    assert done.exit_code == 0, done.output
+    address = done.output.splitlines()[-1]
+    assert address.startswith("https://gait.example:8484/phone/open?key=")
+    answer = stranger().get(address.removeprefix("https://gait.example:8484"), follow_redirects=False)
+    assert answer.status_code == 303
+
+
+@pytest.mark.parametrize(("now", "then", "side", "words"), [
+    (9.0, 6.0, "right", "Index so far: +-9 (90 %). One more pass filmed from the right side makes it +-6."),
+    (9.0, 6.2, "", "Index so far: +-9 (90 %). One more pass filmed from the front or back makes it +-6."),
+    (5.2, 5.0, "left", "Index so far: +-5 (90 %)."),
+])  # fmt: skip
+def test_what_to_film_next(now: float, then: float, side: str, words: str):
+    assert next_words("en", Next(side, now, then)) == words
+    assert next_words("de", Next(side, now, then)).startswith("Index bisher")
+
+
+# ------------------------------------------------------------------------------------------------------------ attacks
+def code(answer: Any) -> str:
+    return answer.json()["error"]["code"]
+
+
+def test_a_phone_reaches_nothing_but_its_own_visit(visit: int, tmp_path: Path):
+    mine, other = phone(visit), phone(new_visit("2026-02-01", "P002"))
+    number = begin(mine, film(tmp_path))["number"]
+    part = parts_of(film(tmp_path))[0]
+    assert code(put(other, number, 0, part, len(film(tmp_path)))) == "DB_NOT_FOUND"
+    assert code(finish(other, number)) == "DB_NOT_FOUND"
+    assert other.get("/phone/state.json").json()["recordings"] == []
+    for path in ("/visits", f"/visits/{visit}", "/operate", "/visits.json", "/compare"):
+        assert mine.get(path).status_code == 401, path
+    # A visit that is named in the statement is not looked at.
+    assert begin(mine, b"x" * 10, session_id=999, visit=999)["number"]
+    assert {int(n) for n in PhoneRecording().to_arrays("session_id")} == {visit}
+
+
+def test_a_session_is_no_phone(visit: int):
+    for role in ("reader", "reviewer", "operator"):
+        browser = web.client(role, target=nothing)
+        for method, path in (("GET", "/phone"), ("GET", "/phone/state.json"), ("POST", "/phone/recordings.json"),
+                             ("PUT", "/phone/recordings/1.json"), ("POST", "/phone/finish/1.json")):  # fmt: skip
+            assert browser.request(method, path).status_code == 403, (role, path)
+    assert web.client("reader").post(f"/visits/{visit}/film").status_code == 403
+
+
+def test_what_is_not_a_recording_is_refused(visit: int, tmp_path: Path):
+    browser, whole = phone(visit), film(tmp_path)
+    most = phone_recordings.PART_BYTES * MOST_PARTS
+    for wrong in (
+        {"video_bytes": 10 * 10**9}, {"video_bytes": most + 1}, {"log_bytes": most}, {"video_bytes": 0},
+        {"video_bytes": -1}, {"video_bytes": True}, {"video_bytes": "1"}, {"log_bytes": None}, {"sha256": "x" * 64},
+        {"sha256": "../../etc/passwd"}, {"sha256": 3},
+    ):  # fmt: skip
+        answer = browser.post("/phone/recordings.json", json={**stated(whole), **wrong})
+        assert (answer.status_code, code(answer)) == (422, "UPLOAD_REFUSED"), wrong
+    for wrong in ({"note": "a\x00b"}, {"note": "x" * 501}, {"pace": {"a": 1}}, {"activity": "y" * 33}):
+        assert code(browser.post("/phone/recordings.json", json={**stated(whole), **wrong})) == "USAGE", wrong
+    for body in (b"[]", b"3", b"null"):
+        answer = browser.post("/phone/recordings.json", content=body, headers={"content-type": "application/json"})
+        assert code(answer) == "UPLOAD_REFUSED"
+    for body in (b"{", b"[" * 60_000, b"\xff"):
+        answer = browser.post("/phone/recordings.json", content=body, headers={"content-type": "application/json"})
+        assert (answer.status_code, code(answer)) == (415, "WEB_REFUSED")
+    assert len(PhoneRecording()) == 0
+
+
+def test_what_is_not_a_part_is_refused(visit: int, tmp_path: Path):
+    browser, whole = phone(visit), film(tmp_path)
+    number, part, size = begin(browser, whole)["number"], parts_of(whole)[0], len(whole)
+    for content_range in (f"bytes 1-4096/{size}", f"bytes 0-4094/{size}", f"bytes 0-4095/{size + 1}", "bytes 0-4095/*",
+                          f"bytes {size // 4096 * 4096 + 4096}-{size + 4096}/{size}", "", "bytes -1-4095/9",
+                          f"bytes 00-4095/{size}", f"bytes 0-{size - 1}/{size}",
+                          f"bytes 0-4095/{size}, 0-1/2"):  # fmt: skip
+        answer = put(browser, number, 0, part, size, **{"content-range": content_range})
+        assert code(answer) in ("UPLOAD_REFUSED", "WEB_REFUSED"), content_range
+    assert code(put(browser, number, 0, part[:-1] + b"?", size, **{"x-sha256": "0" * 64})) == "UPLOAD_REFUSED"
+    for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""):
+        assert put(browser, number, 0, part, size, **{"content-type": kind}).status_code == 415
+    # A body of 10 GB is refused by what it announces, one that announces nothing by what comes.
+    assert put(browser, number, 0, part, size, **{"content-length": str(10 * 2**30)}).status_code == 413
+    endless = (b"x" * 4096 for _ in range(1000))
+    own = {"content-type": "application/octet-stream", "content-range": f"bytes 0-4095/{size}"}
+    answer = browser.put(f"/phone/recordings/{number}.json", content=endless, headers=own)
+    assert answer.status_code in (413, 422)
+    assert begin(browser, whole)["missing"] == list(range(len(parts_of(whole))))
+    assert code(finish(browser, number)) == "UPLOAD_REFUSED"
+    for path in ("/phone/recordings/..%2f1.json", "/phone/recordings/01.json", "/phone/finish/-1.json"):
+        assert browser.put(path, content=part).status_code in (403, 404), path
+
+
+def test_no_page_from_elsewhere_makes_a_phone_send(visit: int, tmp_path: Path):
+    browser, whole = phone(visit), film(tmp_path)
+    for headers in ({"origin": "https://evil.example"}, {"sec-fetch-site": "cross-site"}, {"origin": "null"}):
+        answer = browser.post("/phone/recordings.json", json=stated(whole), headers=headers)
+        assert answer.status_code == 403, headers
+    assert len(PhoneRecording()) == 0
+
+
+def test_what_is_no_video_or_comes_with_a_bad_log_is_refused_by_its_code(visit: int, tmp_path: Path):
+    browser = phone(visit)
+    told = send(browser, b"no video at all" * 1000)
+    assert told["state"] == "refused"
+    assert told["error"].startswith("VIDEO_NOT_A_VIDEO")
+    told = send(browser, film(tmp_path), b'{"time_s": [1]}')
+    assert told["state"] == "refused"
+    assert told["error"].startswith("PHONE_LOG")
+    assert len(video.Video()) == 0
+    assert not list((tmp_path / "archive" / "_phone").rglob("*"))
+    assert "cannot be used" in web.client(target=nothing).get(f"/visits/{visit}").text
+
+
+def test_parts_that_were_changed_on_the_way_are_sent_again(visit: int, tmp_path: Path):
+    """Each part has the sum that its request states, but together they are another recording than was announced."""
+    browser, whole = phone(visit), film(tmp_path)
+    number = begin(browser, whole)["number"]
+    for n, part in enumerate(parts_of(whole)):
+        assert put(browser, number, n * 4096, bytes(len(part)), len(whole)).status_code == 204
+    assert code(finish(browser, number)) == "UPLOAD_REFUSED"
+    assert send(browser, whole)["state"] == "received"
+
+
+def test_a_link_takes_so_many_recordings(visit: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(phone_recordings, "MOST_RECORDINGS", 3)
+    browser = phone(visit)
+    for n in range(3):
+        begin(browser, bytes([n]))
+    assert code(browser.post("/phone/recordings.json", json=stated(b"more"))) == "UPLOAD_REFUSED"
+    assert begin(browser, bytes([1]))["number"]  # one that is known goes on
+
+
+def test_a_visit_that_was_removed_meanwhile_is_not_made_again(visit: int, tmp_path: Path):
+    browser, whole = phone(visit), film(tmp_path)
+    told = begin(browser, whole)
+    owner = phone_of(browser.cookies["pbl_phone"])
+    for n, part in enumerate(parts_of(whole)):
+        put(browser, told["number"], n * 4096, part, len(whole))
+    sent = phone_recordings.recording(owner, told["number"])
+    (session.Session & {"session_id": visit}).delete(prompt=False)
+    assert code(finish(browser, told["number"])) == "PHONE_LINK"
+    with pytest.raises(Exception, match="DB_NOT_FOUND"):  # between the two
+        phone_uploads.register(owner, sent, phone_uploads.put_together(owner, sent))
+    assert len(session.Session()) == len(video.Video()) == 0
+
+
+def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(phone_uploads, "KEPT_FREE", 10**18)
+    answer = phone(visit).post("/phone/recordings.json", json=stated(film(tmp_path)))
+    assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_the_size_of_a_part_is_that_of_the_page(visit: int):
+    page = phone(visit).get("/phone").text
+    assert f'data-part="{PART_BYTES}"' in page

@@ -1,0 +1,351 @@
+"""The phone's page in a Chromium that takes a film of numbered frames as its camera. Skips where there is none."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from pbl_pipeline.video import probe, read_phone_log
+from schemas import video
+from schemas.capture import PhoneRecording
+from schemas.intake import phone_recordings
+from schemas.intake.protocols import Step, add_protocol
+from tests.integration.compute_target import nothing
+from tests.integration.test_web_accounts import running
+from tests.integration.test_web_phone import link_of, new_visit
+from tests.videos import numbered_frames
+from workers import phone_uploads
+from workers.web import Options, Where, certificates, create_app, phone
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
+#: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.
+UPRIGHT, TURNED = (0.7071, 0.7071, 0.0, 0.0), (0.7044, 0.7044, 0.0616, 0.0616)
+#: In the page: a camera of 640 x 480 that is the element `canvas`.
+CANVAS = """
+() => {
+  const canvas = globalThis.canvas = Object.assign(document.createElement("canvas"), {width: 640, height: 480});
+  let n = 0;
+  setInterval(() => {
+    const c = canvas.getContext("2d");
+    c.fillStyle = `rgb(${n++ % 256}, 90, 90)`;
+    c.fillRect(0, 0, 640, 640);
+  }, 33);
+  navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def camera(chromium: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A Chromium whose camera is a film of 640 x 480."""
+    path = tmp_path_factory.mktemp("camera") / "camera.mjpeg"
+    with with_camera(chromium, path, numbered_frames(60, 480, 640)) as browser:
+        yield browser
+
+
+@contextlib.contextmanager
+def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iterator[Any]:
+    """A Chromium whose camera shows these frames (BGR) at 30 a second, from the first when it is opened."""
+    with av.open(str(path), "w", format="mjpeg") as out:
+        stream = out.add_stream("mjpeg", rate=30, options={"q:v": "2"})
+        stream.pix_fmt = "yuvj420p"
+        for frame in frames:
+            if not stream.codec_context.is_open:
+                stream.height, stream.width = frame.shape[:2]
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="bgr24")))
+        out.mux(stream.encode(None))
+    args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
+            f"--use-file-for-fake-video-capture={path}"]  # fmt: skip
+    executable = shutil.which("chromium") or shutil.which("google-chrome")
+    browser = chromium.browser_type.launch(executable_path=executable, args=args)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    for module in (phone_recordings, phone_uploads, phone):
+        monkeypatch.setattr(module, "PART_BYTES", 65536)
+    return new_visit("2026-01-10")
+
+
+@contextlib.contextmanager
+def filming(
+    browser: Any,
+    visit: int,
+    orientation: bool = True,
+    torn: bool = False,
+    denied: bool = False,
+    protocol: str = "",
+    tls: bool = False,
+    **context: Any,
+) -> Iterator[Any]:
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
+    where, scheme = Where(), "https" if tls else "http"
+    if tls:
+        cert, key = certificates.server_certificate(("127.0.0.1",))
+        where = Where(tls_cert=cert, tls_key=key)
+        context["ignore_https_errors"] = True  # the authority is not installed here
+    with running(create_app(Options(target=nothing, secure=tls)), where) as port:
+        base = f"{scheme}://127.0.0.1:{port}"
+        made = browser.new_context(base_url=base, **{"locale": "en", **PHONE, **context})
+        try:
+            if not denied:
+                made.grant_permissions(["camera", "accelerometer", "gyroscope"], origin=base)
+            page, errors = made.new_page(), []
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+            if orientation:
+                sensor(page, "setSensorOverrideEnabled", enabled=True)
+                turn(page, UPRIGHT)
+            page.goto(f"/phone/open?key={link_of(visit, protocol=protocol)}")
+            page.wait_for_selector("main[data-ready]")
+            yield page
+            # A service worker needs a certificate that the browser trusts.
+            known = ("net::ERR",) if torn else ("fetching the script",) if tls else ()
+            assert not [e for e in errors if not any(k in e for k in known)]
+        finally:
+            made.close()
+
+
+def sensor(page: Any, what: str, **values: Any) -> None:
+    if not hasattr(page, "cdp"):
+        page.cdp = page.context.new_cdp_session(page)
+    page.cdp.send(f"Emulation.{what}", {"type": "relative-orientation", **values})
+
+
+def turn(page: Any, wxyz: tuple[float, ...]) -> None:
+    reading = dict(zip("wxyz", wxyz, strict=True))
+    sensor(page, "setSensorOverrideReadings", reading={"quaternion": reading})
+
+
+def film(page: Any, seconds: float = 3.0) -> None:
+    """From the opened page to the end of a take: one tap for the camera, one to begin."""
+    if page.locator(".allow").is_visible():
+        page.locator(".allow").click()
+    page.locator(".record").click()
+    page.wait_for_selector("main[data-filming='yes']")
+    page.wait_for_timeout(1000 * seconds)
+    page.locator(".record").click()
+    page.wait_for_selector(".after:not([hidden])")
+
+
+def arrived(page: Any, n: int = 1) -> None:
+    page.wait_for_function(
+        "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === n",
+        arg=n,
+        timeout=30_000,
+    )
+
+
+def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.get_by_label("fast").check()
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(1500)
+        before = page.evaluate("performance.now()")
+        turn(page, TURNED)
+        page.wait_for_timeout(50)
+        after = page.evaluate("performance.now()")
+        page.wait_for_timeout(1500)
+        page.locator(".record").click()
+        page.wait_for_selector(".after:not([hidden])")
+        times = np.array(json.loads(page.locator("main").get_attribute("data-times")), float) / 1e6
+        start_ms = float(page.locator("main").get_attribute("data-start"))
+        page.locator("[name=note]").fill("first pass")
+        page.locator(".keep").click()
+        arrived(page)
+        assert (
+            page.evaluate("(async () => (await Array.fromAsync((await navigator.storage.getDirectory()).keys())))()")
+            == []
+        )
+    sent = PhoneRecording().fetch1()
+    about = sent["phone_about"] if isinstance(sent["phone_about"], dict) else json.loads(sent["phone_about"])
+    assert about["note"] == "first pass"
+    assert about["sensor"] == "RelativeOrientationSensor"
+    assert about["dropped"] <= 0.1 * about["frames"], about
+    row = (video.Video & {"session_id": visit}).fetch1()
+    assert row["camera_motion"] == "handheld"
+    assert (video.Pace & row).fetch1("pace") == "fast"
+    # Every frame has the time at which the camera delivered it.
+    info = probe(row["video_path"])
+    assert info.n_frames == len(times) == about["frames"] > 45
+    assert (info.width_px, info.height_px) == (640, 480)
+    assert (bool(info.make), bool(info.model)) == (True, True)  # by which a calibration of the phone is found
+    assert (info.lens or "").endswith("camera.mjpeg")
+    assert (info.recorded_utc or "").startswith(f"{datetime.now(UTC):%Y-%m-%d}")
+    assert np.abs(info.time_s - (times - times[0])).max() < 0.002
+    # The turn stands in the log at its moment of the video's clock.
+    (path,) = Path(row["video_path"]).parent.glob("*.json")
+    log = read_phone_log(path)
+    moved = log.time_s[np.argmax(np.abs(log.quat_wxyz - log.quat_wxyz[0]).max(axis=1) > 0.01)]
+    assert (before - start_ms) / 1000 - 0.01 <= moved <= (after - start_ms) / 1000 + 0.01
+
+
+def test_reloads_in_the_middle_of_an_upload(camera: Any, visit: int):
+    with filming(camera, visit, torn=True) as page:
+        film(page)
+        sent = []
+
+        def tear(route: Any) -> None:
+            """One part arrives, then the network is gone."""
+            sent.append(route.request.url)
+            route.continue_() if len(sent) == 1 else route.abort()
+
+        page.route("**/phone/recordings/*.json", tear)
+        page.locator(".keep").click()
+        page.wait_for_function("() => document.querySelector('.said').textContent.startsWith('No network')")
+        assert len(sent) > 1
+        page.unroute("**/phone/recordings/*.json")
+        page.reload()
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == len(PhoneRecording()) == 1
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 45
+
+
+def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int):
+    with filming(camera, visit, torn=True) as page:
+        page.wait_for_function("() => navigator.serviceWorker.ready.then(() => true)")
+        page.reload()  # now the service worker serves it
+        page.wait_for_selector("main[data-ready]")
+        page.context.set_offline(True)
+        page.reload()
+        page.wait_for_selector("main[data-ready]")
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.get_by_text("No network").wait_for()
+        page.context.set_offline(False)
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == 1
+
+
+def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(4500)
+        page.evaluate("window.addEventListener('pagehide', (e) => e.stopImmediatePropagation(), true)")
+        page.reload()
+        page.wait_for_selector("main[data-ready]")
+        page.get_by_role("button", name="Keep and send").last.click()
+        arrived(page)
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+
+
+def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
+    with filming(camera, visit, orientation=False) as page:
+        page.locator(".allow").click()
+        page.get_by_text("tells no orientation").wait_for()
+        film(page, 1.5)
+        page.locator(".again").click()
+        page.get_by_text("None yet").wait_for()
+        film(page, 1.5)
+        page.locator(".keep").click()
+        arrived(page)
+    assert (video.Video & {"session_id": visit}).fetch1("camera_motion") == "static"
+    assert len(video.PhoneAttitude()) == 0
+    assert len(PhoneRecording()) == 1
+
+
+def test_the_page_leads_through_a_protocol(camera: Any, visit: int):
+    add_protocol("clinic", [Step(1, "walking", "fast", "left", 1), Step(2, "tug", "", "any", 1)])
+    with filming(camera, visit, protocol="clinic") as page:
+        pressed = page.locator(".steps [aria-pressed='true']")
+        assert pressed.inner_text() == "Walk, fast, from the left side: 0 of 1"
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.locator(".steps [aria-pressed='true']", has_text="TUG").wait_for()
+        assert page.locator(".steps button").first.inner_text().startswith("\u2713")
+        film(page, 1.5)
+        page.locator(".keep").click()
+        page.get_by_text("complete by its protocol").wait_for()
+    assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
+    assert list(video.Pace().to_arrays("pace")) == ["fast"]
+
+
+def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
+    with filming(camera, visit, tls=True) as page:
+        (cookie,) = (c for c in page.context.cookies() if "pbl_phone" in c["name"])
+        assert (cookie["name"], cookie["secure"], cookie["httpOnly"]) == ("__Host-pbl_phone", True, True)
+        film(page, 1.5)
+        page.locator(".keep").click()
+        arrived(page)
+        answer = page.request.get("/phone/authority.crt")
+        assert answer.body() == certificates.authority().read_bytes()
+    assert len(video.Video() & {"session_id": visit}) == 1
+
+
+def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate(CANVAS)  # a camera whose picture can be turned
+        page.locator(".allow").click()
+        for why, act in (
+            ("interrupted", "() => { Object.defineProperty(document, 'hidden', {get: () => true, configurable: true});"
+                            " document.dispatchEvent(new Event('visibilitychange')); delete document.hidden; }"),
+            ("turned", "() => { canvas.width = 480; canvas.height = 640; }"),
+        ):  # fmt: skip
+            page.locator(".record").click()
+            page.wait_for_selector("main[data-filming='yes']")
+            page.wait_for_timeout(1200)
+            page.evaluate(act)
+            page.locator(".said", has_text=why).wait_for()
+            page.locator(".keep" if why == "interrupted" else ".again").click()
+        arrived(page)
+    assert len(video.Video() & {"session_id": visit}) == 1
+
+
+def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
+    with filming(chromium, visit, denied=True) as page:  # has none
+        page.locator(".allow").click()
+        page.locator(".said", has_text="camera").wait_for()
+    with filming(camera, visit, denied=True) as page:
+        page.evaluate(
+            "() => { const refuse = () => Promise.reject(new DOMException('', 'NotAllowedError'));"
+            " navigator.mediaDevices.getUserMedia = refuse; }"
+        )
+        page.locator(".allow").click()
+        page.locator(".said", has_text="Permissions").wait_for()
+
+
+def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate("delete globalThis.VideoEncoder")
+        film(page)
+        page.locator(".said", has_text="less exact").wait_for()
+        page.locator(".keep").click()
+        arrived(page)
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: str, tmp_path: Path):
+    """At three widths, upright and on its side: nothing sticks out, and axe finds nothing."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    folder = Path(os.environ.get("PBL_PICTURES") or tmp_path)
+    with filming(camera, visit, color_scheme=scheme, locale="de" if scheme == "dark" else "en") as page:
+        page.locator(".allow").click()
+        page.wait_for_timeout(800)
+        for width, height in ((360, 740), (390, 844), (430, 932), (844, 390)):
+            page.set_viewport_size({"width": width, "height": height})
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            page.screenshot(path=folder / f"phone-{width}-{scheme}.png", full_page=True)
+            found = Axe().run(page).response["violations"]
+            assert not [v["id"] for v in found if v["impact"] in ("serious", "critical")], found
+        film(page, 1.0)
+        page.screenshot(path=folder / f"phone-after-{scheme}.png", full_page=True)
+        page.locator(".again").click()

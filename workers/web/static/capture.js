@@ -1,0 +1,244 @@
+// The page of a phone that films a visit: opens the camera, films, keeps, sends, and shows what the server says.
+
+import { openCamera, Take } from "./capture_film.js";
+import { logOf, Sensors, up } from "./capture_sensors.js";
+import { all, keep, newFile, Refusal, remove, request, send } from "./capture_takes.js";
+
+const MOST_MS = 600_000, LEAST_ROOM = 3e8, AGAIN_MS = 3000;
+const page = /** @type {HTMLElement} */ (document.querySelector("main"));
+const texts = JSON.parse(page.dataset.said ?? "{}"), language = document.documentElement.lang;
+const visit = Number(page.dataset.visit), size = Number(page.dataset.part);
+const $ = (/** @type {string} */ at) => /** @type {any} */ (page.querySelector(at));
+const [video, record, allow, clock, level, list] = [$("video"), $(".record"), $(".allow"), $(".clock"), $(".level"), $(".takes")];
+const sensors = new Sensors();
+
+/** @param {string} name @param {Record<string, any>} values */
+function t(name, values = {}) {
+  return texts[name][language].replace(/\{(\w+)\}/g, (/** @type {string} */ _, /** @type {string} */ key) => values[key]);
+}
+
+/** @param {string} name @param {string} more */
+function say(name, more = "") {
+  $(".said").textContent = [name && t(name), more].filter(Boolean).join(" ");
+}
+
+// ---------------------------------------------------------------------------------------------------------- filming
+/** @type {MediaStream|null} */
+let stream = null;
+/** @type {Take|null} */
+let take = null;
+/** @type {any} */
+let taken = null;
+let why = "";
+/** The step of the protocol that is filmed. @type {any} */
+let chosen = null;
+
+allow.onclick = async () => {
+  if (!navigator.mediaDevices) return say("not_secure");
+  const listening = sensors.listen();  // within the tap: iOS asks for it
+  try {
+    stream = await openCamera();
+  } catch (error) {
+    const name = /** @type {Error} */ (error).name;
+    return say(name === "NotFoundError" ? "no_camera" : name === "NotReadableError" ? "busy" : "denied");
+  }
+  await listening;
+  video.srcObject = stream;
+  await video.play();
+  allow.hidden = true, record.hidden = false;
+  record.focus();
+  stream.getVideoTracks()[0].onended = () => stop("interrupted");
+  setTimeout(() => say("ready", sensors.source ? "" : t("no_sensors")), 700);
+};
+
+record.onclick = () => (take ? stop("") : start());
+
+async function start() {
+  const { quota = 1e12, usage = 0 } = await navigator.storage.estimate();
+  if (quota - usage < LEAST_ROOM) return say("full");
+  navigator.storage.persist?.();
+  /** @type {any} */ (navigator).wakeLock?.request("screen").catch(() => {});
+  const name = `take-${Date.now()}-${Math.random().toString(36).slice(2, 8)}`;
+  const file = await newFile(name);
+  taken = { name, visit, made: Date.now(), about: stated(), log: null, complete: false, file };
+  why = "";
+  sensors.trim();
+  take = new Take(/** @type {MediaStream} */ (stream), video, file, await phoneModel(), (name) => stop(name));
+  await keepFacts();
+  await take.start();
+  page.dataset.filming = "yes";
+  record.textContent = t("stop");
+  say("filming");
+}
+
+/** What is stated of the recording that is filmed now. */
+function stated() {
+  const form = new FormData($("form"));
+  const told = Object.fromEntries([...form].filter(([, value]) => value).map(([name, value]) => [name, String(value)]));
+  return { ...told, ...(chosen ? { activity: chosen.activity, pace: chosen.pace } : {}) };
+}
+
+/** Its facts on the phone, with the log so far: also of one that is never ended. */
+async function keepFacts() {
+  const { file, ...facts } = taken;
+  if (take?.startMs) facts.log = logOf(sensors.samples, take.startMs, take.endMs, await phoneModel());
+  await keep(facts);
+  return facts;
+}
+
+async function phoneModel() {
+  const about = await /** @type {any} */ (navigator).userAgentData?.getHighEntropyValues(["model", "platform"]).catch(() => null);
+  const [, told = ""] = /\(([^;)]+)/.exec(navigator.userAgent) ?? [];
+  return { make: about?.platform || (/^iP/.test(told) ? "Apple" : "browser"), model: (about?.model || told).slice(0, 64) };
+}
+
+/** @param {string} reason a text, where it ended by itself */
+async function stop(reason) {
+  if (!take || why) return;
+  const ending = take;
+  why = reason || "stopped";
+  await ending.stop();
+  await taken.file.close();
+  page.dataset.filming = "no";
+  record.textContent = t("start");
+  if (!ending.frames) {
+    take = null;
+    await remove(taken.name);
+    return say(reason || "interrupted");
+  }
+  taken.about = { ...taken.about, frames: ending.frames, dropped: ending.dropped, sensor: sensors.source, camera: ending.how };
+  taken.log = (await keepFacts()).log;
+  take = null;
+  page.dataset.times = JSON.stringify(ending.times), page.dataset.start = String(ending.startMs);
+  const lost = ending.dropped ? t("dropped", { n: ending.dropped, all: ending.frames + ending.dropped }) : "";
+  say(reason, [lost, ending.how.includes("/") ? t("fallback") : ""].filter(Boolean).join(" "));
+  $(".film").hidden = true, $(".after").hidden = false;
+  $(".keep").focus();
+}
+
+/** @param {boolean} kept */
+async function decided(kept) {
+  $(".film").hidden = false, $(".after").hidden = true;
+  if (kept) {
+    const { file, ...facts } = { ...taken, complete: true };
+    await keep({ ...facts, about: { ...facts.about, ...stated() } });
+    $("[name=note]").value = "";
+  } else await remove(taken.name);
+  say("ready");
+  await show();
+  sendAll();
+}
+$(".keep").onclick = () => decided(true);
+$(".again").onclick = () => decided(false);
+
+document.addEventListener("visibilitychange", () => { if (document.hidden) stop("interrupted"); });
+addEventListener("pagehide", () => stop("interrupted"));
+
+setInterval(() => {
+  if (take) {
+    const s = Math.max(0, take.endMs - take.startMs) / 1000;
+    clock.textContent = `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
+    if (s * 1000 > MOST_MS) stop("too_long");
+  } else sensors.trim();
+  if (!sensors.last) return;
+  const [x, y] = up(sensors.last), held = Math.round(Math.atan2(x, y) / (Math.PI / 2)) * 90;
+  const tilt = (Math.atan2(x, y) * 180) / Math.PI - held;
+  level.firstElementChild.style.transform = `rotate(${tilt}deg)`;
+  level.dataset.level = Math.abs(tilt) < 2 ? "yes" : "no";
+  level.ariaLabel = `${t("level")}: ${tilt.toFixed(0)}°`;
+}, 200);
+setInterval(() => { if (take && !why) keepFacts(); }, 2000);
+
+// ---------------------------------------------------------------------------------------------------------- sending
+/** @type {Map<string, string>} */
+const states = new Map();
+let sending = false;
+
+async function sendAll() {
+  if (sending) return;
+  sending = true;
+  try {
+    for (const facts of (await all()).filter((one) => one.complete && one.visit === visit)) {
+      const told = await send(facts, size, (share) => {
+        states.set(facts.name, t("sending", { n: Math.floor(100 * share) }));
+        show();
+      });
+      states.set(facts.name, t("refused", { why: told.error }));
+      if (told.state === "received") await remove(facts.name);
+      else await keep({ ...facts, complete: false, about: { ...facts.about, why: told.error } });
+    }
+    if (!take && navigator.onLine && ["no_network", "ended"].some((name) => $(".said").textContent === t(name))) say("");
+  } catch (error) {
+    if (error instanceof Refusal && (error.code === "PHONE_LINK" || error.status === 401)) say("ended");
+    else if (!(error instanceof Refusal)) say("no_network");
+    else say("", error.message);
+  }
+  sending = false;
+  await show();
+}
+
+/** The steps of the protocol: what came is ticked off, a tap chooses what is filmed now. @param {any[]} steps */
+function lead(steps) {
+  const open = steps.find((step) => step.done < step.passes), now = steps.find((step) => step.number === chosen?.number);
+  if (!chosen || (now && chosen.done < chosen.passes && now.done >= now.passes)) choose(open ?? now ?? steps[0]);
+  else chosen = now ?? chosen;
+  $(".protocol").hidden = !steps.length;
+  $(".complete").textContent = steps.length && !open ? t("complete") : "";
+  $(".steps").replaceChildren(...steps.map((step) => {
+    const line = document.createElement("li"), button = document.createElement("button");
+    const of = (/** @type {string} */ name) => (texts[`is_${step[name]}`] ? t(`is_${step[name]}`) : step[name]);
+    button.type = "button";
+    button.textContent = `${step.done >= step.passes ? "\u2713 " : ""}${[of("activity"), of("pace"), t(`view_${step.view}`)].filter(Boolean).join(", ")}: ${t("done", { n: step.done, all: step.passes })}`;
+    button.ariaPressed = String(step.number === chosen?.number);
+    button.onclick = () => { choose(step); lead(steps); };
+    line.append(button);
+    return line;
+  }));
+}
+
+/** @param {any} step */
+function choose(step) {
+  chosen = step ?? null;
+  $("form").elements.step.value = step?.number ?? "";
+}
+
+/** The recordings of this phone and of the visit. */
+async function show() {
+  const found = await all(), told = await request("/phone/state.json").catch(() => null);
+  const lines = found.filter((one) => one.name !== taken?.name || !take).map((one) => {
+    const own = one.visit !== visit ? t("other_visit") : one.about.why ? t("refused", { why: one.about.why }) : states.get(one.name) ?? t("on_phone");
+    const line = item(new Date(one.made).toLocaleTimeString(language), own);
+    if (one.complete && !one.about.why) return line;
+    const buttons = [[t("remove"), () => remove(one.name)]];
+    if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => keep({ ...one, complete: true }).then(sendAll)]);
+    for (const [label, act] of buttons) {
+      const button = document.createElement("button");
+      button.textContent = label;
+      button.onclick = () => act().then(show);
+      line.append(" ", button);
+    }
+    return line;
+  });
+  for (const one of told?.recordings ?? [])
+    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict || t("refused", { why: one.error })));
+  $(".next").textContent = told?.next ?? "";
+  if (told && !take) lead(told.protocol);
+  list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
+  const { quota = 0, usage = 0 } = await navigator.storage.estimate();
+  const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
+  $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toFixed(1) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
+}
+
+/** @param {string} head @param {string} text */
+function item(head, text) {
+  const line = document.createElement("li"), strong = document.createElement("b");
+  strong.textContent = head;
+  line.append(strong, ` ${text}`);
+  return line;
+}
+
+setInterval(sendAll, AGAIN_MS);
+addEventListener("online", sendAll);
+navigator.serviceWorker?.register("/phone/offline.js", { scope: "/phone" }).catch(() => {});
+show().then(sendAll);
+page.dataset.ready = "yes";
