@@ -49,6 +49,22 @@ def new_folder(beside: Path | None = None) -> TemporaryFolder:
     return TemporaryFolder(dir=beside, prefix=f"{hidden}{_PREFIX}{os.getpid()}-{_OWN}-")
 
 
+def private_folder(name: str) -> Path:
+    """Return the folder `name` of this user among the temporary files, which no other user may enter. It stays.
+
+    Raises
+    ------
+    OSError
+        It cannot be made, or others may enter it.
+    """
+    folder = Path(tempfile.gettempdir()) / f"pbl-{name}-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise OSError(f"{folder} can be entered by other users")
+    return folder
+
+
 def sweep(beside: Path | None = None) -> list[Path]:
     """Remove the folders of processes that have ended; return those that this account may not remove."""
     left = []

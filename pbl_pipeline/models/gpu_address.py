@@ -13,9 +13,10 @@ import os
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
+
+from pbl_pipeline.temporary import private_folder
 
 #: A GPU process that does not listen after so long has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
@@ -45,23 +46,13 @@ def running_server() -> str:
     OSError
         The folder of its socket cannot be made.
     """
-    folder = _folder()
+    folder = private_folder("gpu")
     address = str(folder / f"{_name()}.sock")
-    with (folder / f"{_name()}.lock").open("w") as lock:
+    with (folder / f"{_name()}.lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not _listens(address):
             _start(address, folder / f"{_name()}.log")
     return address
-
-
-def _folder() -> Path:
-    """A folder that only this user may enter."""
-    folder = Path(tempfile.gettempdir()) / f"pbl-gpu-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise OSError(f"{folder} can be entered by other users")
-    return folder
 
 
 def _name() -> str:
@@ -99,7 +90,7 @@ def _start(address: str, log: Path) -> None:
         if _listens(address):
             return
         if process.poll() is not None:
-            lines = log.read_text(errors="replace").strip().splitlines()
+            lines = log.read_text("utf-8", "replace").strip().splitlines()
             raise RuntimeError(lines[-1][:300] if lines else f"the GPU process ended with {process.returncode}")
         time.sleep(0.05)
     process.kill()

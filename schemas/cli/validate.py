@@ -188,10 +188,9 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
     is only refitted. With --tables both are methods, and every visit that has results by both counts; the comparisons
     between visits that the change touches are listed.
     """
-    import tempfile
-
     from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.temporary import new_folder
     from pbl_pipeline.validation import bridge_pairs, bridge_table, print_tables, write_tables
 
     if new is None and (keep is None or in_tables):
@@ -209,8 +208,8 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
         schemas.activate(methods=False)
         values, comparisons = values_by(old, str(new))
     else:
-        with tempfile.TemporaryDirectory() as spare:
-            values = [_bridge_values(name, keep or Path(spare)) for name in (old, new) if name is not None]
+        with new_folder() as spare:
+            values = [_bridge_values(name, keep or spare) for name in (old, new) if name is not None]
         if new is None:
             return
     pairs = bridge_pairs(values[0], values[1])
