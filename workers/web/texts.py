@@ -100,7 +100,8 @@ def on_page(language: str, english: str) -> Markup:
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown
-    kept = " ".join(part for part in re.split(r"(?<=[.;:]) ", english) if not _COMMAND.search(part)).rstrip(" ;:")
+    parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )", english)
+    kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:")
     return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
 
