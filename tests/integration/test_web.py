@@ -314,7 +314,7 @@ def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, mon
         away = browser.get("/visits")
         assert away.status_code == 503
         assert "DB_NOT_RUNNING" in away.text
-        assert "pbl db start" in away.text
+        assert "ask the person who runs this server" in away.text
     finally:
         embedded.start()
     assert "/visits/1" in browser.get("/visits").text  # the same page finds the server again
@@ -333,9 +333,9 @@ def test_an_error_nobody_foresaw_says_nothing_of_the_program(four_visits: None, 
 
 def test_german_by_the_browser_and_by_choice(four_visits: None):
     browser = web.client()
-    assert "Besuche" in browser.get("/visits", headers={"accept-language": "fr, de-CH;q=0.8, en;q=0.1"}).text
+    assert "Termine" in browser.get("/visits", headers={"accept-language": "fr, de-CH;q=0.8, en;q=0.1"}).text
     web.post(browser, "/language", language="de", back="/visits/1")
-    assert "Alle Besuche dieser Person" in browser.get("/visits/1").text
+    assert "Alle Termine dieser Person" in browser.get("/visits/1").text
     assert web.post(browser, "/language", language="de", back="//evil").headers["location"] == "/"
 
 

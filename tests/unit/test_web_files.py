@@ -77,7 +77,7 @@ def test_what_the_library_says_is_in_every_language():
     composed = re.compile(
         r"walks (part of the time )?(across|to and from|towards|away from) the (picture|camera)|look at the overlay"
         r"|the GDI needs .*|(only one|\{n\}) gait cycles?, and the first and last steps of a walk are excluded"
-        r"|\{name\} of '\{value\}'|the measure '\{name\}'|\{table\} waits for a choice: \{note\}; next: \{step\}"
+        r"|\{name\} of '\{value\}'|the measure '\{name\}'|\{table\} waits for a choice: \{note\}(; next: \{step\})?"
     )
     pool = "\0".join(plain)
     parts = {e: [part.strip() for part in re.split(r"\{\w+\}", e)] if "{" in e else [] for e in ours}

@@ -101,7 +101,7 @@ def on_page(language: str, english: str) -> Markup:
     if not _COMMAND.search(shown):
         return shown
     parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )", english)
-    kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:")
+    kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
     return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
 
