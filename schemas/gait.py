@@ -345,7 +345,7 @@ class Spatiotemporal(dj.Computed):
 
     class Measure(dj.Part):
         definition = f"""
-        # every measure with both sides and its spread; after those of walking those of a stated task
+        # every measure with both sides and its spread
         {measure_columns("measure")}
         """
 

@@ -101,7 +101,7 @@ def test_no_text_of_a_page_names_a_command():
     say = "Use the buttons of this page, or ask the person who runs this server."
     assert (
         texts.on_page("en", "TrackedPersons failed (X); next: look at it, then pbl retry")
-        == f"TrackedPersons failed (X) {say}"
+        == f"TrackedPersons failed (X); next: look at it {say}"
     )
     assert texts.on_page("en", "give the height (--height-m), or <none>") == "give the height, or &lt;none&gt;"
     german = texts.on_page("de", "a. `pbl why` says more")

@@ -100,7 +100,7 @@ def on_page(language: str, english: str) -> Markup:
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown
-    parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )", english)
+    parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )|, (?=then `?pbl )", english)
     kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
     return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
