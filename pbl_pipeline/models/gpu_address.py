@@ -6,7 +6,6 @@ It ends by itself when no one has been connected for a while. Fit and detection 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import importlib.util
 import os
@@ -46,6 +45,8 @@ def running_server() -> str:
     OSError
         The folder of its socket cannot be made.
     """
+    import fcntl  # not on Windows, where JAX sees no GPU
+
     folder = private_folder("gpu")
     address = str(folder / f"{_name()}.sock")
     with (folder / f"{_name()}.lock").open("wb") as lock:
