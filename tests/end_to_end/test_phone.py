@@ -1,5 +1,5 @@
 """From the link of a visit to its index: a Chromium films the demo recording, with orientations as sensors, and the
-same pictures come as a file. Minutes."""
+same pictures come as a file. Minutes, and two idle cores: a loaded machine loses frames. `pytest -m machine`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
 from workers.populate import populate
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.machine]
 #: Frames (30 a second) in which the first picture stands still before the walk, and the last one after it.
 BEFORE, AFTER = 150, 60
 
