@@ -15,6 +15,8 @@ from pbl_pipeline import settings
 
 #: Programs that compile faster than this are not worth a file.
 MIN_COMPILE_SECONDS = 0.3
+#: Flags of XLA for the fit (see `configure`); with them the convolutions of detection take a slow path.
+FIT_FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
 
 
 @functools.cache
@@ -49,7 +51,7 @@ def configure() -> None:
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
     # neither: 0.98 s and 14 s). Read when the first device is asked for. Detection
     # needs the trials and is another process.
-    for flag in ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false"):
+    for flag in FIT_FLAGS:
         flags = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()

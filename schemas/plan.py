@@ -135,8 +135,7 @@ def locked(session_id: int) -> Iterator[None]:
     # For this transaction only: the snapshot of the default level would be from before the lock.
     connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
     with connection.transaction:
-        table = session.Session.full_table_name  # DataJoint's own name, quoted; the number is an argument
-        connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
+        session.lock(session_id)
         yield
 
 

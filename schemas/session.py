@@ -37,6 +37,12 @@ class BodyMass(dj.Manual):
     """
 
 
+def lock(session_id: int) -> None:
+    """Have every other transaction that locks this visit wait until the present one ends."""
+    table = Session.full_table_name  # DataJoint's own name, quoted; the number is an argument
+    Session.connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
+
+
 def unknown_visit(session_id: int) -> PblError:
     """DB_NOT_FOUND for a number that no visit has."""
     return PblError(

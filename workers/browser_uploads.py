@@ -7,24 +7,21 @@ import dataclasses
 import hashlib
 import os
 import secrets
-import shutil
 import time
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.limited import LimitExceeded, limited
-from pbl_pipeline.video import read_first
 from schemas import session, video, worker
 from schemas.decisions.review_decisions import record
 from schemas.intake import Registered, VisitRecord
 from schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, take_in
+from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, check_opens, has_room, take_in
 
-#: What opening a recording may take (s, bytes), and the age at which the rest of a broken upload is removed (s).
-_OPEN_S, _OPEN_BYTES, _REST_S = 60.0, 2**31, 86_400.0
+#: Age at which the rest of a broken upload is removed (s).
+_REST_S = 86_400.0
 _PREFIX = "browser-"
 
 
@@ -111,10 +108,7 @@ class Arriving:
 
 def check_room(n_bytes: int) -> None:
     """Raise `PblError` FILE_UNWRITABLE where so many bytes do not fit into the archive."""
-    here = archive_dir()
-    while not here.is_dir():
-        here = here.parent
-    if shutil.disk_usage(here).free < n_bytes + KEPT_FREE:
+    if not has_room(archive_dir(), n_bytes):
         raise PblError(
             "FILE_UNWRITABLE",
             found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
@@ -126,15 +120,7 @@ def check_room(n_bytes: int) -> None:
 def check(arrived: Arriving) -> PblError | None:
     """Return what is wrong with a file that is to be a video: VIDEO_..., or None. Its first picture is decoded."""
     try:
-        limited(read_first, arrived.path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
-    except LimitExceeded as error:
-        return PblError(
-            "VIDEO_NOT_A_VIDEO",
-            found=f"a file that takes {error} to open",
-            expected="a video file",
-            next_step="copy it from the phone again",
-            key=arrived.name,
-        )
+        check_opens(arrived.path, "a video file", "copy it from the phone again")
     except PblError as error:
         return error.with_key(arrived.name)
     return None

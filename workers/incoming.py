@@ -25,7 +25,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.limited import LimitExceeded, limited
-from pbl_pipeline.video import read_phone_log, sha256_of
+from pbl_pipeline.video import read_first, read_phone_log, sha256_of
 from schemas import video, worker
 from schemas.connection import dj
 from schemas.intake import OneCamera, Registered, Sensors, VisitRecord, register
@@ -52,6 +52,8 @@ VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
 RUN_S, UPLOAD_S = 600.0, 600.0
 #: What reading a sensor log may take (s, bytes).
 LOG_S, LOG_BYTES = 60.0, 2**30
+#: What opening a recording may take (s, bytes).
+_OPEN_S, _OPEN_BYTES = 60.0, 2**31
 #: Space on the archive's disk that uploads do not fill (bytes).
 KEPT_FREE = 10**9
 _BLOCK = 2**20
@@ -216,7 +218,7 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> C
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, upload.name.parts[0])
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
-    if shutil.disk_usage(folder).free < upload.size + KEPT_FREE:
+    if not has_room(folder, upload.size):
         raise OSError(f"{upload.size / 1e9:.1f} GB do not fit beside {KEPT_FREE / 1e9:.0f} GB that are kept free")
     try:
         with (
@@ -239,6 +241,29 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> C
             raise OSError(f"{type(error).__name__}: {error}") from error  # the client of an object store
         raise
     return Copy(part, digest.hexdigest())
+
+
+def has_room(folder: Path, n_bytes: int) -> bool:
+    """Return whether so many bytes fit on the disk of a folder, which need not exist yet, beside `KEPT_FREE`."""
+    while not folder.is_dir():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free >= n_bytes + KEPT_FREE
+
+
+def check_opens(path: Path, expected: str, next_step: str) -> None:
+    """Decode the first picture of a file in a process with limits.
+
+    Raises
+    ------
+    PblError
+        VIDEO_...: what is wrong with it; VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the limits.
+    """
+    try:
+        limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
+    except LimitExceeded as error:
+        raise PblError(
+            "VIDEO_NOT_A_VIDEO", found=f"a file that takes {error} to open", expected=expected, next_step=next_step
+        ) from error
 
 
 def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:

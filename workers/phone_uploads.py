@@ -14,8 +14,6 @@ import shutil
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.limited import LimitExceeded, limited
-from pbl_pipeline.video import read_first
 from schemas import video, worker
 from schemas.capture import UPLOADING
 from schemas.intake import VisitRecord, phone_recordings
@@ -24,12 +22,10 @@ from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remo
 from schemas.operations.folders import private_folder, sync_folders
 
 from . import queue
-from .incoming import KEPT_FREE, Copy, take_in
+from .incoming import KEPT_FREE, Copy, check_opens, has_room, take_in
 
 #: Priority of the jobs of a phone's recording: the person is still there.
 FIRST = 1
-#: What opening a recording may take (s, bytes).
-_OPEN_S, _OPEN_BYTES = 60.0, 2**31
 
 
 def folder(phone: Phone, sent: Sent) -> Path:
@@ -47,11 +43,8 @@ def missing(phone: Phone, sent: Sent) -> list[int]:
 
 def check_room(sent: Sent) -> None:
     """Raise `PblError` FILE_UNWRITABLE where a recording does not fit into the archive."""
-    here = archive_dir()
-    while not here.is_dir():
-        here = here.parent
     # Twice: the parts stay until the whole is registered.
-    if shutil.disk_usage(here).free < 2 * (sent.video_bytes + sent.log_bytes) + KEPT_FREE:
+    if not has_room(archive_dir(), 2 * (sent.video_bytes + sent.log_bytes)):
         raise PblError(
             "FILE_UNWRITABLE",
             found="no room for the recording in the archive of the server",
@@ -125,7 +118,7 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
         for number in range(sent.n_parts):
             (here / str(number)).unlink()
         raise upload_refused("parts that together have another SHA-256 than was announced", "they are sent again")
-    _check_video(whole)
+    check_opens(whole, "a recording of the page of a phone", "film again")
     copies = [Copy(whole, video_sum.hexdigest())]
     return [*copies, Copy(log, "")] if sent.log_bytes else copies
 
@@ -162,15 +155,3 @@ def discard(phone: Phone, sent: Sent) -> None:
     """Remove the parts of a recording that is registered or cannot be."""
     shutil.rmtree(folder(phone, sent), ignore_errors=True)
     remove_folders(archive_dir(), phone.subject)
-
-
-def _check_video(path: Path) -> None:
-    try:
-        limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
-    except LimitExceeded as error:
-        raise PblError(
-            "VIDEO_NOT_A_VIDEO",
-            found=f"a file that takes {error} to open",
-            expected="a recording of the page of a phone",
-            next_step="film again",
-        ) from error

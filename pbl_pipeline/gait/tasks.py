@@ -1,4 +1,4 @@
-"""Timed tasks: sit-to-stand, timed up and go and squats, from events of their own (docs/measures.md, "Tasks").
+"""Timed tasks: sit-to-stand, timed up and go and squats, from their own events (docs/measures.md, "Tasks").
 
 The events are times at which the height of the hips, or the heading of the pelvis, has gone a first or all but a last
 part of its way from one level to the next.
@@ -68,7 +68,7 @@ BRIDGED_S = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class TaskMotion:
-    """What the events of tasks are found in; NaN in frames without the person.
+    """Signals in which the events of tasks are found; NaN in frames without the person.
 
     Attributes
     ----------
@@ -256,8 +256,8 @@ def _rise_and_sit(motion: TaskMotion, moves: Sequence[Move]) -> _Values:
 def _moves(time_s: np.ndarray, values: np.ndarray, middle: float, apart: float, near: float = np.inf) -> list[Move]:
     """Return the movements of a signal over a level `middle` between plateaus that are at least `apart`.
 
-    A plateau's level is the furthest value from the middle, up to `near`, between two crossings. A movement that has no
-    frame at its tenth or nine tenths is left out, such as one that the recording cuts.
+    A plateau's level is the furthest value from the middle, up to `near`, between two crossings. A movement without
+    a frame where it begins or ends (`BEGIN`, `END`) is left out, such as one that the recording cuts.
     """
     seen = np.flatnonzero(np.isfinite(values))
     time, above = time_s[seen], values[seen] - middle

@@ -57,7 +57,7 @@ ONE_CAMERA_SD: Mapping[str, float] = {
     "ankle_push_off_power_w_per_kg": 1.1,
     "centre_of_mass_excursion_m": 0.003,
 }
-#: Why there are no forces, by code.
+#: Reasons for missing forces, by code.
 REASONS = {
     "NO_CYCLES": "no gait cycle is used",
     "MOVING_CAMERA": FOLLOWS,

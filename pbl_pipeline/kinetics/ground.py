@@ -1,6 +1,6 @@
 """Each foot's share of the ground reaction, and where it acts.
 
-What the motion tells well is the vertical force of both feet together. Its second derivatives tell the horizontal force
+The motion tells the vertical force of both feet together well. Its second derivatives tell the horizontal force
 less well and the moment badly, so that the centre of pressure of one foot would be off by 5 cm. Three things that are
 known of walking tell more, each measured on force plates (`python -m research.benchmarks.kinetics`):
 
@@ -11,8 +11,8 @@ known of walking tell more, each measured on force plates (`python -m research.b
 - while both feet stand, the vertical force of the one behind falls as `trailing_share` (from the motion alone it cannot
   be told: two feet and the body are a closed loop).
 
-The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. What feet on a floor then do
-not carry stays as the residual.
+The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. The force that feet on a
+floor then do not carry stays as the residual.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _FOREFOOT, _HEEL_OFF = 0.65, (0.1, 0.2)
 TRAILING = (0.90, 0.71, 0.59, 0.51, 0.42, 0.34, 0.26, 0.18, 0.12, 0.07, 0.04)
 #: How much of the horizontal accelerations is believed: chosen on the same children.
 BELIEVED = 0.3
-#: What low-passed motion lacks of the sharp change of force at each initial contact: added to the vertical force at
-#: 0, 4, ..., 100 % of a step (from one foot's initial contact to the other's), in ranges of that force over the step.
-#: Means over the same children.
+#: The part that low-passed motion lacks of the sharp change of force at each initial contact: added to the vertical
+#: force at 0, 4, ..., 100 % of a step (from one foot's initial contact to the other's), in ranges of that
+#: force over the step. Means over the same children.
 # fmt: off
 TRANSIENT = np.array([
     -0.26, 0.21, 0.14, -0.10, -0.12, -0.01, 0.09, 0.12, 0.10, 0.06, 0.01, -0.01, -0.01,

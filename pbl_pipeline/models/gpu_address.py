@@ -19,8 +19,6 @@ from pbl_pipeline.temporary import private_folder
 
 #: A GPU process that does not listen after so long has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
-#: Flags that `jax_setup` sets for the fit. With them convolutions take a slow path.
-_FIT_FLAGS = ("--xla_gpu_autotune_level", "--xla_gpu_enable_triton_gemm")
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
@@ -74,8 +72,11 @@ def _listens(address: str) -> bool:
 
 
 def _start(address: str, log: Path) -> None:
+    from pbl_pipeline.jax_setup import FIT_FLAGS  # loads JAX
+
     env = dict(os.environ)
-    flags = [f for f in env.get("XLA_FLAGS", "").split() if f.partition("=")[0] not in _FIT_FLAGS]
+    of_fit = {flag.partition("=")[0] for flag in FIT_FLAGS}
+    flags = [f for f in env.get("XLA_FLAGS", "").split() if f.partition("=")[0] not in of_fit]
     env["XLA_FLAGS"] = " ".join(flags)
     # The fit may be another process on the same GPU.
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

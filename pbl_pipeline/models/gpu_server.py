@@ -1,9 +1,9 @@
 """The process that owns the GPU for detection: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
 
 Each connection is of one network: a `NetworkSpec`, then pictures, each answered with the network's outputs as float32
-in the order of the pictures. What waits on all connections of a network goes through the GPU together. Each network
-has one batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's result
-does not depend on its neighbours.
+in the order of the pictures. The pictures that wait on all connections of a network go through the GPU together. Each
+network has one batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's
+result does not depend on its neighbours.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Program:
     PblError
         ASSET_CHECKSUM; MODEL_INVALID: an operation that is not known.
     RuntimeError
-        The device is no GPU and `any_device` is False, has no room, or computes something else than LiteRT.
+        The device is not a GPU and `any_device` is False, has no room, or computes other values than LiteRT.
     """
 
     def __init__(self, spec: NetworkSpec, any_device: bool = False, batch: int = BATCH) -> None:
@@ -163,7 +163,7 @@ class _Served:
 
 
 class Server:
-    """Serves networks at an address until it is closed or nobody has been connected for `idle_s`."""
+    """Serves networks at an address until it is closed or no one has been connected for `idle_s`."""
 
     def __init__(self, address: str, any_device: bool = False, idle_s: float = IDLE_S, batch: int = BATCH) -> None:
         self._listener = Listener(address, "AF_UNIX", backlog=256)
@@ -185,7 +185,7 @@ class Server:
             self._openers.submit(self._open, connection)
 
     def close(self) -> None:
-        """Accept no more connections and end those that are open."""
+        """Accept no further connections and end those that are open."""
         self._listener.close()
         for served in self._served.values():
             served.close()

@@ -1,7 +1,7 @@
 """A network of a TensorFlow Lite file that is shown pictures: on the GPU where one is visible, else by LiteRT.
 
 On the GPU one process for each machine and GPU owns the networks (`gpu_server`); every process that detects sends its
-pictures there, so that pictures of many videos make up a batch. What was asked for by `PBL_ONNX_DEVICE` holds here as
+pictures there, so that pictures of many videos make up a batch. The choice of `PBL_ONNX_DEVICE` holds here as
 for ONNX models: "cpu" never uses the GPU, "auto" uses it where it works; "cuda" fails where one is visible to JAX
 and does not compute. Where none is, LiteRT computes whatever was asked for: "cuda" may be meant for an ONNX model.
 """

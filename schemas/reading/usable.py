@@ -11,13 +11,13 @@ from .. import gait, keypoints, qc, video
 from .shown import shown_visit
 from .why import why
 
-#: What is known of a recording: nothing yet; it can be used; it can, with remarks; it cannot.
+#: Verdicts on a recording: nothing is known yet; it can be used; it can, with remarks; it cannot.
 PENDING, USABLE, REMARKS, UNUSABLE = "pending", "usable", "remarks", "unusable"
 
 
 @dataclasses.dataclass(frozen=True)
 class Usable:
-    """What is known of a recording."""
+    """The verdict on a recording."""
 
     state: str  # `PENDING`, `USABLE`, `REMARKS` or `UNUSABLE`
     said: tuple[str, ...] = ()  # what is wrong and what to do, in the words of the library

@@ -14,9 +14,10 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from .. import session, study
-from ..decisions.review_decisions import decisions, record
+from ..decisions.review_decisions import record
 from ..intake.sheets import Row, Sheet, refused, with_point
 from ..transactions import in_transaction
+from .form_checks import check_fields, decided_meanwhile, last_decision
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
 #: Name of the field of the role; the others are named by their instruments.
@@ -88,20 +89,13 @@ def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason
 
 
 def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str) -> Entered:
-    table = session.Session.full_table_name  # who enters at the same moment waits here
-    locked = f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE"  # noqa: S608
-    session.Session.connection.query(locked, args=(session_id,))
+    session.lock(session_id)  # who enters at the same moment waits here
     now = entry(session_id)
-    if unknown := sorted(set(values) - set(now.values)):
-        raise PblError(
-            "USAGE",
-            found=f"a field {unknown[0][:64]!r}",
-            expected="the role or an instrument of ClinicalInstrument",
-            next_step="load the form again",
-            key=f"session_id={session_id}",
-        )
+    check_fields(session_id, values, now.values, "the role or an instrument of ClinicalInstrument")
     if now.seen != seen:
-        raise _meanwhile(session_id)
+        last = last_decision(session_id, ("role", "score"))
+        did = "" if last is None else f"entered {last.about.get('instrument', 'the role')}"
+        raise decided_meanwhile(session_id, last, did)
     given = {name: text.strip()[:200] for name, text in values.items()}
     given = {name: text if name == ROLE else with_point(text) for name, text in given.items()}
     changed = {name: text for name, text in given.items() if not _same(text, now.values[name])}
@@ -148,17 +142,3 @@ def _stored(text: str, is_role: bool) -> Any:
     if not text:
         return None
     return text if is_role else float(text)
-
-
-def _meanwhile(session_id: int) -> PblError:
-    last = next((d for d in decisions(session_id) if d.what in ("role", "score")), None)
-    who = (
-        f"{last.by} entered {last.about.get('instrument', 'the role')} at {last.at} UTC" if last else "it was imported"
-    )
-    return PblError(
-        "DECIDED_MEANWHILE",
-        found=f"since this form was loaded something else is stored: {who}",
-        expected="what the form showed; nothing of yours was written",
-        next_step="load the form again, look at what is stored, and enter then",
-        key=f"session_id={session_id}",
-    )

@@ -12,12 +12,13 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label
 
 from .. import lab, session, study, video
-from ..decisions.review_decisions import decisions, record
+from ..decisions.review_decisions import record
 from ..intake.conditions import set_condition
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..intake.visits import replace_height, set_population
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
+from .form_checks import check_fields, decided_meanwhile, last_decision
 from .study_sheets import CLEAR, COLUMNS, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
@@ -167,20 +168,12 @@ def correct(
 def _correct(
     session_id: int, given: dict[str, str], by: str, seen: str, reason: str
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
-    table = session.Session.full_table_name  # who enters at the same moment waits here
-    locked = f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE"  # noqa: S608
-    session.Session.connection.query(locked, args=(session_id,))
+    session.lock(session_id)  # who enters at the same moment waits here
     now = facts(session_id)
-    if unknown := sorted(set(given) - set(now.values)):
-        raise PblError(
-            "USAGE",
-            found=f"a field {unknown[0][:64]!r}",
-            expected="a field of the form",
-            next_step="load the form again",
-            key=f"session_id={session_id}",
-        )
+    check_fields(session_id, given, now.values, "a field of the form")
     if now.seen != seen:
-        raise _meanwhile(session_id)
+        last = last_decision(session_id, _KINDS.values())
+        raise decided_meanwhile(session_id, last, "" if last is None else f"changed the {last.what}")
     changed = {name: text for name, text in given.items() if not _same(name, text, now.values[name])}
     checks: dict[str, Callable[[str], Any]] = {
         "height_m": _height,
@@ -278,15 +271,3 @@ def _same(name: str, text: str, stored: str) -> bool:
         return number_of(Row(name, {}), name, text[:40]) == float(stored)
     except PblError:
         return False
-
-
-def _meanwhile(session_id: int) -> PblError:
-    last = next((d for d in decisions(session_id) if d.what in _KINDS.values()), None)
-    who = f"{last.by} changed the {last.what} at {last.at} UTC" if last else "it was imported"
-    return PblError(
-        "DECIDED_MEANWHILE",
-        found=f"since this form was loaded something else is stored: {who}",
-        expected="what the form showed; nothing of yours was written",
-        next_step="load the form again, look at what is stored, and enter then",
-        key=f"session_id={session_id}",
-    )

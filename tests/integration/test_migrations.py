@@ -138,6 +138,24 @@ def _unbind(patch: pytest.MonkeyPatch) -> None:
             patch.setattr(cls, name, None, raising=False)
 
 
+class Killed(BaseException):
+    """The end of a migration in the middle."""
+
+
+def migrate_until(line: int | None) -> list[str]:
+    """Migrate, killed at that line of what it says (None: to the end); return what it said."""
+    done: list[str] = []
+
+    def say(text: str) -> None:
+        done.append(text)
+        if len(done) == line:
+            raise Killed
+
+    with contextlib.suppress(Killed):
+        migrations.migrate(say=say)
+    return done
+
+
 def _chain() -> list[str]:
     return [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
@@ -218,19 +236,7 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
         older_tables.undo_0006(cursor)
         cursor.execute(older_tables.NOT_RECORDED)
     empty()
-
-    class Killed(BaseException):
-        pass
-
-    done: list[str] = []
-
-    def say(line: str) -> None:
-        done.append(line)
-        if len(done) == killed_before:
-            raise Killed
-
-    with contextlib.suppress(Killed):
-        migrations.migrate(say=say)
+    migrate_until(killed_before)
     migrations.migrate()
     assert everything()["pbl_study.#clinical_instrument"] == new
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
@@ -261,19 +267,7 @@ def test_corrections_by_a_method_become_rows(
     assert (refused.code, "__session_gdi.session_corrected" in refused.err) == (1, True)
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0004 corrections_as_rows"]) > 60, dry.open) == (True, [])
-
-    class Killed(BaseException):
-        pass
-
-    done: list[str] = []
-
-    def say(line: str) -> None:
-        done.append(line)
-        if len(done) == killed_before:
-            raise Killed
-
-    with contextlib.suppress(Killed):
-        migrations.migrate(say=say)
+    migrate_until(killed_before)
     assert (migrations.applied()[-1].number == OWN - 1) == (killed_before is None)
     migrations.migrate()
     after = everything()
@@ -304,18 +298,7 @@ def test_tracking_without_the_video_info_that_it_read_goes(
     statements = dict(dry.steps)["0005 tracking_of_videos_that_were_read"]
     assert (statements[0], len(statements) > 20, dry.open) == ("START TRANSACTION", True, [])
 
-    class Killed(BaseException):
-        pass
-
-    done: list[str] = []
-
-    def say(line: str) -> None:
-        done.append(line)
-        if len(done) == killed_before:
-            raise Killed
-
-    with contextlib.suppress(Killed):
-        migrations.migrate(say=say)
+    done = migrate_until(killed_before)
     assert (len(done) == len(statements)) == (killed_before is None)
     migrations.migrate()
     after = everything()
@@ -383,9 +366,6 @@ def _named() -> list[str]:
 def test_a_migration_that_was_broken_off_goes_on(older: None):
     statements = dict(migrations.migrate(dry_run=True).steps)[f"{OWN:04} sizes"]
     assert len(statements) == 3
-
-    class Killed(BaseException):
-        pass
 
     def say(line: str) -> None:
         if line.strip() == statements[2]:

@@ -35,7 +35,7 @@ from tests.integration.chain import small_video
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_accounts import running
 from tests.rows import register
-from workers import phone_uploads, queue
+from workers import incoming, phone_uploads, queue
 from workers.populate import populate
 from workers.web import Options, Where, create_app
 from workers.web.phone import next_words
@@ -501,7 +501,7 @@ def test_a_visit_that_was_removed_meanwhile_is_not_made_again(visit: int, tmp_pa
 
 
 def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(phone_uploads, "KEPT_FREE", 10**18)
+    monkeypatch.setattr(incoming, "KEPT_FREE", 10**18)
     answer = phone(visit).post("/phone/recordings.json", json=stated(film(tmp_path)))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
 

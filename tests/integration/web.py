@@ -12,6 +12,7 @@ from typing import Any
 import uvicorn
 from starlette.testclient import TestClient
 
+from schemas.connection import dj
 from workers.web import Options, create_app
 from workers.web.computing import Target, compute_visit
 
@@ -45,6 +46,23 @@ def post(browser: TestClient, path: str, **fields: object):
 
 
 @contextlib.contextmanager
+def one_query_at_a_time() -> Iterator[None]:
+    """The page's thread and the test's share DataJoint's connection, as no two threads do outside tests."""
+    connection, waiting = dj.conn(), threading.RLock()
+    execute = connection._execute_query
+
+    def alone(*args: Any) -> None:
+        with waiting:
+            execute(*args)
+
+    connection._execute_query = alone
+    try:
+        yield
+    finally:
+        del connection._execute_query
+
+
+@contextlib.contextmanager
 def shown(
     chromium: Any, role: str = "reviewer", size: tuple[int, int] = (390, 800), name: str = "R. Viewer",
     refused: bool = False, target: Target = compute_visit, **context: Any
@@ -64,7 +82,8 @@ def shown(
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
         opened.goto(f"/enter?key={app.state.sessions.new_link(name, *role.split(','))}")
-        yield opened
+        with one_query_at_a_time():
+            yield opened
         assert not [e for e in errors if not (refused and "a status of 4" in e)]
     finally:
         made.close()

@@ -300,18 +300,24 @@ def check_fields(fields: Mapping[str, str]) -> None:
         check_label(f"field {ascii(name)[:80]}", one_line, BODY_BYTES)
 
 
-async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, broken off or no form."""
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
-        raise Refused("form")
+async def read_body(request: Request, most: int) -> bytes:
+    """Return the body of a request. Raises `Refused` for one of more bytes than `most`, or that is broken off."""
     body = bytearray()
     try:
         async for piece in request.stream():
             body += piece
-            if len(body) > BODY_BYTES:
+            if len(body) > most:
                 raise Refused("size")
     except ClientDisconnect:
         raise Refused("form") from None
+    return bytes(body)
+
+
+async def read_form(request: Request) -> dict[str, str]:
+    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, broken off or no form."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
+        raise Refused("form")
+    body = await read_body(request, BODY_BYTES)
     try:
         return dict(parse_qsl(body.decode(), keep_blank_values=True, max_num_fields=100))
     except ValueError:

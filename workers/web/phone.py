@@ -15,7 +15,7 @@ from typing import Any
 import segno
 from markupsafe import Markup
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
@@ -28,12 +28,12 @@ from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 from .. import phone_uploads
 from ..process_queue import ProcessQueue
 from . import certificates, texts
-from .access import BODY_BYTES, Cookie, Refused, Session, form_of
+from .access import BODY_BYTES, Cookie, Refused, Session, form_of, read_body
 from .address import FILM, OPEN, Address, number_of, whole_number
 from .computing import Target
 from .computing import begin as compute
-from .pages import Pages
-from .tables import Tables
+from .pages import Pages, reader_language
+from .tables import Tables, on_disk
 
 #: The phone's page may use its camera and sensors.
 _MAY = {
@@ -47,6 +47,7 @@ _KEPT = 20
 _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
 #: Group of the catalogue with the texts that the script says.
 _SAID = "capture."
+_on_disk = functools.partial(on_disk, "tell who runs the server; the recording stays on the phone")
 
 
 class Phones:
@@ -114,7 +115,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def state(request: Request) -> Response:
         phone: Phone = request.state.phone
-        language = texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
+        language = reader_language(request)
         recordings, more, steps = await tables.ask(known, phone.session_id)
         return JSONResponse(
             {
@@ -218,7 +219,7 @@ def verdict(language: str, judged: Usable | None) -> str:
     """Return in a sentence whether a recording can be used; empty of one that is not registered."""
     if judged is None:
         return ""
-    why = [texts.plain_library(language, said) for said in judged.said]
+    why = [texts.library_words(language, said) for said in judged.said]
     if judged.cycles is not None and not any(judged.cycles):
         why.append(texts.text(language, "capture.no_cycles"))
     said = texts.text(language, f"capture.{judged.state}", why="; ".join(why))
@@ -254,28 +255,7 @@ async def _body(request: Request, kind: str, most: int) -> bytes:
     announced = whole_number(request.headers.get("content-length", "0"))
     if announced is None or announced > most:
         raise Refused("size")
-    body = bytearray()
-    try:
-        async for piece in request.stream():
-            body += piece
-            if len(body) > most:
-                raise Refused("size")
-    except ClientDisconnect:
-        raise Refused("form") from None
-    return bytes(body)
-
-
-async def _on_disk(work: Any, *args: Any) -> Any:
-    """Return what a function returns that reads or writes the archive. Raises its `PblError`, or FILE_UNWRITABLE."""
-    try:
-        return await asyncio.to_thread(work, *args)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="room and rights in the archive of the server",
-            next_step="tell who runs the server; the recording stays on the phone",
-        ) from error
+    return await read_body(request, most)
 
 
 def _shown(sent: Sent) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import datetime
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+import functools
+from collections.abc import Mapping, Sequence
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -25,12 +25,11 @@ from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
 from .pages import Pages
-from .tables import Tables
-
-T = TypeVar("T")
+from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
+_on_disk = functools.partial(on_disk, "tell who runs the server")
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
@@ -222,19 +221,6 @@ async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | N
             raise
         outcomes.append(Outcome(str(error.key), "refused", error=error))
         return None
-
-
-async def _on_disk(work: Callable[..., T], *args: Any) -> T:
-    """Return what a function returns that writes to the archive. Raises its `PblError`, or FILE_UNWRITABLE."""
-    try:
-        return await asyncio.to_thread(work, *args)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="room and rights in the archive of the server",
-            next_step="tell who runs the server",
-        ) from error
 
 
 def _visits_of_person_of(session_id: int) -> list[int]:

@@ -9,6 +9,8 @@ from typing import Any, Protocol, TypeVar
 
 import pymysql
 
+from pbl_pipeline.errors import PblError
+
 T = TypeVar("T")
 
 
@@ -26,6 +28,25 @@ class Files:
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
         """The answer of a function that reads files."""
         return await asyncio.to_thread(question, *args)
+
+
+async def on_disk(next_step: str, work: Callable[..., T], *args: Any) -> T:
+    """Return what a function returns that reads or writes the archive.
+
+    Raises
+    ------
+    PblError
+        The error of the function; FILE_UNWRITABLE, with `next_step`, for its OSError.
+    """
+    try:
+        return await asyncio.to_thread(work, *args)
+    except OSError as error:
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=error.strerror or str(error),
+            expected="room and rights in the archive of the server",
+            next_step=next_step,
+        ) from error
 
 
 class Tables:

@@ -105,11 +105,6 @@ def on_page(language: str, english: str) -> Markup:
     return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
 
 
-def plain_library(language: str, english: str) -> str:
-    """What the library says in English, in the language of a page as plain text; English where there is no other."""
-    return catalogue().get(f"library.{english}", {}).get(language, english)
-
-
 def language_of(cookie: str | None, accepted: str) -> str:
     """The language that a person chose, else the first of ours that her browser prefers."""
     if cookie in LANGUAGES:
