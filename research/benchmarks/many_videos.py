@@ -1,0 +1,92 @@
+"""From video files to keypoints in many processes at once, on a GPU where one is visible: docs/benchmarks.md.
+
+    python -m research.benchmarks.many_videos                      # the demo recording at 1080p, 64 times
+    python -m research.benchmarks.many_videos VIDEO ... --copies 8 --processes 2 --device cpu
+
+Each process probes, tracks and detects one video after the other, as those of `pbl worker` do. A first round, of one
+video a process, loads the networks and is not counted.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import click
+import numpy as np
+
+from pbl_pipeline.bench.clip import demo_clip
+from pbl_pipeline.bench.detect_case import measure
+from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.resources import cores
+from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.tracking import choose_subject, track_people
+from pbl_pipeline.video import guess_camera, probe
+
+#: Points that a detector is less sure of are not compared.
+SURE = 0.5
+
+
+def frames_of(video: Path, method: str) -> int:
+    """Detect keypoints in a video; return its number of frames."""
+    return measure(video, None, 1, method)["frames"]
+
+
+def keypoints_of(video: Path, method: str, device: str) -> Keypoints:
+    """Return the keypoints of a video's subject, all networks computed on a device."""
+    os.environ["PBL_ONNX_DEVICE"] = device
+    info = probe(video)
+    tracking = track_people(video, info=info)
+    subject = choose_subject(tracking).person_id
+    return detect_keypoints(video, tracking, subject or 0, guess_camera(info), params=method)
+
+
+def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances of points that both hold for sure: in the picture (px), and of their 3D positions (mm)."""
+    sure = (a.confidence > SURE) & (b.confidence > SURE)
+    apart = [np.linalg.norm(x - y, axis=-1)[sure] for x, y in ((a.xy_px, b.xy_px), (a.xyz_cam_m, b.xyz_cam_m))]
+    return apart[0], 1e3 * apart[1]
+
+
+def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float]:
+    """Return frames a second over all videos, and the seconds of the first round."""
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        begin = time.perf_counter()
+        list(pool.map(frames_of, videos[:processes], [method] * processes))
+        first = time.perf_counter() - begin
+        begin = time.perf_counter()
+        frames = sum(pool.map(frames_of, videos, [method] * len(videos)))
+        return frames / (time.perf_counter() - begin), first
+
+
+@click.command()
+@click.argument("videos", nargs=-1, type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--copies", type=click.IntRange(1), default=64, show_default=True, help="How often each video is taken.")
+@click.option("--processes", type=click.IntRange(1), help="At once; default: as many as cores.")
+@click.option("--method", default="blazepose-heavy", show_default=True, help="Of the keypoints.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True)
+@click.option("--against-cpu", is_flag=True, help="Compare the first video's keypoints with those computed on the CPU.")
+def main(
+    videos: tuple[Path, ...], copies: int, processes: int | None, method: str, device: str, against_cpu: bool
+) -> None:
+    """Print frames a second from video files to keypoints, and how far the devices' keypoints are apart."""
+    os.environ["PBL_ONNX_DEVICE"] = device
+    with new_folder() as folder:
+        of = list(videos) or [demo_clip(folder / "demo1080.mp4")]
+        some = processes or cores()
+        found, first = rate(of * copies, method, some)
+        click.echo(f"{len(of) * copies} videos, {some} processes: {found:.0f} frames/s; first round {first:.1f} s")
+        if against_cpu:
+            with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+                two = list(pool.map(keypoints_of, [of[0]] * 2, [method] * 2, [device, "cpu"]))
+            for unit, apart in zip(("px", "mm"), differences(*two), strict=True):
+                median, most = np.percentile(apart, [50, 99])
+                click.echo(f"from the CPU's: median {median:.4f} {unit}, 99th percentile {most:.4f} {unit}")
+
+
+if __name__ == "__main__":
+    main()
