@@ -205,7 +205,7 @@ def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
         Column("gdi", _floats(c.gdi for c in cycles), "", "Gait Deviation Index of the cycle"),
         Column("pooled", np.array([c.trial in pooled for c in cycles], bool), "", "whether the visit pools its trial"),
         Column("far_leg", Labels.of([c.cycle.far_leg for c in cycles]), "", "leg that the other hid from the camera"),
-        Column("excluded", Labels.of([c.cycle.excluded for c in cycles]), "", "why it is no part of the measures"),
+        Column("excluded", Labels.of([c.cycle.excluded for c in cycles]), "", "why it is not part of the measures"),
     ]
     for name in KINETICS:
         column = _floats(None if c.forces is None else c.forces.measures.get(name) for c in cycles)

@@ -57,7 +57,7 @@ class KineticsParams:
 
 
 class Walk(Protocol):
-    """What the stage reads of the gait of a trial, such as its `TrialMetrics`."""
+    """Gait of a trial as far as the stage reads it; a `TrialMetrics` is one."""
 
     @property
     def events(self) -> GaitEvents: ...

@@ -75,9 +75,8 @@ def fit_session(
     height_m: float | None = None,
     markers: Any = None,
 ) -> SessionFit:
-    """The stand-in of the chain with the markers of the body, which exports need, a vertical and errors, which forces
-    need, and the parameters it was given."""
-    session = chain.fit_session(trials, names, paramset, camera_motion, height_m)
+    """The stand-in of the chain with the markers of the body, which exports need, and the parameters it was given."""
+    session = chain.fit_upright(trials, names, paramset, camera_motion, height_m)
     points = marker_set("blazepose_33")
     seen = {"residual_2d_px": 4.0, "residual_3d_m": 0.03}
 
@@ -86,9 +85,6 @@ def fit_session(
         more = {k: np.full((n, len(points)), v) for k, v in seen.items()}
         places = {"marker_names": points.names, "site_offset_m": np.zeros((len(points), 3))}
         made = {"params_hash": session.params_hash, "solver": session.solver}
-        # As the tables store them: accelerations would turn the rounding into other forces.
-        qpos, sd = np.float32(fit.qpos), np.full(fit.qpos.shape, 0.005, np.float32)
-        made |= {"orientation_source": "measured: phone", "qpos": qpos, "qpos_sd": sd}
         return with_markers(dataclasses.replace(fit, **places, **made, **more))
 
     offset = np.zeros((len(points), 3))

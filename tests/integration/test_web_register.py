@@ -175,8 +175,8 @@ def test_what_is_stated_is_corrected_with_what_was_before(tmp_path: Path):
     [
         ({"height_m": "172"}, "FIT_INPUT"),
         ({"height_m": "1_7"}, "SHEET_FORMAT"),
-        ({"mass_kg": "0"}, "SHEET_FORMAT"),
-        ({"mass_kg": "1e9"}, "SHEET_FORMAT"),
+        ({"mass_kg": "4"}, "FIT_INPUT"),
+        ({"mass_kg": "1e9"}, "FIT_INPUT"),
         ({"mass_kg": "heavy"}, "SHEET_FORMAT"),
         ({"mass_kg": "inf"}, "SHEET_FORMAT"),
         ({"population": "x" * 33}, "USAGE"),
