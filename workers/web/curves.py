@@ -92,7 +92,8 @@ def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:
 
     found = dataclasses.replace(visit.kinetics, trials=())
     weight_n = None if found.mass_kg is None else GRAVITY * found.mass_kg
-    return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": force_charts(visit.kinetics, label)}
+    drawn = [{**c, "svg": texts.in_chart(language, c["svg"])} for c in force_charts(visit.kinetics, label)]
+    return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": drawn}
 
 
 def norm_people(norm: str) -> int | None:
