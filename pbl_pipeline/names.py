@@ -55,7 +55,7 @@ def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
     return names
 
 
-#: Masses (kg) of people, with room to spare.
+#: Masses (kg) of people who walk, with room to spare.
 MASS_KG = (5.0, 400.0)
 
 

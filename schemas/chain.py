@@ -51,8 +51,9 @@ def computed_tables() -> list[Any]:
     return [cls for cls in tables().values() if issubclass(cls, dj.Computed)]
 
 
-#: Computed tables that have rows only where they were asked for: a reference was registered, a setting wants copies.
-ON_REQUEST = ("KinematicError", "Deidentified")
+#: Computed tables that have rows only where they were asked for: a reference was registered, a setting wants copies,
+#: forces were planned (visits that were registered before there were any have no plan of them).
+ON_REQUEST = ("KinematicError", "Deidentified", "Kinetics")
 
 
 def is_wanted(table: Any) -> bool:

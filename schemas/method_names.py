@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from . import fit, gait, gdi, keypoints, tracking
+from . import fit, gait, gdi, keypoints, kinetics, tracking
 from .method_rows import stored_key
 
 #: Column of a method -> table of the methods, table of the results.
@@ -16,6 +16,7 @@ _RESULTS = {
     "gait_method": (gait.GaitEventMethod, gait.GaitEvents),
     "gdi_method": (gdi.GdiModel, gdi.GDI),
     "norm": (gdi.NormativeSet, gdi.GDI),
+    "kinetics_method": (kinetics.KineticsMethod, kinetics.Kinetics),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, gdi, keypoints, study, tracking
+from . import fit, gait, gdi, keypoints, kinetics, study, tracking
 from .instruments import INSTRUMENTS
 from .method_rows import insert_methods
 
@@ -17,6 +17,7 @@ METHOD_TABLES = (
     fit.FitMethod,
     gait.GaitEventMethod,
     gdi.GdiModel,
+    kinetics.KineticsMethod,
 )
 
 

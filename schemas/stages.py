@@ -17,6 +17,7 @@ STAGES = (
     "gait",
     "gdi",
     "qc",
+    "kinetics",
     "validation",
     "privacy",
     "study",

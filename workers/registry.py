@@ -49,6 +49,7 @@ STAGES: dict[str, Stage] = {
     "GDI": Stage(LIGHT, 300.0, 16),
     "SessionGdi": Stage(LIGHT, 600.0, 16),
     "SessionQc": Stage(LIGHT, 300.0, 16),
+    "Kinetics": Stage(LIGHT, 600.0, 4),
     "KinematicError": Stage(LIGHT, 300.0, 16),
     "Deidentified": Stage(DETECTOR, 4 * 3600.0, 1),
 }

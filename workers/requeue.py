@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from schemas import computed_tables, fit, gait, gdi, keypoints, tracking, video
+from schemas import computed_tables, fit, gait, gdi, keypoints, kinetics, tracking, video
 from schemas.connection import dj
 from schemas.intake import Methods
 from schemas.intake.plans import resolve as resolve_ingest
@@ -85,9 +85,10 @@ _SELECTIONS = {
     "SessionFit": ("fit", "FitPlan", "FitMethod"),
     "GaitEvents": ("gait", "GaitPlan", "GaitEventMethod"),
     "GDI": ("gdi", "GdiPlan", "GdiModel"),
+    "Kinetics": ("kinetics", "KineticsPlan", "KineticsMethod"),
 }
 #: Modules by prefix of their columns.
-_MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gait, "gdi": gdi}
+_MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gait, "gdi": gdi, "kinetics": kinetics}
 
 
 def plan_new_method(table: str, method: str, since: datetime.date | None = None) -> Reprocess:
@@ -113,7 +114,10 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     selection, methods = getattr(module, selection_name), getattr(module, method_name)
     column = f"{prefix}_method"
     chosen = resolve_method(methods, method)
-    rows = selection & (video.Video & (True if since is None else f"video_created >= '{since:%Y-%m-%d}'"))
+    recorded = video.Video & (True if since is None else f"video_created >= '{since:%Y-%m-%d}'")
+    rows = selection & recorded
+    if prefix == "kinetics":  # also visits that were registered before there were forces to plan
+        rows = dj.U("session_id") & (gait.GaitPlan & recorded)
     others = [k for k in rows.primary_key if k != column]
     have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
     # The choice of the subject goes with the tracking: that of this version, not that of the older row.

@@ -58,7 +58,8 @@ def check_forces(trial: ExportTrial) -> None:
             "EXPORT_INPUT",
             found=f"no forces{why}",
             expected="a trial with ground reactions (docs/kinetics.md)",
-            next_step="leave out --to forces, or write kinetics.json with `pbl gait` beside the fits",
+            next_step="leave out --to forces, or write kinetics.json with `pbl gait` beside the fits; in the tables "
+            "`pbl why VIDEO_ID` says what stops them",
             key=trial.name,
         )
     if trial.mass_kg is None:
@@ -66,6 +67,7 @@ def check_forces(trial: ExportTrial) -> None:
             "EXPORT_INPUT",
             found="no body mass",
             expected="the mass that turns body weights into newtons",
-            next_step="`pbl gait *.fit.npz --mass-kg 68.5 --out metrics.json` in the folder of the fits",
+            next_step="`pbl gait *.fit.npz --mass-kg 68.5 --out metrics.json` in the folder of the fits; in the tables "
+            "`pbl ingest` a video of the visit again with --mass-kg 68.5, then `pbl populate`",
             key=trial.name,
         )

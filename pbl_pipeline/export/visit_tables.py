@@ -4,6 +4,7 @@ stand in a column `unit` beside the values."""
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,8 @@ from pbl_pipeline.body import SLIDES, angle_of
 from pbl_pipeline.fit.angles_file import angles_table
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
-from pbl_pipeline.words import unit_of
+from pbl_pipeline.kinetics import CURVES, CycleKinetics, Kinetics
+from pbl_pipeline.words import KINETICS, unit_of
 
 from .columns import Column, Labels, Table, joined
 from .trial import ExportTrial
@@ -62,19 +64,26 @@ _STATISTICS = {
 _TRIAL = "name of the trial"
 
 
-def session_tables(trials: Sequence[ExportTrial], metrics: GaitMetrics | None) -> list[Table]:
+def session_tables(
+    trials: Sequence[ExportTrial], metrics: GaitMetrics | None, kinetics: Kinetics | None = None
+) -> list[Table]:
     """All tables of a visit. Those of gait are there where its trials were measured."""
     wide = [_angles_wide(t) for t in trials]
     made = [joined(wide), joined([_angles_long(w, t) for w, t in zip(wide, trials, strict=True)])]
     measured = [(t.name, t.measured) for t in trials if t.measured is not None]
     if measured:
         made.append(joined([_events(name, m) for name, m in measured]))
-        cycles = [(name, c, _gdi_of(m.gdi, c)) for name, m in measured for c in m.cycles]
+        of_cycles = {(t.name, c.number): c for t in trials if t.kinetics is not None for c in t.kinetics.cycles}
+        cycles = [
+            _Cycle(name, c, _gdi_of(m.gdi, c), of_cycles.get((name, c.number)))
+            for name, m in measured
+            for c in m.cycles
+        ]
         pooled = {name for name, m in measured if m.pooled}
         made += [_cycles_wide(cycles, pooled), _cycles_long(cycles), _curves_wide(cycles), _curves_long(cycles)]
-        parts = [("trial", name, m.spatiotemporal, m.gdi) for name, m in measured]
+        parts = [_Part("trial", name, m.spatiotemporal, m.gdi) for name, m in measured]
         if metrics is not None:
-            parts = [("session", "", metrics.spatiotemporal, metrics.gdi), *parts]
+            parts = [_Part("session", "", metrics.spatiotemporal, metrics.gdi, kinetics), *parts]
         made += [_measures_wide(parts), _measures_long(parts)]
     return made
 
@@ -151,7 +160,13 @@ def _events(name: str, measured: TrialMetrics) -> Table:
     return Table("events", tuple(columns))
 
 
-_Cycle = tuple[str, GaitCycle, float]
+class _Cycle(NamedTuple):
+    trial: str
+    cycle: GaitCycle
+    gdi: float
+    forces: CycleKinetics | None
+
+
 _CYCLE_TIMES = {
     "start_s": "initial contact",
     "opposite_foot_up_s": "toe-off of the other foot",
@@ -165,43 +180,50 @@ def _gdi_of(gdi: Gdi, cycle: GaitCycle) -> float:
     return next((c.gdi for c in gdi.cycles if c.number == cycle.number and c.side == cycle.side), np.nan)
 
 
-def _cycle_keys(cycles: Sequence[_Cycle], each: int = 1) -> list[Column]:
+def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[Column]:
     return [
-        Column("trial", _repeated([n for n, _, _ in cycles], each), "", _TRIAL),
-        Column(
-            "cycle", np.repeat(np.array([c.number for _, c, _ in cycles], np.int64), each), "", "number in its trial"
-        ),
-        Column("side", _repeated([c.side for _, c, _ in cycles], each), "", "left or right"),
-        Column("used", np.repeat([c.used for _, c, _ in cycles], each).astype(bool), "", "part of the measures"),
+        Column("trial", _repeated([n for n, _ in cycles], each), "", _TRIAL),
+        Column("cycle", np.repeat(np.array([c.number for _, c in cycles], np.int64), each), "", "number in its trial"),
+        Column("side", _repeated([c.side for _, c in cycles], each), "", "left or right"),
+        Column("used", np.repeat([c.used for _, c in cycles], each).astype(bool), "", "part of the measures"),
     ]
 
 
 def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
     """`pooled`: names of the trials that the measures of the visit are made of."""
-    values = [measures_of(c) for _, c, _ in cycles]
-    columns = _cycle_keys(cycles)
-    columns.append(Column("bout", _integers(c.bout for _, c, _ in cycles), "", "walking bout, from 0"))
+    values = [measures_of(c.cycle) for c in cycles]
+    columns = _cycle_keys([c[:2] for c in cycles])
+    columns.append(Column("bout", _integers(c.cycle.bout for c in cycles), "", "walking bout, from 0"))
     columns += [
-        Column(name, _floats(getattr(c, name) for _, c, _ in cycles), "s", f"{text}, from the first frame of the video")
+        Column(name, _floats(getattr(c.cycle, name) for c in cycles), "s", f"{text}, from the first frame of the video")
         for name, text in _CYCLE_TIMES.items()
     ]
     for name in (m for m in MEASURES if m != "step_time_s"):
         column = _floats(v.get(name, np.nan) for v in values)
         columns.append(Column(name, column, unit_of(name), "of this cycle (docs/measures.md)"))
     columns += [
-        Column("gdi", _floats(g for _, _, g in cycles), "", "Gait Deviation Index of the cycle"),
-        Column("pooled", np.array([n in pooled for n, _, _ in cycles], bool), "", "whether the visit pools its trial"),
-        Column("far_leg", Labels.of([c.far_leg for _, c, _ in cycles]), "", "leg that the other hid from the camera"),
-        Column("excluded", Labels.of([c.excluded for _, c, _ in cycles]), "", "why it is no part of the measures"),
+        Column("gdi", _floats(c.gdi for c in cycles), "", "Gait Deviation Index of the cycle"),
+        Column("pooled", np.array([c.trial in pooled for c in cycles], bool), "", "whether the visit pools its trial"),
+        Column("far_leg", Labels.of([c.cycle.far_leg for c in cycles]), "", "leg that the other hid from the camera"),
+        Column("excluded", Labels.of([c.cycle.excluded for c in cycles]), "", "why it is not part of the measures"),
     ]
+    for name in KINETICS:
+        column = _floats(None if c.forces is None else c.forces.measures.get(name) for c in cycles)
+        columns.append(Column(name, column, unit_of(name), "of this cycle (docs/kinetics.md)"))
     return Table("cycles_wide", tuple(columns))
 
 
 def _cycles_long(cycles: Sequence[_Cycle]) -> Table:
-    found = [(n, c, m, v) for n, c, g in cycles for m, v in (measures_of(c) | {"gdi": g}).items() if np.isfinite(v)]
-    columns = _cycle_keys([(n, c, np.nan) for n, c, _, _ in found])
+    values = [measures_of(c) | {"gdi": g} | ({} if f is None else dict(f.measures)) for _, c, g, f in cycles]
+    found = [
+        (n, c, m, v)
+        for (n, c, *_), of_cycle in zip(cycles, values, strict=True)
+        for m, v in of_cycle.items()
+        if np.isfinite(v)
+    ]
+    columns = _cycle_keys([(n, c) for n, c, _, _ in found])
     columns += [
-        Column("measure", Labels.of([m for _, _, m, _ in found]), "", "docs/measures.md"),
+        Column("measure", Labels.of([m for _, _, m, _ in found]), "", "docs/measures.md, kinetics.md"),
         Column("value", _floats(v for _, _, _, v in found), "column unit", "of this cycle"),
         Column("unit", Labels.of([unit_of(m) for _, _, m, _ in found]), "", "empty: none"),
     ]
@@ -209,21 +231,28 @@ def _cycles_long(cycles: Sequence[_Cycle]) -> Table:
 
 
 def _curves_wide(cycles: Sequence[_Cycle]) -> Table:
-    own = [row for row in cycles if row[1].curves]
-    n = len(next(iter(own[0][1].curves.values()))) if own else 0
-    columns = [*_cycle_keys(own, n), Column("percent", np.tile(_percent(n), len(own)), "%", "of the cycle's time")]
+    own = [row for row in cycles if row.cycle.curves]
+    n = len(next(iter(own[0].cycle.curves.values()))) if own else 0
+    columns = [
+        *_cycle_keys([c[:2] for c in own], n),
+        Column("percent", np.tile(_percent(n), len(own)), "%", "of the cycle's time"),
+    ]
     for angle, text in ANGLE_NAMES.items():
-        values = [c.curves.get(angle, np.full(n, np.nan)) for _, c, _ in own]
+        values = [c.cycle.curves.get(angle, np.full(n, np.nan)) for c in own]
         columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", _positive(text)))
+    for name in CURVES:
+        values = [({} if c.forces is None else c.forces.curves).get(name, np.full(n, np.nan)) for c in own]
+        text = "of the own foot or leg (docs/kinetics.md)"
+        columns.append(Column(name, np.concatenate([*values, np.zeros(0)]), unit_of(name), text))
     return Table("curves_wide", tuple(columns))
 
 
 def _curves_long(cycles: Sequence[_Cycle]) -> Table:
-    own = [(name, c, angle) for name, c, _ in cycles for angle in ANGLE_NAMES if angle in c.curves]
+    own = [(name, c, angle) for name, c, *_ in cycles for angle in ANGLE_NAMES if angle in c.curves]
     n = len(own[0][1].curves[own[0][2]]) if own else 0
     sd = [c.curves_sd.get(angle, np.full(n, np.nan)) for _, c, angle in own]
     columns = [
-        *_cycle_keys([(name, c, np.nan) for name, c, _ in own], n),
+        *_cycle_keys([(name, c) for name, c, _ in own], n),
         Column("angle", _repeated([a for _, _, a in own], n), "", "signs: see curves_wide"),
         Column("percent", np.tile(_percent(n), len(own)), "%", "of the cycle's time"),
         Column("value_deg", np.concatenate([*(c.curves[a] for _, c, a in own), np.zeros(0)]), "deg", "angle"),
@@ -241,12 +270,28 @@ def _positive(text: str) -> str:
 
 
 # ------------------------------------------------------------------------------------------------------------ measures
-_Part = tuple[str, str, Spatiotemporal, Gdi]
+class _Part(NamedTuple):
+    scope: str
+    trial: str
+    measures: Spatiotemporal
+    gdi: Gdi
+    kinetics: Kinetics | None = None
+
+
+#: Statistic of a measure of forces -> attribute of `KineticMeasure`.
+_OF_FORCES = {
+    "mean": "mean",
+    "left": "left",
+    "right": "right",
+    "n": "n",
+    "error_sd": "sd",
+    "asymmetry_percent": "asymmetry_percent",
+}
 
 
 def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
     """Measure, statistic, value and, where there is none, the reason."""
-    _, _, spatiotemporal, gdi = part
+    _, _, spatiotemporal, gdi, kinetics = part
     for name, measure in spatiotemporal.measures.items():
         if measure is None:
             yield name, "mean", np.nan, spatiotemporal.reasons.get(name, "")
@@ -265,13 +310,27 @@ def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
             yield from (("gvs_" + a + "_deg", side, float(v), "") for a, v in gdi.profile.of_side(side).items())
         scores = (("left", gdi.profile.gps_left), ("right", gdi.profile.gps_right), ("mean", gdi.profile.gps))
         yield from (("gps_deg", statistic, float(v), "") for statistic, v in scores if v is not None)
+    if kinetics is None:
+        return
+    for name in KINETICS:
+        measure = kinetics.measures.get(name)
+        if measure is None:
+            yield name, "mean", np.nan, kinetics.reasons.get(name, "")
+            continue
+        found = {s: getattr(measure, attribute) for s, attribute in _OF_FORCES.items()}
+        yield from ((name, s, float(v), "") for s, v in found.items() if v is not None)
 
 
 def _measures_long(parts: Sequence[_Part]) -> Table:
     found = [(part[0], part[1], *row) for part in parts for row in _values(part)]
     columns = [
         *_scope([(scope, trial) for scope, trial, *_ in found]),
-        Column("measure", Labels.of([r[2] for r in found]), "", "docs/measures.md; gvs: score of one angle"),
+        Column(
+            "measure",
+            Labels.of([r[2] for r in found]),
+            "",
+            "docs/measures.md, kinetics.md; gvs: score of one angle",
+        ),
         Column("statistic", Labels.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
         Column("value", _floats(r[4] for r in found), "column unit", "missing where it cannot be trusted"),
         Column("unit", Labels.of([_unit(r[2], r[3]) for r in found]), "", "empty: none"),
@@ -286,6 +345,7 @@ def _measures_wide(parts: Sequence[_Part]) -> Table:
     wanted = [(m, s) for m in names for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
     wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
+    wanted += [(m, s) for m in KINETICS for s in _OF_FORCES]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])
     for measure, statistic in wanted:
         values = _floats(row.get((measure, statistic), np.nan) for row in rows)

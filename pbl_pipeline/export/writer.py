@@ -16,7 +16,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
 from pbl_pipeline.files import check_out_folder
-from pbl_pipeline.gait import GaitMetrics, TrialMetrics
+from pbl_pipeline.gait import TrialMetrics
 from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import Check, failed
 from pbl_pipeline.visit import Visit
@@ -149,7 +149,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
             folder.mkdir(parents=True, exist_ok=True)
             paths.append(_written(folder / f"{trial.name}{ending}", write))
     out.mkdir(parents=True, exist_ok=True)
-    paths += _write_tables(trials, visit.measures, formats, out, _common(about))
+    paths += _write_tables(trials, visit, formats, out, _common(about))
     if "bids" in formats:
         for name, data in bids_files(trials, origins, labels, known_participants(root)).items():
             path = root / name
@@ -190,14 +190,14 @@ def _writers(
 
 def _write_tables(
     trials: Sequence[ExportTrial],
-    measures: GaitMetrics | None,
+    visit: Visit,
     formats: Sequence[str],
     out: Path,
     about: Mapping[str, str],
 ) -> list[Path]:
     if not {"csv", "parquet"} & set(formats):
         return []
-    tables, paths = session_tables(trials, measures), []
+    tables, paths = session_tables(trials, visit.measures, visit.kinetics), []
 
     def parquet(table: Table) -> Callable[[Path], object]:
         return lambda path: write_parquet(table, path, about)

@@ -15,6 +15,7 @@ from .types import (
     KineticsParams,
     Series,
     TrialKinetics,
+    Walk,
 )
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Motion",
     "Series",
     "TrialKinetics",
+    "Walk",
     "contact_of",
     "generalised_without",
     "ground_reaction",

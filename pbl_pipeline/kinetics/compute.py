@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import Body, load_body
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitEvent, TrialMetrics
+from pbl_pipeline.gait import GaitEvent
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
 from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
@@ -28,6 +28,7 @@ from .types import (
     KineticsParams,
     Series,
     TrialKinetics,
+    Walk,
 )
 
 #: What the method itself gets wrong of a measure of one leg (root mean square), from force plates: the tuning children
@@ -90,7 +91,7 @@ _SIDED = tuple(n for n in MEASURES if n != "centre_of_mass_excursion_m")
 
 def visit_kinetics(
     fits: Sequence[TrialFit],
-    gait: Sequence[TrialMetrics],
+    gait: Sequence[Walk],
     method: Method[KineticsParams],
     *,
     mass_kg: float | None = None,
@@ -124,7 +125,7 @@ def visit_kinetics(
     )
 
 
-def trial_kinetics(fit: TrialFit, gait: TrialMetrics, params: KineticsParams, *, aid: str = "") -> TrialKinetics:
+def trial_kinetics(fit: TrialFit, gait: Walk, params: KineticsParams, *, aid: str = "") -> TrialKinetics:
     """Return the kinetics of one trial; EMPTY with a code of `REASONS` where there can be none."""
     used = [c for c in gait.cycles if c.used]
     code = _code_against(fit, gait, aid)
@@ -155,7 +156,7 @@ def trial_kinetics(fit: TrialFit, gait: TrialMetrics, params: KineticsParams, *,
     return TrialKinetics(fit.name, PASS, "", "", tuple(cycles), series, None if samples is None else samples[:, :, -n:])
 
 
-def _code_against(fit: TrialFit, gait: TrialMetrics, aid: str) -> str:
+def _code_against(fit: TrialFit, gait: Walk, aid: str) -> str:
     if aid.strip().lower() not in _NO_AID:
         return "AID"
     if why_no_lengths(fit):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
+from pbl_pipeline.gait import GaitCycle, GaitEvents
 from pbl_pipeline.qc import Check
 
 from .joints import MOMENTS
@@ -53,6 +54,19 @@ class KineticsParams:
     samples: int = 20
     lasting: float = 0.95
     memory_s: float = 0.2
+
+
+class Walk(Protocol):
+    """Gait of a trial as far as the stage reads it; a `TrialMetrics` is one."""
+
+    @property
+    def events(self) -> GaitEvents: ...
+
+    @property
+    def cycles(self) -> tuple[GaitCycle, ...]: ...
+
+    @property
+    def pooled(self) -> bool: ...
 
 
 @dataclasses.dataclass(frozen=True)

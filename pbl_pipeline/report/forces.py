@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from pbl_pipeline import charts
@@ -43,7 +45,7 @@ def forces_section(visit: Visit) -> dict | None:
         "reason": "",
         "open": sure and not doubts,
         "rows": [_row(name, kinetics.measures.get(name), kinetics.reasons.get(name, ""), weight) for name in KINETICS],
-        "charts": _charts(kinetics),
+        "charts": force_charts(kinetics, _label),
         "note": " ".join([_NOTE + in_newtons + left_over, *(sentence(c.advice) for c in doubts)]),
     }
 
@@ -72,8 +74,15 @@ def _row(name: str, measure: KineticMeasure | None, reason: str, mass_kg: float 
     }
 
 
-def _charts(kinetics: Kinetics) -> list[dict]:
-    """Return one chart for each curve that cycles have; of hip and knee only where their measures are known."""
+def _label(title: str, unit: str, n: int) -> str:
+    return f"{title} in {unit} over the gait cycle in percent, of {plural(n, 'cycle')}."
+
+
+def force_charts(kinetics: Kinetics, label: Callable[[str, str, int], str]) -> list[dict]:
+    """Return one chart for each curve that cycles have; of hip and knee only where their measures are known.
+
+    `label` describes a chart for those who do not see it, by the curve's title, its unit and the number of cycles.
+    """
     shown = ("force_", "ankle_") if "knee_extension_moment_peak_nm_per_kg" in kinetics.reasons else ("",)
     cycles = [c for t in kinetics.trials for c in t.cycles if c.used and c.curves]
     drawn = []
@@ -82,8 +91,9 @@ def _charts(kinetics: Kinetics) -> list[dict]:
         known = [curve for curves in by_side.values() for curve in curves]
         if not known or not name.startswith(shown):
             continue
-        label = f"{title} in {unit} over the gait cycle in percent, of {plural(len(known), 'cycle')}."
         percent = np.linspace(0.0, 100.0, len(known[0]))
-        chart = charts.cycle_chart(label, percent, by_side, {}, None, unit="", least=_LEAST[unit])
+        chart = charts.cycle_chart(
+            label(title, unit, len(known)), percent, by_side, {}, None, unit="", least=_LEAST[unit]
+        )
         drawn.append({"name": title, "note": unit, "svg": chart})
     return drawn

@@ -30,7 +30,7 @@ Example: pbl export --slice paper --to parquet --out paper_visits"""
     multiple=True,
     required=True,
     metavar="FORMAT",
-    help="trc, mot, osim, c3d, dlc, csv, parquet or bids; once for each.",
+    help="trc, mot, forces, osim, c3d, dlc, csv, parquet or bids; once for each.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
 @click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")

@@ -101,6 +101,7 @@ _METHODS = {
 )
 @click.option("--population", metavar="NAME", help="Group of the subject, such as healthy (else: as it was).")
 @click.option("--height-m", type=float, help="Measured body height of the subject, such as 1.72 (else: as it was).")
+@click.option("--mass-kg", type=float, help="Measured body mass at the visit, such as 68.5 (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
 @click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
 @click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")

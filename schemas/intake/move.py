@@ -13,7 +13,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from .. import fit, gait, gdi, keypoints, lab, session, video, worker
+from .. import fit, gait, gdi, keypoints, kinetics, lab, session, video, worker
 from ..datajoint_setup import dj
 from ..jobs import forget_errors
 from ..operations.archive import LOCK, archive_dir, folder_of, plain_name
@@ -27,7 +27,7 @@ from .rigs import check_same_number
 from .visits import session_ids
 
 #: Plans of a visit that follow a video into its new one.
-_PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan)
+_PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan)
 
 
 @dataclasses.dataclass(frozen=True)

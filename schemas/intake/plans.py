@@ -7,7 +7,7 @@ from typing import Any
 
 from pbl_pipeline.methods import of_stage
 
-from .. import fit, gait, gdi, keypoints, tracking, video
+from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..datajoint_setup import dj
 from ..method_rows import resolve_method
 from ..plan import default_fit
@@ -21,6 +21,7 @@ METHOD_FIELDS = {
     "gait_method": "gait",
     "gdi_method": "gdi",
     "norm": "norm",
+    "kinetics_method": "kinetics",
 }
 #: Method of the fit that markers get where none is named (`pbl_pipeline.fit.default_fit`).
 DEFAULT_MARKER_FIT = "markers"
@@ -40,7 +41,11 @@ def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
     def key(table: Any, name: str | None) -> str:
         return resolve_method(table, name or of_stage(table.stage).default)
 
-    after_fit = {"gait_method": key(gait.GaitEventMethod, named.gait), **gdi.resolve(named.gdi, named.norm)}
+    after_fit = {
+        "gait_method": key(gait.GaitEventMethod, named.gait),
+        **gdi.resolve(named.gdi, named.norm),
+        "kinetics_method": key(kinetics.KineticsMethod, named.kinetics),
+    }
     if markers:
         return {"fit_method": resolve_method(fit.FitMethod, named.fit or DEFAULT_MARKER_FIT), **after_fit}
     points = key(keypoints.KeypointMethod, named.keypoint)
@@ -81,7 +86,8 @@ def _selections(
         yield from _of_videos(videos, sessions, chosen, named)
     elif "fit_method" in named:
         yield fit.MarkerPlan, [{"video_id": v, "fit_method": chosen["fit_method"]} for v in videos]
-    for table, keys in ((gait.GaitPlan, ("gait_method",)), (gdi.GdiPlan, ("gdi_method", "norm"))):
+    for table in (gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan):
+        keys = [k for k in table.primary_key if k != "session_id"]
         if named & set(keys):
             yield table, [{"session_id": s, **{k: chosen[k] for k in keys}} for s in sessions]
 

@@ -41,6 +41,7 @@ NEEDED = ("file", "subject", "visit")
 COLUMNS = (
     *NEEDED,
     *("date", "pace", "activity", "camera", "camera_motion", "attitude", "person", "population", "height_m", "project"),
+    "mass_kg",
 )
 _ONE_VISIT = "one value; two visits need two labels"
 
@@ -148,7 +149,7 @@ def _value(row: Row, column: str, text: str) -> Any:
         if not (text.isdecimal() and 1 <= int(text) < 1000):
             raise refused(row.where, f"person {text!r}", "the number of a person, from 1", "correct it")
         return int(text)
-    if column == "height_m":
+    if column in ("height_m", "mass_kg"):
         return number_of(row, column, text)
     return date_of(row, column) if column == "date" else text
 
@@ -191,10 +192,10 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
                     "one day for one visit",
                     "two visits need two labels; a wrong day is corrected by `pbl study import`",
                 )
-            for what in ("date", "population", "project", "height_m"):
+            for what in ("date", "population", "project", "height_m", "mass_kg"):
                 value = getattr(visit, what)
                 if value is not None:
-                    of = (*key, what) if what == "date" else (visit.subject, what)
+                    of = (*key, what) if what in ("date", "mass_kg") else (visit.subject, what)
                     check_same(first.setdefault(of, value), value, what, whose, _ONE_VISIT)
 
 

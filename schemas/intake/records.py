@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_height, check_label, is_plain
+from pbl_pipeline.names import check_height, check_label, check_mass, is_plain
 
 from ..session import UNLABELLED
 from ..subject_codes import check_subject
@@ -27,6 +27,7 @@ class Methods:
     gait: str | None = None
     gdi: str | None = None
     norm: str | None = None
+    kinetics: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +45,10 @@ class VisitRecord:
     pace: str | None = None  # None: unknown
     height_m: float | None = None
     date: datetime.date | None = None  # None: the day that the label names
+    mass_kg: float | None = None  # of the person at the visit
 
     def check(self, key: object = None) -> None:
-        """Raise `PblError` USAGE for a code that could be a name or a label too long, FIT_INPUT for a height."""
+        """Raise `PblError` USAGE for a code that could be a name or a label too long; FIT_INPUT for height or mass."""
         check_subject(self.subject, "pass such a code with --subject", key)
         for what, text, longest in (
             ("session", self.session_label, 64),
@@ -57,6 +59,7 @@ class VisitRecord:
         ):
             check_label(f"--{what}", text or "", longest)
         check_height(self.height_m)
+        check_mass(self.mass_kg)
 
     def text(self) -> str:
         """Return subject and session in words."""

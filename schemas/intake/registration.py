@@ -22,7 +22,7 @@ from .calibrations import camera_id_of
 from .conditions import set_condition
 from .plans import named_keys, plan_all, plan_named, resolve
 from .records import File, Methods, Recording, RefusedFile, Registered
-from .visits import session_ids, set_height, set_population
+from .visits import session_ids, set_height, set_mass, set_population
 
 #: Errors that say that the file was not where, or what, it should be.
 _FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
@@ -32,8 +32,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     """Register recordings with the methods they go through, each in a separate transaction.
 
     A file whose bytes are registered already takes what is new: a calibration or sensor log of the phone (what was
-    computed with another is deleted: keypoints and after), activity, pace, population, height, and the methods that are
-    named, which are added to its selections and the plans of its session.
+    computed with another is deleted: keypoints and after), activity, pace, population, height, mass, and the methods
+    that are named, which are added to its selections and the plans of its session.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     ------
     PblError
         USAGE for a subject code that could be a name, a label too long, or a statement that does not apply to the kind
-        of recording; FIT_INPUT for a height; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set; SOLVER_UNKNOWN,
+        of recording; FIT_INPUT for a height or mass; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set; SOLVER_UNKNOWN,
         NORM_UNKNOWN for unknown methods. Nothing is registered then.
     """
     recordings, named = list(recordings), methods or Methods()
@@ -171,6 +171,7 @@ def _update_file(
             *set_condition(number, visit.activity, visit.pace),
             *set_population(row["subject"], visit.population),
             *set_height(row["subject"], visit.height_m),
+            *set_mass(int(row["session_id"]), visit.mass_kg),
         ]
 
     changes = one.update(row) + in_transaction(work)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .. import fit, lab, session
+from .. import fit, kinetics, lab, session
 from ..rows import counted, delete_below, inside, number, utc_now
 from ..subject_codes import day_of
 from ..transactions import next_id
@@ -13,7 +13,7 @@ from .records import VisitRecord
 
 def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     """Return the number of the session of each visit, by subject and label; people and sessions are registered where
-    they are new, and population, height and date are changed where they are stated. Call it in a transaction.
+    they are new, and population, height, mass and date are changed where they are stated. Call it in a transaction.
     """
     visits = list(dict.fromkeys(visits))
     add_people(visits)
@@ -39,6 +39,8 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     for key, date in dates.items():
         if key in stored and stored[key]["session_date"] != date:
             session.Session.update1({"session_id": numbers[key], "session_date": date})
+    for v in visits:
+        set_mass(numbers[v.subject, v.session_label], v.mass_kg)
     return {key: numbers[key] for key in keys}
 
 
@@ -87,3 +89,33 @@ def replace_height(subject: str, height_m: float | None) -> list[str]:
     if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
         changes.append(f"what was fitted without it was deleted: {rows}")
     return changes
+
+
+def set_mass(session_id: int, mass_kg: float | None) -> list[str]:
+    """State the body mass (kg) of the person at a visit (None: as it is); returns what changed, in words.
+
+    Forces that were told another mass are deleted, so that the next populate computes them anew. Call it inside a
+    transaction.
+    """
+    return [] if mass_kg is None else replace_mass(session_id, mass_kg)
+
+
+def replace_mass(session_id: int, mass_kg: float | None) -> list[str]:
+    """As `set_mass`; None removes the mass."""
+    key = {"session_id": session_id}
+    session.lock(session_id)  # who inserts forces waits here, then reads this mass
+    stored = (session.BodyMass & key).to_arrays("body_mass")
+    if (number(stored[0]) if len(stored) else None) == mass_kg:
+        return []
+    (session.BodyMass & key).delete_quick()
+    if mass_kg is not None:
+        session.BodyMass.insert1({**key, "body_mass": mass_kg})
+    known = "not known" if mass_kg is None else f"{mass_kg:g} kg"
+    return [f"body mass of the visit is {known} now", *delete_forces([session_id])]
+
+
+def delete_forces(sessions: Iterable[int]) -> list[str]:
+    """Delete the forces of visits whose mass or walking aid changed; returns how many, in words."""
+    of_visits = kinetics.Kinetics & inside("session_id", sessions)
+    rows = counted(delete_below(kinetics.Kinetics, of_visits.keys()))
+    return [f"forces computed without it were deleted: {rows}"] if rows else []

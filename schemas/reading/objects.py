@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import fit, gait, gdi, keypoints, tracking, video
+from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..checks import check_values
 from ..gait import load_cycles, load_events
-from ..rows import Rows, or_nan, row_of, stored_rows
+from ..rows import Rows, number, or_nan, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pbl_pipeline import tracking as tracking_lib
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.keypoints import Keypoints
+    from pbl_pipeline.kinetics import CycleKinetics, Kinetics, TrialKinetics
     from pbl_pipeline.qc import Check
     from pbl_pipeline.visit import Solution
 
@@ -222,6 +223,76 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
         cycles=cycles,
         qc=tuple(_checks(rows(gdi.GDI.Check, key), "index")),
         profile=gdi.profile_of_rows(rows(gdi.GDI.Profile, key), row, "gdi"),
+    )
+
+
+def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics | None:
+    """The library's `Kinetics` of one row of SessionGdi, of several methods the one that was computed last; None where
+    there are none."""
+    from pbl_pipeline import kinetics as lib
+
+    found = rows(kinetics.Kinetics, _of(gdi.SessionGdi, key))
+    if not found:
+        return None
+    row = max(found, key=lambda r: r["forces_computed"])
+    row_key = _of(kinetics.Kinetics, row)
+    stored = {r["force_measure"]: r for r in rows(kinetics.Kinetics.Measure, row_key)}
+    measures, reasons = {}, {}
+    for name in (n for n in lib.MEASURES if n in stored):
+        own = stored[name]
+        if own["force_mean"] is None:
+            reasons[name] = own["force_missing"]
+            continue
+        values: dict[str, Any] = {k: number(own[column]) for column, k in kinetics.MEASURE_PARTS.items()}
+        measures[name] = lib.KineticMeasure(**values, n=int(own["force_n"]))
+    return lib.Kinetics(
+        status=row["forces_status"],
+        code=row["forces_code"],
+        reason=row["forces_reason"],
+        measures=measures,
+        reasons=reasons,
+        mass_kg=number(row["forces_mass"]),
+        residual_bw=number(row["forces_residual"]),
+        method=row["kinetics_method"],
+        params_hash=row["forces_method_hash"],
+        trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
+        qc=tuple(_checks(rows(kinetics.Kinetics.Check, row_key), "forces")),
+    )
+
+
+def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
+    """The library's `TrialKinetics` of a row of Kinetics.Trial."""
+    from pbl_pipeline import kinetics as lib
+    from pbl_pipeline.kinetics.kinetics_file import load_arrays
+
+    series, curves = None, {}
+    if row["trial_forces"] is not None:
+        with stored_file(file_ref(row["trial_forces"])) as path:
+            series, found = load_arrays(path)
+        curves = {c["number"]: c for c in found}
+    cycles = {int(r["cycle_no"]): r for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
+
+    def cycle(own: Mapping[str, Any]) -> CycleKinetics:
+        number_of = int(own["cycle_no"])
+        about, drawn = gait.cycle_of_row(cycles[number_of], ""), curves.get(number_of, {})
+        return lib.CycleKinetics(
+            number_of,
+            about.side,
+            about.used,
+            drawn.get("curves", {}),
+            drawn.get("curves_sd", {}),
+            {n: float(own[n]) for n in lib.MEASURES if own[n] is not None},
+            own["forces_missing"],
+        )
+
+    of_trial = {**_of(kinetics.Kinetics, row), "video_id": row["video_id"]}
+    return lib.TrialKinetics(
+        row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, row), rows)["trial_name"],
+        row["trial_forces_status"],
+        row["trial_forces_code"],
+        row["trial_forces_reason"],
+        tuple(cycle(r) for r in rows(kinetics.Kinetics.Cycle, of_trial)),
+        series,
     )
 
 

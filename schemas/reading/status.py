@@ -27,6 +27,7 @@ EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
     "Spatiotemporal": ("measures_status", ("EMPTY",), "measures_reason"),
     "GDI": ("gdi_status", ("EMPTY",), None),
     "SessionGdi": ("session_status", ("EMPTY",), None),
+    "Kinetics": ("forces_status", ("EMPTY",), "forces_reason"),
     "Deidentified": ("deidentified_status", ("NO_HEAD",), "deidentified_reason"),
 }
 
@@ -305,7 +306,7 @@ def _empty(names: Collection[str], most: int) -> list[EmptyRow]:
     out: list[EmptyRow] = []
     for table in computed_tables():
         reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
-        if reason is None or table.__name__ not in names:
+        if reason is None or table.__name__ not in names or "video_id" not in table.primary_key:
             continue
         said = {e.video_id for e in out}  # the first table that has nothing knows why
         for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id", limit=most):

@@ -27,6 +27,7 @@ from .objects import (
     load_choice,
     load_fit_checks,
     load_keypoints,
+    load_kinetics,
     load_metrics,
     load_solution,
     load_trial_fit,
@@ -86,7 +87,7 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
         `{"subject": "P017", "session_label": "2026-03-01", "fit_method": "paper-2025"}`; `fit_set_kind` where it has
         recordings of one camera, of several, or markers.
     measures
-        Also events, cycles, measures and index.
+        Also events, cycles, measures, index and forces.
 
     Raises
     ------
@@ -260,7 +261,9 @@ def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Row
         key=key,
         **about,
     )
-    return visit.with_measures(load_metrics(key, rows)) if measures and "norm" in key else visit
+    if not measures or "norm" not in key:
+        return visit
+    return dataclasses.replace(visit.with_measures(load_metrics(key, rows)), kinetics=load_kinetics(key, rows))
 
 
 def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows) -> Recording:

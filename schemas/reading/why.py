@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from .. import computed_tables, fit, tracking, video
-from ..chain import ON_REQUEST, before
+from ..chain import ON_REQUEST, before, followers
 from ..decisions.not_usable import unusable
 from ..job_errors import error_code, error_found, error_next_step
 from ..jobs import jobs_of
@@ -120,6 +120,7 @@ def _method(row: dict[str, Any], table: Any) -> str:
 
 
 def _verdict(steps: list[Step], in_a_set: bool) -> str:
+    go_on = {t.__name__ for t in computed_tables() if followers(t)}
     for step in steps:
         stage = step.table if step.camera is None else f"{step.table} of its camera, video_id {step.camera},"
         if step.what == ERROR:
@@ -130,7 +131,7 @@ def _verdict(steps: list[Step], in_a_set: bool) -> str:
             return f"{stage} is being computed {step.note}"
         if step.what == PENDING:
             return f"{stage} waits for a worker ({step.note}); next: pbl worker or pbl populate"
-        if step.what == EMPTY:
+        if step.what == EMPTY and step.table in go_on:
             return f"{stage} ran well and found nothing to go on with: {step.note}"
         if step.what == NOT_YET and step.table not in ON_REQUEST:
             if step.table == "SessionFit" and not in_a_set:

@@ -32,7 +32,7 @@ from ..intake.sheets import (
     refused,
     similar_codes,
 )
-from ..intake.visits import add_people, session_ids
+from ..intake.visits import add_people, delete_forces, session_ids
 from ..rows import inside
 from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
@@ -459,6 +459,7 @@ class _Plan:
         blank = {column: _default(column) for column in VISIT_COLUMNS.values()}
         visits = {key: ({"session_id": numbers[key]}, s.values) for key, s in self.visits.items()}
         _write(study.Visit, visits, self.stored_visits, blank)
+        delete_forces(key["session_id"] for key, values in visits.values() if "assistive_device" in values)
         study.Cohort.insert(({"cohort": c} for c in sorted({c for c, _ in self.members})), skip_duplicates=True)
         blank = {"member_included": True, "member_group": "", "member_reason": ""}
         members = {key: ({"cohort": key[0], "subject": key[1]}, s.values) for key, s in self.members.items()}

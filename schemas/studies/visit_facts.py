@@ -9,13 +9,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_height, check_label
+from pbl_pipeline.names import check_height, check_label, check_mass
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
 from ..intake.conditions import set_condition
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
-from ..intake.visits import replace_height, set_population
+from ..intake.visits import replace_height, replace_mass, set_population
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
 from .form_checks import check_fields, decided_meanwhile, last_decision
@@ -27,8 +27,6 @@ NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
 DISTINCT = "distinct"
 #: Fields of a registered visit and the most characters; height (m) and population are of the person.
 FACTS = {"height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
-#: Range of a body mass (kg).
-MASS_KG = (2.0, 400.0)
 #: What the names of the fields of a recording begin with; its video_id follows.
 ACTIVITY, PACE = "activity:", "pace:"
 _NUMBERS = ("height_m", "mass_kg")
@@ -141,7 +139,8 @@ def correct(
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
     """Bring what is stored of a visit, its person and its recordings to what was entered, all of it or nothing.
 
-    What was computed with another height, or pools other recordings now, is deleted and pending again.
+    What was computed with another height, mass or walking aid, or pools other recordings now, is deleted and pending
+    again.
 
     Parameters
     ----------
@@ -204,10 +203,7 @@ def _write(
         if name == "height_m":
             replace_height(subject, _height(text) if text else None)
         elif name == "mass_kg":
-            key = {"session_id": session_id}
-            (session.BodyMass & key).delete_quick()
-            if text:
-                session.BodyMass.insert1({**key, "body_mass": _mass(text)})
+            replace_mass(session_id, _mass(text) if text else None)
         elif name == "population":
             set_population(subject, text or "unknown")
         elif number:
@@ -248,9 +244,7 @@ def _height(text: str) -> float:
 
 def _mass(text: str) -> float:
     value = number_of(Row("mass", {}), "mass", text[:40])
-    if not MASS_KG[0] <= value <= MASS_KG[1]:
-        expected = f"kilograms, {MASS_KG[0]:g} to {MASS_KG[1]:g}"
-        raise refused("mass", f"a body mass of {value:g} kg", expected, "write it in kilograms, such as 71.5")
+    check_mass(value)
     return value
 
 

@@ -98,6 +98,18 @@ def fit_session(trials, names, paramset=None, camera_motion="static", height_m=N
     )
 
 
+def fit_upright(trials, names, paramset=None, camera_motion="static", height_m=None) -> SessionFit:
+    """As `fit_session`, with a vertical that is known and with errors: what forces need. In the precision in which the
+    tables store movements, because accelerations would turn that rounding into other forces."""
+    session = fit_session(trials, names, paramset, camera_motion, height_m)
+
+    def upright(fit):
+        qpos, sd = np.float32(fit.qpos), np.full(fit.qpos.shape, 0.005, np.float32)
+        return dataclasses.replace(fit, orientation_source="measured: phone", qpos=qpos, qpos_sd=sd)
+
+    return dataclasses.replace(session, trials=tuple(map(upright, session.trials)))
+
+
 def install(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of the library's functions."""
     patch.setattr(pbl_pipeline.tracking, "track_people", track_people)

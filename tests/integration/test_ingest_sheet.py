@@ -148,6 +148,20 @@ def test_days_and_decimals_in_the_german_form(tables, recordings):
     assert lab.Subject().fetch1("subject_height") == 1.72
 
 
+def test_a_mass_is_that_of_a_visit(tables, recordings):
+    header = "file;subject;visit;mass_kg"
+    for rows, code in (
+        (("one.mp4;P001;1;71", "two.mp4;P001;1;72"), "SHEET_CONFLICT"),
+        (("one.mp4;P001;1;715",), "FIT_INPUT"),
+    ):
+        refused = pbl("ingest", "--sheet", sheet(recordings, *rows, header=header, name="bad.csv"))
+        assert refused.error_code == code, refused.err
+    two = ("one.mp4;P001;1;71,5", "two.mp4;P001;2;75", "three.mp4;P001;2;")
+    assert pbl("ingest", "--sheet", sheet(recordings, *two, header=header)).code == 0
+    masses = session.Session.proj("session_label") * session.BodyMass
+    assert {r["session_label"]: r["body_mass"] for r in masses.to_dicts()} == {"1": 71.5, "2": 75.0}
+
+
 def test_the_files_own_day_against_the_visits(tables, recordings):
     video_file = recordings / "dated.mp4"
     with av.open(str(recordings / "one.mp4")) as old, av.open(str(video_file), "w") as new:

@@ -10,7 +10,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
-from schemas import fit, gait, gdi, keypoints, lab, session, tracking, video
+from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
 from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.plans import resolve
 from schemas.intake.recording_sheet import ingest_sheet
@@ -114,7 +114,7 @@ ADAPTERS = {
 def planned() -> dict[str, set[tuple]]:
     """Methods in the selections and plans."""
     tables = (tracking.TrackingSelection, keypoints.KeypointSelection, fit.FitPlan, fit.MarkerPlan, gait.GaitPlan)
-    rows = {t.__name__: t().to_dicts() for t in (*tables, gdi.GdiPlan)}
+    rows = {t.__name__: t().to_dicts() for t in (*tables, gdi.GdiPlan, kinetics.KineticsPlan)}
     return {
         name: {tuple(v for k, v in sorted(r.items()) if k not in ("video_id", "session_id")) for r in found}
         for name, found in rows.items()
@@ -125,6 +125,7 @@ def expected_plans(of_markers: bool) -> dict[str, set[tuple]]:
     """Those of the default methods."""
     of = resolve(Methods(), of_markers)
     after = {"GaitPlan": {(of["gait_method"],)}, "GdiPlan": {(of["gdi_method"], of["norm"])}}
+    after |= {"KineticsPlan": {(of["kinetics_method"],)}}
     if of_markers:
         none: dict[str, set[tuple]] = {name: set() for name in ("TrackingSelection", "KeypointSelection", "FitPlan")}
         return {**none, "MarkerPlan": {(of["fit_method"],)}, **after}

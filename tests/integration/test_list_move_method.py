@@ -11,7 +11,7 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
-from schemas import fit, gait, gdi, intake, keypoints, lab, session, video
+from schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, video
 from schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
 from schemas.intake.move import carry_out, plan_move
 from schemas.method_names import keys_named, with_keys
@@ -100,7 +100,7 @@ def a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks):
     assert visits_of_fits() == {"P002/2026-03-02": 2, "P003/first": 1}
     assert len(session.Session & {"subject": "P001"}) == 1
     old, new = ((session.Session & {"subject": s}).fetch1("session_id") for s in ("P001", "P003"))
-    for table in (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan):
+    for table in (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan):
         plans = [[{**r, "session_id": 0} for r in (table & {"session_id": n}).to_dicts()] for n in (old, new)]
         assert plans[0] == plans[1] != []
 

@@ -26,8 +26,8 @@ def visit(tables: None, tmp_path: Path) -> None:
     populate()
 
 
-def done() -> dict[str, int]:
-    return {t.table: t.done for t in populate().tables if t.done}
+def done(*tables: str) -> dict[str, int]:
+    return {t.table: t.done for t in populate(tables or None).tables if t.done}
 
 
 def test_the_visit_pools_the_rows_of_its_trials(visit: None, monkeypatch: pytest.MonkeyPatch):
@@ -44,7 +44,7 @@ def test_the_visit_pools_the_rows_of_its_trials(visit: None, monkeypatch: pytest
     from pbl_pipeline.fit import TrialFit
 
     monkeypatch.setattr(TrialFit, "load", nothing)
-    assert done() == {"SessionGdi": 1, "SessionQc": 1}
+    assert done("SessionGdi", "SessionQc") == {"SessionGdi": 1, "SessionQc": 1}
     after = gdi.SessionGdi.fetch1()
     stride = cycle["cycle_end"] - cycle["cycle_start"]
     pooled = (gdi.SessionGdi.Measure & {"session_measure": "stance_percent"}).fetch1("session_measure_n")
@@ -77,6 +77,6 @@ def test_what_a_visit_pooled_takes_it_along(visit: None, table: str):
     anew = dict.fromkeys(OF_TRIALS[OF_TRIALS.index(table) :], 1)
     if table == "Spatiotemporal":
         del anew["GDI"]
-    assert done() == {**anew, "SessionGdi": 1, "SessionQc": 1}
+    assert done() == {**anew, "SessionGdi": 1, "SessionQc": 1, "Kinetics": 1}
     assert not pipeline_status().errors
     assert done() == {}

@@ -80,6 +80,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
         "GDI": 2,
         "SessionGdi": 1,
         "SessionQc": 1,
+        "Kinetics": 1,
         "KinematicError": 0,
         "Deidentified": 0,
     }
@@ -171,7 +172,8 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     run = populate()
     assert not errors(run)
     empty = {t.table: t.empty for t in run.tables if t.empty}
-    assert empty == {"SubjectChoice": 1, "GaitEvents": 1, "Spatiotemporal": 1, "GDI": 1, "SessionGdi": 1}
+    of_chain = ("SubjectChoice", "GaitEvents", "Spatiotemporal", "GDI", "SessionGdi", "Kinetics")
+    assert empty == dict.fromkeys(of_chain, 1)
     shown = {(e.table, e.about): e.reason for e in pipeline_status().empty}
     assert shown == {
         ("SubjectChoice", "empty_nobody.mp4"): "No person was found in the video.",

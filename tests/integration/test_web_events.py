@@ -111,7 +111,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     assert next(e for e in shown.events if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
     # What follows is computed again: of the corrected trial and of the visit alone.
     run = {t.table: t.done for t in populate().tables if t.done}
-    assert run == dict.fromkeys(("GaitCycle", "Spatiotemporal", "GDI", "SessionGdi", "SessionQc"), 1)
+    assert run == dict.fromkeys(("GaitCycle", "Spatiotemporal", "GDI", "SessionGdi", "SessionQc", "Kinetics"), 1)
     assert dict(zip(*gait.GaitCycle.to_arrays("video_id", "correction_no"), strict=True)) == {1: 1, 2: None}
     after = dict(zip(*(gait.Spatiotemporal.to_arrays("video_id", "stance")), strict=True))
     assert (after[1] != stance[1], after[2]) == (True, stance[2])

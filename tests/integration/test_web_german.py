@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 
-import pbl_pipeline
+import pbl_pipeline.fit
+from pbl_pipeline.kinetics import REASONS
 from schemas import study
 from schemas.intake.conditions import set_condition
 from tests.integration import web
-from tests.integration.chain import small_video
+from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
 from workers.populate import populate
 from workers.web import texts
@@ -83,10 +84,11 @@ def english_of(page: str, english: set[str], names: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def clinic(module_tables: Path) -> None:
+def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     """P001 at three visits, one not computed; a chair test, nobody, two people alike, and a person chosen by hand."""
+    module_patch.setattr(pbl_pipeline.fit, "fit_session", fit_upright)
     for name, day in (("gang", "2026-01-10"), ("gang zwei", "2026-04-10")):
-        register(small_video(module_tables, name), session_label=day)
+        register(small_video(module_tables, name), session_label=day, mass_kg=70.5)
     chair = register(small_video(module_tables, "stuhl"), subject="P002", session_label="2026-02-01")
     set_condition(chair[0], activity="sit_to_stand")
     register(small_video(module_tables, "leer", people="nobody"), subject="P003", session_label="2026-02-02")
@@ -179,3 +181,8 @@ def test_the_advice_of_every_check_has_its_german(english: set[str]):
     untold = {text: file for text, file in every.items() if "<span" in texts.library("de", text)}
     # The advice about the far leg names a side and is written out for both.
     assert not {t: f for t, f in untold.items() if "leg was behind the" not in t}
+
+
+@pytest.mark.parametrize("code", REASONS)
+def test_the_reason_for_missing_forces_has_its_german(code: str):
+    assert texts.library_words("de", REASONS[code]) != REASONS[code]

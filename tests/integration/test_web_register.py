@@ -10,13 +10,14 @@ from typing import Any
 
 import pytest
 
+from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from schemas import lab, session, study, video
 from schemas.review import Decision
 from schemas.studies.visit_facts import FACTS, NEW, facts
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
-from workers.web import multipart
+from workers.web import multipart, texts
 
 VISIT = {"subject": "P001", "visit": "2026-01-10"}
 
@@ -170,13 +171,20 @@ def test_what_is_stated_is_corrected_with_what_was_before(tmp_path: Path):
     assert study.Visit.fetch1("orthosis", "assistive_device") == ("", "cane")
 
 
+@pytest.mark.parametrize(("name", "bounds"), [("height_m", HEIGHT_M), ("mass_kg", MASS_KG)])
+def test_the_hint_of_a_field_states_the_bounds_of_the_library(name: str, bounds: tuple[float, float]):
+    low, high = (f"{b:g}" for b in bounds)
+    assert f"{low} to {high}" in texts.text("en", f"expects.{name}")
+    assert f"{low} bis {high}".replace(".", ",") in texts.text("de", f"expects.{name}")
+
+
 @pytest.mark.parametrize(
     ("values", "code"),
     [
         ({"height_m": "172"}, "FIT_INPUT"),
         ({"height_m": "1_7"}, "SHEET_FORMAT"),
-        ({"mass_kg": "0"}, "SHEET_FORMAT"),
-        ({"mass_kg": "1e9"}, "SHEET_FORMAT"),
+        ({"mass_kg": "4"}, "FIT_INPUT"),
+        ({"mass_kg": "1e9"}, "FIT_INPUT"),
         ({"mass_kg": "heavy"}, "SHEET_FORMAT"),
         ({"mass_kg": "inf"}, "SHEET_FORMAT"),
         ({"population": "x" * 33}, "USAGE"),

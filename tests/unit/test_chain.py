@@ -19,6 +19,7 @@ NEEDS = {
     "GDI": ["GaitCycle"],
     "SessionGdi": ["SessionFit", "Spatiotemporal", "GDI"],
     "SessionQc": ["SessionGdi"],
+    "Kinetics": ["GaitCycle", "SessionGdi"],
     "KinematicError": ["SessionFit"],
     "Deidentified": ["VideoInfo"],
 }

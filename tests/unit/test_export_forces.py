@@ -7,13 +7,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pbl_pipeline.body import MarkerSet, angle_of, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import ExportOptions, write_export
 from pbl_pipeline.gait import gait_metrics
-from pbl_pipeline.kinetics import GRAVITY, JOINTS, METHODS, Kinetics, smooth_motion, visit_kinetics
+from pbl_pipeline.kinetics import (
+    CURVES,
+    GRAVITY,
+    JOINTS,
+    MEASURES,
+    METHODS,
+    Kinetics,
+    smooth_motion,
+    visit_kinetics,
+)
 from pbl_pipeline.visit import Recording, Visit
 from tests.walking_fit import walking_fit
 
@@ -121,3 +131,34 @@ _BARE = ExportOptions(body_points=False, overwrite=True)
 def _one_marker() -> MarkerSet:
     head = BODY.body_names.index("head")
     return MarkerSet("blazepose_33", ("nose",), ("head",), np.array([head]), np.zeros((1, 3)), np.ones(1))
+
+
+def test_tables_hold_the_measures_and_curves_of_the_forces(visit: Visit, tmp_path: Path) -> None:
+    write_export(visit, ["csv"], tmp_path / "out")
+    found, tables = of(visit), {p.stem: pd.read_csv(p) for p in (tmp_path / "out").glob("*.csv")}
+    wide, long = tables["measures_wide"].set_index("scope").loc["session"], tables["measures_long"]
+    reasons = long[long.scope == "session"].set_index("measure").reason
+    for name in MEASURES:
+        if (measure := found.measures.get(name)) is None:
+            assert np.isnan(wide[f"{name}_mean"])
+            assert reasons[name] == found.reasons[name]
+            continue
+        assert wide[f"{name}_left"] == pytest.approx(measure.left, abs=1e-4)
+        assert wide[f"{name}_n"] == measure.n
+    cycles = {c.number: c for c in found.trials[0].cycles}
+    peaks = tables["cycles_wide"].set_index("cycle")["vertical_peak_loading_bw"].dropna()
+    assert len(peaks) > 2
+    assert peaks.to_dict() == pytest.approx(
+        {n: c.measures["vertical_peak_loading_bw"] for n, c in cycles.items() if c.measures}, abs=1e-4
+    )
+    curves = tables["curves_wide"]
+    assert set(CURVES) <= set(curves)
+    known = {n: c.curves["force_vertical_bw"] for n, c in cycles.items() if "force_vertical_bw" in c.curves}
+    assert known
+    for number, curve in known.items():
+        assert np.asarray(curves["force_vertical_bw"][curves.cycle == number]) == pytest.approx(curve, abs=1e-4)
+    units = tables["data_dictionary"].drop_duplicates("column").set_index("column").unit
+    assert units[["vertical_impulse_bw_s", "force_vertical_bw", "hip_work_j_per_kg"]].tolist() == ["BW s", "BW", "J/kg"]
+    none = dataclasses.replace(visit, kinetics=None)
+    write_export(none, ["csv"], tmp_path / "none")
+    assert list(pd.read_csv(tmp_path / "none" / "cycles_wide.csv")) == list(tables["cycles_wide"])

@@ -1,8 +1,9 @@
-"""Joint angles over the gait cycle on the page of a visit: curves of both sides, their peaks and ranges."""
+"""Joint angles and forces over the gait cycle on the page of a visit: curves of both sides, peaks and ranges."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -18,8 +19,10 @@ from pbl_pipeline.gait import (
     norm_names,
     normal_bands,
 )
+from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
-from pbl_pipeline.words import ANGLES
+from pbl_pipeline.words import ANGLES, KINETICS
 
 from . import texts
 
@@ -77,6 +80,20 @@ def curves_of(visit: Visit, language: str) -> Curves | None:
         normal = None if band is None else (float(band[1].min()), float(band[1].max()))
         drawn.append(Curve(name, title, positive, picture, ranges, normal))
     return Curves(tuple(drawn), bands, far, adult_ranges())
+
+
+def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:
+    """Return the forces of a visit (without its trials) with their charts and the body weight (N); None without any."""
+    if visit.kinetics is None:
+        return None
+
+    def label(title: str, unit: str, n: int) -> str:
+        return texts.text(language, "forces.chart", name=texts.library_words(language, title), unit=unit, n=n)
+
+    found = dataclasses.replace(visit.kinetics, trials=())
+    weight_n = None if found.mass_kg is None else GRAVITY * found.mass_kg
+    drawn = [{**c, "svg": texts.in_chart(language, c["svg"])} for c in force_charts(visit.kinetics, label)]
+    return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": drawn}
 
 
 def norm_people(norm: str) -> int | None:

@@ -19,7 +19,7 @@ from schemas.reading.shown import ShownVisit
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of, whole_number
 from .computing import told as told_of
-from .curves import curves_of, norm_people
+from .curves import curves_of, forces_of, norm_people
 from .pages import Pages, as_json, reader_language
 from .phone import verdict
 from .plain_values import plain
@@ -56,14 +56,16 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
 
 
 def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
-    """Return the curves of a visit, or why they cannot be shown, and of how many children the norm of its index is."""
+    """Return the curves and forces of a visit, or why they cannot be shown, and of how many children the norm of its
+    index is."""
     try:
         visit = about.visit
         found = None if visit is None else curves_of(visit, language)
     except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
-        return {"curves": None, "no_curves": error, "norm_people": None}
+        return {"curves": None, "no_curves": error, "norm_people": None, "forces": None}
     norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
-    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm)}
+    forces = None if visit is None else forces_of(visit, language)
+    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm), "forces": forces}
 
 
 def list_routes(pages: Pages, tables: Tables) -> list[Address]:

@@ -1,0 +1,254 @@
+"""Ground reactions, joint moments and powers of each visit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from pbl_pipeline import methods
+from pbl_pipeline.temporary import new_folder
+
+from . import capture, fit, gait, gdi, session, study, video
+from .checks import check_columns, check_row
+from .datajoint_setup import dj
+from .method_rows import method_columns, method_row
+from .origin import Origin, computes, origin_columns
+from .rows import InputChanged, number
+from .stored_files import file_ref, stored_file
+
+if TYPE_CHECKING:
+    from pbl_pipeline import kinetics as lib
+    from pbl_pipeline.gait import GaitCycle, GaitEvents
+
+schema = dj.Schema()
+
+
+@schema
+class KineticsMethod(dj.Lookup):
+    stage = "kinetics"
+    definition = f"""
+    # frozen parameters of forces and joint moments
+    {method_columns("kinetics")}
+    """
+
+
+@schema
+class KineticsPlan(dj.Manual):
+    definition = """
+    # which sessions get forces and joint moments by which method
+    -> session.Session
+    -> KineticsMethod
+    """
+
+
+@schema
+class Kinetics(dj.Computed):
+    definition = f"""
+    # forces and joint moments over the used cycles of the trials that the index of the visit pools; per body weight and kilogram
+    -> gdi.SessionGdi
+    -> KineticsMethod
+    ---
+    -> session.Session
+    forces_status        : enum('PASS', 'EMPTY')
+    forces_code          : varchar(32)         # why EMPTY, such as AID or VERTICAL_UNKNOWN
+    forces_reason        : varchar(255)        # the code in words
+    forces_mass=null     : float64             # (kg) body mass as it was stated, null: not known
+    forces_aid           : varchar(64)         # walking aid as it was stated, empty: nothing stated
+    forces_residual=null : float64             # (body weight) root mean square of the force that no foot carries
+    {origin_columns("forces")}
+    index (forces_status)
+    """  # noqa: E501
+
+    class Measure(dj.Part):
+        definition = """
+        # every measure of the visit with both sides and the standard deviation of its error
+        -> master
+        force_measure            : varchar(64) # name, with its unit
+        ---
+        force_mean=null          : float64     # in the unit (see force_measure): both sides
+        force_left=null          : float64     # in the unit (see force_measure)
+        force_right=null         : float64     # in the unit (see force_measure)
+        force_sd=null            : float64     # in the unit (see force_measure): standard deviation of the error of force_mean
+        force_sd_left=null       : float64     # in the unit (see force_measure)
+        force_sd_right=null      : float64     # in the unit (see force_measure)
+        force_asymmetry=null     : float64     # (percent) right minus left, of their mean; null where too uncertain
+        force_asymmetry_sd=null  : float64     # (percent) standard deviation of its error
+        force_n                  : int16       # values
+        force_missing            : varchar(255)  # why it is null
+        """  # noqa: E501
+
+    class Trial(dj.Part):
+        definition = """
+        # the trials of the set, each with its curves
+        -> master
+        -> gait.GaitCycle
+        ---
+        trial_forces_status : enum('PASS', 'EMPTY')
+        trial_forces_code   : varchar(32)      # why EMPTY
+        trial_forces_reason : varchar(255)     # the code in words
+        trial_forces=null   : <object@arrays>  # npz: forces, moments and powers over time, curves of the cycles; null where there are none; docs/files.md
+        """  # noqa: E501
+
+    class Cycle(dj.Part):
+        definition = """
+        # measures of each cycle; null where contact or motion is not known over the whole stance
+        -> master
+        -> gait.GaitCycle.Cycle
+        ---
+        vertical_peak_loading_bw=null             : float64  # (body weight)
+        vertical_peak_push_off_bw=null            : float64  # (body weight)
+        vertical_impulse_bw_s=null                : float64  # (body weight s)
+        braking_impulse_bw_s=null                 : float64  # (body weight s)
+        propulsion_impulse_bw_s=null              : float64  # (body weight s)
+        knee_extension_moment_peak_nm_per_kg=null : float64  # (Nm/kg) internal
+        knee_adduction_moment_peak_nm_per_kg=null : float64  # (Nm/kg) external
+        ankle_push_off_power_w_per_kg=null        : float64  # (W/kg)
+        hip_work_j_per_kg=null                    : float64  # (J/kg)
+        knee_work_j_per_kg=null                   : float64  # (J/kg)
+        ankle_work_j_per_kg=null                  : float64  # (J/kg)
+        centre_of_mass_excursion_m=null           : float64  # (m)
+        forces_missing                            : varchar(100)  # why they are null
+        """
+
+    class Check(dj.Part):
+        definition = f"""
+        # quality checks of the forces
+        {check_columns("forces")}
+        """
+
+    @property
+    def key_source(self) -> Any:
+        planned = fit.FitSet.proj("session_id") * KineticsPlan
+        return (gdi.SessionGdi.proj() * KineticsMethod.proj()) & planned
+
+    def make_fetch(self, key: dict) -> tuple:
+        mass_kg, aid = stated_of(fit.session_of_set(key))
+        of_trials = fit.SessionFit.Trial.proj("trial_name", "trial_file") * gait.GaitCycle.proj("cycles_computed")
+        rows = (of_trials & key).to_dicts(order_by="video_id")
+        if len(rows) != len(fit.SessionFit.Trial & key):
+            raise InputChanged("cycles of a trial are gone", key)
+        pace = gdi.pace_of(key["gdi_method"])
+        done = video.conditions([{"video_id": r["video_id"]} for r in rows])
+        trials = [
+            {
+                **{k: r[k] for k in ("video_id", "trial_name", "cycles_computed")},
+                "file": file_ref(r["trial_file"]),
+                "events": gait.load_events(r),
+                "pooled": done[r["video_id"]].pooled(pace),
+            }
+            for r in rows
+        ]
+        cycles = (gait.GaitCycle.Cycle & key).to_dicts(order_by="video_id, cycle_no")
+        return trials, cycles, mass_kg, aid or _aid_of_phones(rows), method_row(KineticsMethod, key)
+
+    @computes
+    def make_compute(
+        self,
+        key: dict,
+        trials: Sequence[Mapping[str, Any]],
+        cycles: Sequence[Mapping[str, Any]],
+        mass_kg: float | None,
+        aid: str,
+        method: Mapping[str, Any],
+    ) -> tuple[lib.Kinetics, list[int], str]:
+        from pbl_pipeline.fit import TrialFit
+        from pbl_pipeline.kinetics import visit_kinetics
+
+        fits, walks = [], []
+        for trial in trials:
+            with stored_file(trial["file"]) as path:
+                fits.append(dataclasses.replace(TrialFit.load(path), name=trial["trial_name"]))
+            own = [gait.cycle_of_row(r, trial["trial_name"]) for r in cycles if r["video_id"] == trial["video_id"]]
+            walks.append(_Walk(trial["events"], tuple(own), trial["pooled"]))
+        found = visit_kinetics(fits, walks, methods.stored(**method), mass_kg=mass_kg, aid=aid)
+        return found, [int(t["video_id"]) for t in trials], aid
+
+    def make_insert(self, key: dict, found: lib.Kinetics, ids: list[int], aid: str, origin: Origin) -> None:
+        from pbl_pipeline.kinetics.kinetics_file import save_arrays
+
+        self.insert1(
+            {
+                **key,
+                "session_id": fit.session_of_set(key),
+                "forces_status": found.status,
+                "forces_code": found.code,
+                "forces_reason": found.reason[:255],
+                "forces_mass": number(found.mass_kg),
+                "forces_aid": aid[:64],
+                "forces_residual": number(found.residual_bw),
+                **origin.row("forces", method_hash=found.params_hash),
+            }
+        )
+        absent = dict.fromkeys(MEASURE_PARTS)
+        for name in (*found.measures, *found.reasons):
+            own = found.measures.get(name)
+            values = absent if own is None else {c: number(getattr(own, k)) for c, k in MEASURE_PARTS.items()}
+            missing, n = found.reasons.get(name, "")[:255], 0 if own is None else own.n
+            self.Measure.insert1({**key, "force_measure": name, **values, "force_n": n, "force_missing": missing})
+        with new_folder() as folder:
+            for number_of, trial in zip(ids, found.trials, strict=True):
+                path = folder / f"{number_of}.kinetics.npz"
+                if trial.series is not None:
+                    save_arrays(trial, path)
+                self.Trial.insert1(
+                    {
+                        **key,
+                        "video_id": number_of,
+                        "trial_forces_status": trial.status,
+                        "trial_forces_code": trial.code,
+                        "trial_forces_reason": trial.reason[:255],
+                        "trial_forces": None if trial.series is None else path,
+                    }
+                )
+        self.Cycle.insert(
+            {**key, "video_id": v, "cycle_no": c.number, **c.measures, "forces_missing": c.missing[:100]}
+            for v, trial in zip(ids, found.trials, strict=True)
+            for c in trial.cycles
+        )
+        self.Check.insert({**key, **check_row("forces", check)} for check in found.qc)
+
+
+#: Column of `Kinetics.Measure` -> attribute of the library's `KineticMeasure`.
+MEASURE_PARTS = {
+    "force_mean": "mean",
+    "force_left": "left",
+    "force_right": "right",
+    "force_sd": "sd",
+    "force_sd_left": "sd_left",
+    "force_sd_right": "sd_right",
+    "force_asymmetry": "asymmetry_percent",
+    "force_asymmetry_sd": "asymmetry_sd",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Walk:
+    """The `pbl_pipeline.kinetics.Walk` of a trial."""
+
+    events: GaitEvents
+    cycles: tuple[GaitCycle, ...]
+    pooled: bool
+
+
+def stated_of(session_id: int) -> tuple[float | None, str]:
+    """Return body mass (kg) and walking aid as stated of a visit, None and "" where nothing is.
+
+    A locking read, which sees what is committed whenever this transaction began (as `gait.correction_of`).
+    """
+    row = session.Session.connection.query(
+        f"SELECT body_mass, assistive_device FROM {session.Session.full_table_name}"  # noqa: S608
+        f" LEFT JOIN {session.BodyMass.full_table_name} USING (session_id)"
+        f" LEFT JOIN {study.Visit.full_table_name} USING (session_id) WHERE session_id = %s LOCK IN SHARE MODE",
+        args=(session_id,),
+    ).fetchone()
+    return (None, "") if row is None else (number(row[0]), row[1] or "")
+
+
+def _aid_of_phones(videos: Sequence[Mapping[str, Any]]) -> str:
+    """Return the first walking aid that the phones stated which filmed these videos."""
+    sent = capture.PhoneRecording & [{"video_id": r["video_id"]} for r in videos]
+    about = [r["phone_about"] for r in sent.proj("phone_about").to_dicts(order_by="phone_recording")]
+    aids = [str((json.loads(a) if isinstance(a, str) else a).get("aid", "")) for a in about]
+    return next(filter(None, aids), "")
