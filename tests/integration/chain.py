@@ -104,7 +104,7 @@ def fit_session(trials, names, paramset=None, camera_motion="static", height_m=N
     )
 
 
-#: What the event network made of each movement.
+#: The phases that the event network gave, by its arguments.
 _phases: dict[bytes, Phases] = {}
 
 
