@@ -8,7 +8,8 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             then echo $$p; break; fi; done)
 OUT    ?= pbl_demo
 JOBS   ?= 2# test processes, a file of tests at a time
-PYTEST := $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile
+# Whatever the shell says, compiled modules are kept: tests start many processes that import them.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile
 
 .PHONY: demo docs test test-fast lint format lock clean help
 

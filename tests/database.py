@@ -7,12 +7,16 @@ import contextlib
 import functools
 import os
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import pytest
 
+from schemas.datajoint_setup import datajoint
 from schemas.operations import embedded
 from tests import mysql
 
@@ -33,6 +37,23 @@ def remove_home(home: Path) -> None:
     shutil.rmtree(home, ignore_errors=True)
 
 
+def keep(home: Path, name: str) -> None:
+    """Keep a copy of the database of the embedded server of this home."""
+    folder = embedded.Folder(home / "db")
+    embedded.stop(folder=folder)
+    subprocess.run(["cp", "-a", "--sparse=always", folder.path, home / name], check=True)
+    embedded.start(folder=folder)
+
+
+def put_back(home: Path, name: str) -> None:
+    """Make the database of this home the copy that was kept under this name."""
+    folder = embedded.Folder(home / "db")
+    embedded.stop(folder=folder)
+    shutil.rmtree(folder.path)
+    subprocess.run(["cp", "-a", "--sparse=always", home / name, folder.path], check=True)
+    embedded.start(folder=folder)
+
+
 def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
     """Take away DJ_* and the database's PBL_* variables: no real server and none of the user's tables is in reach."""
     for name in [n for n in os.environ if n.startswith("DJ_") or n in ("PBL_STORE", "PBL_DB_PREFIX")]:
@@ -41,15 +62,32 @@ def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.contextmanager
+def lines_parsed_once() -> Iterator[None]:
+    """Let DataJoint parse each line of a definition once: tests declare and compare the same tables again and again."""
+    parser = datajoint.declare.attribute_parser
+
+    @functools.cache
+    def parsed(line: str) -> Any:
+        return parser.parse_string(line, parse_all=True)
+
+    def copied(line: str, parse_all: bool) -> Any:
+        return parsed(line).copy()
+
+    with mock.patch.object(datajoint.declare, "attribute_parser", mock.Mock(parse_string=copied)):
+        yield
+
+
+@contextlib.contextmanager
 def server(home: Path) -> Iterator[dict[str, str]]:
     """Start the database of a home; yields the variables with which `pbl` uses it. MySQL is ended after, the embedded
     server with its home (`remove_home`)."""
-    if mysql.chosen():
-        with mysql.running(home / "db") as started:
-            yield {"PBL_HOME": str(home), **started.environment}
-    else:
-        embedded.start(folder=embedded.Folder(home / "db"))
-        yield {"PBL_HOME": str(home)}
+    with lines_parsed_once():
+        if mysql.chosen():
+            with mysql.running(home / "db") as started:
+                yield {"PBL_HOME": str(home), **started.environment}
+        else:
+            embedded.start(folder=embedded.Folder(home / "db"))
+            yield {"PBL_HOME": str(home)}
 
 
 @contextlib.contextmanager

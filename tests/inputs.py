@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.video import Camera, CameraPose, VideoInfo
 
@@ -15,6 +17,11 @@ LENS = Camera(np.array([[1000.0, 0, 500], [0, 1000.0, 500], [0, 0, 1]]), np.zero
 POSE = CameraPose(np.eye(3), np.zeros(3))
 PHONE_T = np.array([0.0, 0.02, 0.05])
 LEVEL = np.array([0.5, -0.5, 0.5, -0.5])
+
+
+def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
+    """The code of an error that was raised."""
+    return error.value.code
 
 
 def markers(**changes) -> WorldMarkers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from contextlib import closing
 from pathlib import Path
@@ -34,6 +35,47 @@ def everything_but_refreshes() -> dict[str, list[tuple]]:
     return {name: rows for name, rows in everything().items() if not name.endswith(nobodys)}
 
 
+class Saved:
+    """Rows, their arrays and the videos of a folder, to have the same again after `remove_all`."""
+
+    def __init__(self, folder: Path, copy: Path) -> None:
+        """Save all rows but the methods, and the folder as `copy`."""
+        self.folder, self.copy = folder, copy
+        with closing(connection.plain_connection(conv={})) as server:
+            self.statements = [
+                f"INSERT INTO {catalog.quote(*table)} ({names}) VALUES ({','.join(map(dump.literal, row))})"
+                for table, columns in catalog.tables().items()
+                if _of_tests(table[1])
+                for names in [", ".join(catalog.quote(c.name) for c in columns)]
+                for row in dump.rows_of(server, *table, columns)
+            ]
+        shutil.copytree(folder, copy / "videos")
+        shutil.copytree(_store(), copy / "store", copy_function=_link)
+
+    def put_back(self) -> None:
+        """Insert the rows into tables that have none."""
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            for statement in (*dump.HEADER, "START TRANSACTION", *self.statements, "COMMIT"):
+                cursor.execute(statement)
+        shutil.rmtree(self.folder)
+        shutil.copytree(self.copy / "videos", self.folder)
+        shutil.copytree(self.copy / "store", _store(), copy_function=_link, dirs_exist_ok=True)
+
+
+def _store() -> Path:
+    return Path(connection.store_backend().spec["location"])
+
+
+def _link(path: str, link: str) -> None:
+    if not os.path.exists(link):
+        os.link(path, link)
+
+
+def _of_tests(table: str) -> bool:
+    """True for a table whose rows a test makes: results, decisions and jobs, no methods."""
+    return not table.startswith("#") and (not table.startswith("~") or table.startswith("~~"))
+
+
 def remove_all() -> None:
     """Leave the tables as `schemas.activate` makes them: every row and every job goes but the methods (`#`), and so do
     the lists of what was removed of whom (`forget.manifest_path`), by which a person is forgotten again.
@@ -45,7 +87,7 @@ def remove_all() -> None:
         cursor.execute("SET foreign_key_checks = 0")
         server.begin()
         for schema, table in catalog.tables():
-            if not table.startswith("#") and (not table.startswith("~") or table.startswith("~~")):
+            if _of_tests(table):
                 cursor.execute(f"DELETE FROM {catalog.quote(schema, table)}")
         server.commit()
     shutil.rmtree(settings.home_dir() / "forgotten", ignore_errors=True)

@@ -7,8 +7,11 @@ and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +23,9 @@ import pbl_pipeline.tracking
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
+from pbl_pipeline.gait.events import phase
+from pbl_pipeline.gait.events.network import predict as network
+from pbl_pipeline.gait.events.network.predict import Grid, Phases
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
 from pbl_pipeline.synthetic import plain_walk
@@ -110,14 +116,40 @@ def fit_upright(trials, names, paramset=None, camera_motion="static", height_m=N
     return dataclasses.replace(session, trials=tuple(map(upright, session.trials)))
 
 
+#: The phases that the event network gave, by its arguments.
+_phases: dict[bytes, Phases] = {}
+
+
+def predict(grid: Grid, model: str) -> Phases:
+    """The library's own, once for each movement: the walker of the stand-ins is the same in most tests."""
+    key = pickle.dumps((grid, model))
+    if key not in _phases:
+        _phases[key] = network.predict(grid, model)
+        for value in vars(_phases[key]).values():
+            value.setflags(write=False)
+    return _phases[key]
+
+
 def install(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of the library's functions."""
+    patch.setattr(phase, "predict", predict)
     patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
     patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
 
 
+def computed_once(build: Callable[[Path], Any]) -> Any:
+    """A fixture of this name: empty tables, filled by `build(folder)` as `fill` does it."""
+
+    @pytest.fixture(name=build.__name__)
+    def filled(tables: None, fill: Callable[[Callable[[Path], Any]], Any]) -> Any:
+        return fill(build)
+
+    return filled
+
+
 def install_on_files(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of what the chain on files calls."""
+    patch.setattr(phase, "predict", predict)
     for function in (track_people, detect_keypoints, fit_session):
         patch.setattr(pbl_pipeline.pipeline, function.__name__, function)

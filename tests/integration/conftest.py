@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import schemas
-from tests.rows import remove_all
+from tests.rows import Saved, remove_all
 
 from . import chain
 
@@ -25,6 +26,22 @@ def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     chain.install(monkeypatch)
     yield
     remove_all()
+
+
+@pytest.fixture(scope="module")
+def fill(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Callable[[Path], Any]], Any]:
+    """A call that fills empty tables as `build(folder)` does, once in a module: after that it puts the rows back."""
+    made: dict[Callable[[Path], Any], tuple[Any, Saved]] = {}
+
+    def filled(build: Callable[[Path], Any]) -> Any:
+        if build in made:
+            made[build][1].put_back()
+        else:
+            folder = tmp_path_factory.mktemp("videos")
+            made[build] = build(folder), Saved(folder, tmp_path_factory.mktemp("saved"))
+        return made[build][0]
+
+    return filled
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from schemas.operations.declare import declare_all
 from schemas.reading import frames
 from tests.command import pbl
 from tests.database import installation
-from tests.rows import everything, everything_but_refreshes, remove_all
+from tests.rows import everything, everything_but_refreshes
 from workers import backups
 from workers.populate import populate
 
@@ -36,18 +36,15 @@ HEIGHT = 1.7345678901234567
 TITLE = "knee ' \" \\ % `\n\t\0 \u00e4\u20ac\U0001f6b6 $(rm -rf /); --"
 
 
-@pytest.fixture
-def filled(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+@chain.computed_once
+def filled(folder: Path) -> None:
     """One visit through the whole chain, one error row, and awkward values."""
-    chain.install(monkeypatch)
     declare_all()
-    (tmp_path / "notes.mp4").write_text("not a video")
-    ingest([chain.small_video(tmp_path, "walk"), tmp_path / "notes.mp4"], VisitRecord(subject="P001", project="gait"))
+    (folder / "notes.mp4").write_text("not a video")
+    ingest([chain.small_video(folder, "walk"), folder / "notes.mp4"], VisitRecord(subject="P001", project="gait"))
     populate()
     lab.Project.update1({"project": "gait", "project_title": TITLE})
     lab.Subject.update1({"subject": "P001", "subject_height": HEIGHT})
-    yield
-    remove_all()
 
 
 @pytest.fixture

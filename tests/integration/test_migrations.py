@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import datajoint
 import pytest
@@ -22,8 +23,9 @@ from schemas.chain import ON_REQUEST
 from schemas.decisions import event_corrections
 from schemas.intake import VisitRecord, ingest
 from schemas.reading import frames
+from tests import mysql
 from tests.command import pbl
-from tests.database import new_home, remove_home, server
+from tests.database import keep, new_home, put_back, remove_home, server
 from tests.rows import everything, register
 from workers import heartbeat, loop
 from workers.populate import populate
@@ -59,50 +61,156 @@ def statements(conn):
     ]
 '''
 
-
-@pytest.fixture(scope="module")
-def home() -> Iterator[dict[str, str]]:
-    """The variables of a server of its own, in use only where `empty` or `older` says so."""
-    path = new_home()
-    with server(path) as variables:
-        yield variables
-    remove_home(path)
+#: Makes the database what a builder makes of an empty one; returns what the builder returns.
+Put = Callable[[Callable[[Path], Any]], Any]
 
 
-@pytest.fixture
-def empty(home: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
-    """The server of its own without any table. Calling it forgets what the classes know of the server, as in a new
-    process."""
-    with monkeypatch.context() as patch:
-        for name, value in home.items():
-            patch.setenv(name, value)
-        patch.setattr(connection, "_current", None)
-        patch.setattr(datajoint.instance, "_singleton_connection", None)
-        _unbind(patch)
+class Home:
+    """A server of this module, and the databases that were built on it."""
+
+    def __init__(self, path: Path, variables: dict[str, str]) -> None:
+        self.path, self.variables = path, variables
+        self.built: dict[str, Any] = {}
+
+    def put(self, build: Callable[[Path], Any]) -> Any:
+        """Make the database what `build` makes of an empty one, given a folder for videos; return what it returns.
+
+        It is built once; after that its files are put back. On MySQL it is built each time.
+        """
+        name = build.__name__
+        if name in self.built:
+            put_back(self.path, name)
+            return self.built[name]
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             cursor.execute("SET foreign_key_checks = 0")
             cursor.execute("SELECT schema_name FROM information_schema.schemata WHERE schema_name LIKE 'pbl\\_%'")
             for (schema,) in cursor.fetchall():
                 cursor.execute(f"DROP DATABASE {schema}")
-        yield lambda: _unbind(patch)
+        result = build(self.path)
+        if not mysql.chosen():
+            self.built[name] = result
+            keep(self.path, name)
+        return result
+
+
+@pytest.fixture(scope="module")
+def home() -> Iterator[Home]:
+    """The server, in use only where a test asks for `put`."""
+    path = new_home()
+    with server(path) as variables:
+        yield Home(path, variables)
+    remove_home(path)
 
 
 @pytest.fixture
-def older(empty: Callable[[], None], add: Callable[[str, str], None], tmp_path: Path) -> None:
-    """A video in tables from before videos had a size and before there was a schema for validation; and a migration."""
+def forget(home: Home, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """The server of this module, in use. Calling it makes the classes forget the server, as in a new process."""
+    chain.install(monkeypatch)
+    with monkeypatch.context() as patch:
+        for name, value in home.variables.items():
+            patch.setenv(name, value)
+
+        def forgotten() -> None:
+            patch.setattr(connection, "_current", None)
+            patch.setattr(datajoint.instance, "_singleton_connection", None)
+            _unbind(patch)
+
+        yield forgotten
+
+
+@pytest.fixture
+def put(home: Home, forget: Callable[[], None]) -> Put:
+    """`Home.put`, in a process that knows nothing of the database before and after."""
+
+    def done(build: Callable[[Path], Any]) -> Any:
+        forget()
+        result = home.put(build)
+        forget()
+        return result
+
+    return done
+
+
+def no_table(folder: Path) -> None:
+    """Leave the database empty."""
+
+
+def new(folder: Path) -> None:
+    """Declare the tables."""
     schemas.activate()
-    register(chain.small_video(tmp_path, "old"), session_label="2026-03-01")
-    _make_older(add)
-    empty()
 
 
-def _make_older(add: Callable[[str, str], None]) -> None:
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+def without_sizes(folder: Path) -> None:
+    """Compute a visit in tables from before videos had a size and before there was a schema for validation."""
+    _visits(folder, "2026-03-01")
+
+    def undo_sizes(cursor: Any) -> None:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute("DROP DATABASE pbl_validation")
-        older_tables.undo_0003(cursor)
-        older_tables.undo_0002(cursor)
+
+    _undo(undo_sizes, older_tables.undo_0003, older_tables.undo_0002)
+
+
+def without_session(folder: Path) -> dict[str, list[tuple]]:
+    """Compute two visits and take migration 0001 back; return the rows of before that, as all builders below."""
+    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    _undo(older_tables.undo_0001)
+    return rows
+
+
+def without_instruments(folder: Path) -> dict[str, list[tuple]]:
+    """Declare the tables and take the migrations from 0006 back."""
+    schemas.activate()
+    rows = everything()
+    _undo(older_tables.undo_0008, older_tables.undo_0007, older_tables.undo_0006)
+    return rows
+
+
+def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
+    """Compute a visit whose events are corrected, and take migration 0004 back."""
+    _visits(folder, "2026-03-01")
+    found = event_corrections.shown(1)
+    assert found is not None
+    (time, side, kind, _), *others = found.events
+    event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
+    _compute()
+    rows = everything()
+    _undo(older_tables.undo_0004)
+    return rows
+
+
+def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
+    """Compute two visits and take migration 0005 back, for the first one."""
+    rows = _visits(folder, "2026-03-01", "2026-06-01")
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        older_tables.undo_0005(cursor, 1)
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
+    return rows
+
+
+def _visits(folder: Path, *days: str) -> dict[str, list[tuple]]:
+    schemas.activate()
+    for day in days:
+        register(chain.small_video(folder, day), session_label=day)
+    _compute()
+    return everything()
+
+
+def _compute() -> None:
+    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
+
+
+def _undo(*migrations: Callable[[Any], None]) -> None:
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for undo in migrations:
+            undo(cursor)
         cursor.execute(older_tables.NOT_RECORDED)
+
+
+@pytest.fixture
+def older(put: Put, add: Callable[[str, str], None]) -> None:
+    """A database of an older release (`without_sizes`), and its migration."""
+    put(without_sizes)
     add(f"{OWN:04}_sizes", SIZES)
 
 
@@ -160,15 +268,7 @@ def _chain() -> list[str]:
     return [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
 
-def test_an_older_database_keeps_its_rows_and_works(
-    empty: Callable[[], None], add: Callable[[str, str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    chain.install(monkeypatch)
-    schemas.activate()
-    register(chain.small_video(tmp_path, "old"), session_label="2026-03-01")
-    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
-    _make_older(add)
-    empty()
+def test_an_older_database_keeps_its_rows_and_works(older: None, tmp_path: Path):
     before = everything()
     dry = pbl("db", "migrate", "--dry-run")
     assert dry.code == 0, dry.out + dry.err
@@ -196,72 +296,37 @@ def test_an_older_database_keeps_its_rows_and_works(
     # A new visit goes through the whole chain beside it.
     assert frames.session_summary()["subject"].tolist() == ["P001"]
     ingest([chain.small_video(tmp_path, "new")], VisitRecord(subject="P002"))
-    run = populate(_chain())
-    assert not {t.table: t.errors for t in run.tables if t.errors}
+    _compute()
     assert set(frames.session_summary()["subject"]) == {"P001", "P002"}
     assert set(video.Video.to_arrays("video_size")) > {7}
 
 
-def test_results_from_before_they_had_their_session_get_it(
-    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    chain.install(monkeypatch)
-    schemas.activate()
-    for visit in ("2026-03-01", "2026-06-01"):
-        register(chain.small_video(tmp_path, f"walk{visit}"), session_label=visit)
-    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
-    new = everything()
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        older_tables.undo_0001(cursor)
-        cursor.execute(older_tables.NOT_RECORDED)
-    empty()
+def test_results_from_before_they_had_their_session_get_it(put: Put):
+    rows = put(without_session)
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0001 session_of_results"]), dry.open) == (4 * len(older_tables.WITHOUT_SESSION), [])
     migrations.migrate()
     after = everything()
-    changed = {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")}
-    assert changed == set()
+    assert {t for t in rows if after[t] != rows[t] and not t.split(".")[1].startswith("~")} == set()
     assert len(gdi.SessionGdi * session.Session) == len(session.Session()) == 2
     assert len(gait.Spatiotemporal * session.Session * video.Video) == 2
     assert migrations.migrate().steps == []
 
 
 @pytest.mark.parametrize("killed_before", [None, 1, 2, 3])
-def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], None], killed_before: int | None):
-    schemas.activate()
-    new = everything()["pbl_study.#clinical_instrument"]
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        older_tables.undo_0008(cursor)
-        older_tables.undo_0007(cursor)
-        older_tables.undo_0006(cursor)
-        cursor.execute(older_tables.NOT_RECORDED)
-    empty()
+def test_instruments_and_errors_of_before_get_their_columns(put: Put, killed_before: int | None):
+    rows = put(without_instruments)["pbl_study.#clinical_instrument"]
     migrate_until(killed_before)
     migrations.migrate()
-    assert everything()["pbl_study.#clinical_instrument"] == new
+    assert everything()["pbl_study.#clinical_instrument"] == rows
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
     assert gdi.SessionGdi.Measure.heading.names[-2:] == ["session_measure_error", "session_measure_minimal_change"]
     assert migrations.migrate().steps == []
 
 
 @pytest.mark.parametrize("killed_before", [None, 4, 60])
-def test_corrections_by_a_method_become_rows(
-    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
-):
-    chain.install(monkeypatch)
-    schemas.activate()
-    register(chain.small_video(tmp_path, "a"), session_label="2026-03-01")
-    populate(_chain())
-    found = event_corrections.shown(1)
-    assert found is not None
-    (time, side, kind, _), *others = found.events
-    event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
-    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
-    new = everything()
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        older_tables.undo_0004(cursor)
-        cursor.execute(older_tables.NOT_RECORDED)
-    empty()
+def test_corrections_by_a_method_become_rows(put: Put, killed_before: int | None):
+    rows = put(corrected_by_a_method)
     assert len(everything()["pbl_gdi.__session_gdi"]) == 2
     refused = pbl("populate")
     assert (refused.code, "__session_gdi.session_corrected" in refused.err) == (1, True)
@@ -271,29 +336,20 @@ def test_corrections_by_a_method_become_rows(
     assert (migrations.applied()[-1].number == OWN - 1) == (killed_before is None)
     migrations.migrate()
     after = everything()
-    assert {t for t in new if after[t] != new[t] and not t.split(".")[1].startswith("~")} == set()
+    assert {t for t in rows if after[t] != rows[t] and not t.split(".")[1].startswith("~")} == set()
     assert not [t for t in after if "hand_events" in t]
     assert migrations.migrate().steps == []
     # Nothing is pending; going back to the detected events computes theirs again.
     assert not populate(_chain()).did_something
-    event_corrections.take_back(1, "B. Second", (event_corrections.shown(1) or found).state)
+    found = event_corrections.shown(1)
+    assert found is not None
+    event_corrections.take_back(1, "B. Second", found.state)
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
 @pytest.mark.parametrize("killed_before", [None, 5])
-def test_tracking_without_the_video_info_that_it_read_goes(
-    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
-):
-    chain.install(monkeypatch)
-    schemas.activate()
-    (one,) = register(chain.small_video(tmp_path, "a"), session_label="2026-03-01")
-    register(chain.small_video(tmp_path, "b"), session_label="2026-06-01")
-    populate(_chain())
-    new = everything()
-    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        older_tables.undo_0005(cursor, one)
-        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
-    empty()
+def test_tracking_without_the_video_info_that_it_read_goes(put: Put, killed_before: int | None):
+    rows = put(tracked_without_video_info)
     dry = migrations.migrate(dry_run=True)
     statements = dict(dry.steps)["0005 tracking_of_videos_that_were_read"]
     assert (statements[0], len(statements) > 20, dry.open) == ("START TRANSACTION", True, [])
@@ -302,13 +358,14 @@ def test_tracking_without_the_video_info_that_it_read_goes(
     assert (len(done) == len(statements)) == (killed_before is None)
     migrations.migrate()
     after = everything()
-    left = {t: len(rows) for t, rows in after.items() if t.split(".")[1].startswith("__") or "fit_set" in t}
-    assert left == {t: len(new[t]) // 2 for t in left}
-    assert set(map(str, video.VideoInfo.to_arrays("video_id"))) == {str(one + 1)}
+    left = {t: len(found) for t, found in after.items() if t.split(".")[1].startswith("__") or "fit_set" in t}
+    assert left == {t: len(rows[t]) // 2 for t in left}
+    assert set(map(str, video.VideoInfo.to_arrays("video_id"))) == {"2"}
     assert migrations.migrate().steps == []
     # What was asked for is computed again.
-    assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
-    assert {t: len(rows) for t, rows in everything().items() if t in left} == {t: len(new[t]) for t in left}
+    _compute()
+    after = everything()
+    assert {t: len(after[t]) for t in left} == {t: len(rows[t]) for t in left}
 
 
 @pytest.mark.parametrize("command", [("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")])
@@ -323,8 +380,8 @@ def test_commands_over_tables_of_an_older_version_name_the_migration(older: None
     assert pbl("list", "videos").code == 0
 
 
-def test_what_no_migration_removes_is_named(empty: Callable[[], None], add: Callable[[str, str], None]):
-    schemas.activate()
+def test_what_no_migration_removes_is_named(put: Put, add: Callable[[str, str], None]):
+    put(new)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("ALTER TABLE pbl_video.video DROP COLUMN video_size")
         cursor.execute(
@@ -333,7 +390,6 @@ def test_what_no_migration_removes_is_named(empty: Callable[[], None], add: Call
         cursor.execute("ALTER TABLE pbl_lab.project MODIFY COLUMN project_title VARCHAR(20) NOT NULL DEFAULT ''")
         cursor.execute("ALTER TABLE pbl_session.session ADD COLUMN forgotten INT NOT NULL")
         cursor.execute("ALTER TABLE pbl_keypoints.__keypoints DROP INDEX camera_kind")
-    empty()
     named = _named()
     assert {n.split(":")[0] for n in named} == {
         "`pbl_video`.`video`",
@@ -405,10 +461,10 @@ STARTS = (
 
 @pytest.mark.parametrize(("number", "name"), [(999, "x"), (1, "another_of_this_number")])
 def test_a_database_of_a_newer_version_is_left_alone(
-    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
+    put: Put, forget: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
 ):
     monkeypatch.chdir(tmp_path)
-    schemas.activate()
+    put(new)
     assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
@@ -418,7 +474,7 @@ def test_a_database_of_a_newer_version_is_left_alone(
         )
     before = everything()
     for command in STARTS:
-        empty()
+        forget()
         refused = pbl(*command)
         assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
         for part in (f"{number:04} {name}", "9.9+gabc", code_version()):
@@ -426,21 +482,23 @@ def test_a_database_of_a_newer_version_is_left_alone(
     assert everything() == before
     assert not list(tmp_path.iterdir())
     # Also a worker that runs while the tables are migrated stops at its next look.
-    empty()
+    forget()
     schemas.stages.modules()
     with pytest.raises(PblError, match=r"9\.9") as error:
         loop.Worker((), heartbeat.Silent()).run(once=True)
     assert error.value.code == "DB_MIGRATION"
 
 
-def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_missing(empty: Callable[[], None]):
-    schemas.activate()
+def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_missing(
+    put: Put, forget: Callable[[], None]
+):
+    put(new)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = %s", (OWN - 1,))
     last = migrations.available()[-1]
     for command in STARTS:
         if command[:2] != ("db", "migrate"):
-            empty()
+            forget()
             refused = pbl(*command)
             assert (refused.code, refused.error_code) == (1, "DB_MIGRATION"), command
             assert f"without migration {last.title}" in refused.err
@@ -457,9 +515,8 @@ def test_one_process_migrates_at_a_time(database: Path):
         assert error.value.code == "DB_MIGRATION"
 
 
-def test_an_empty_server_gets_the_tables_as_they_are_defined(
-    empty: Callable[[], None], add: Callable[[str, str], None]
-):
+def test_an_empty_server_gets_the_tables_as_they_are_defined(put: Put, add: Callable[[str, str], None]):
+    put(no_table)
     add(f"{OWN:04}_sizes", SIZES)
     planned = migrations.migrate(dry_run=True)
     assert "pbl_lab: the schema is created" in planned.created

@@ -19,10 +19,10 @@ BEFORE = ["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput", "
 OF_TRIALS = ["GaitEvents", "GaitCycle", "Spatiotemporal", "GDI"]
 
 
-@pytest.fixture
-def visit(tables: None, tmp_path: Path) -> None:
+@chain.computed_once
+def visit(folder: Path) -> None:
     """A computed visit of two recordings, 1 and 2."""
-    register(chain.small_video(tmp_path, "a"), chain.small_video(tmp_path, "b", n=250), session_label="2026-01-10")
+    register(chain.small_video(folder, "a"), chain.small_video(folder, "b", n=250), session_label="2026-01-10")
     populate()
 
 

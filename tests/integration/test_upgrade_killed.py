@@ -6,7 +6,6 @@ pytest -m machine tests/integration/test_upgrade_killed.py -s         # minutes;
 from __future__ import annotations
 
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,8 +17,7 @@ import pytest
 
 from pbl_pipeline import settings
 from schemas import connection, migrations
-from schemas.operations import embedded
-from tests.database import embedded_only, installation
+from tests.database import embedded_only, installation, keep, put_back
 from tests.rows import everything
 
 pytestmark = [pytest.mark.machine, pytest.mark.database, embedded_only]
@@ -56,24 +54,13 @@ def state() -> dict[str, Any]:
     return rows
 
 
-def put_back(home: Path) -> None:
-    """The old database again, as the files of its server."""
-    folder = embedded.Folder(home / "db")
-    embedded.stop(folder=folder)
-    shutil.rmtree(home / "db")
-    subprocess.run(["cp", "-a", str(home / "old"), str(home / "db")], check=True)
-    embedded.start(folder=folder)
-
-
 def test_an_upgrade_killed_at_random_statements_gives_the_same_numbers(tmp_path: Path):
     draw = random.Random(34)
     with installation() as home:
         assert settings.home_dir() == home
         built = target("build", tmp_path)
         assert built.returncode == 0, built.stderr[-3000:]
-        embedded.stop(folder=embedded.Folder(home / "db"))
-        subprocess.run(["cp", "-a", str(home / "db"), str(home / "old")], check=True)
-        put_back(home)
+        keep(home, "old")
         whole = target("migrate")
         assert whole.returncode == 0, whole.stderr[-3000:]
         statements = whole.stdout.splitlines()
@@ -82,7 +69,7 @@ def test_an_upgrade_killed_at_random_statements_gives_the_same_numbers(tmp_path:
         assert wanted["migrations"] == tuple((m.number, m.name) for m in migrations.available())
         sys.stdout.write(f"\n{len(statements)} statements, {sum(map(len, wanted.values()))} rows, columns and keys\n")
         for at in sorted(draw.sample(range(1, len(statements) + 1), KILLS)):
-            put_back(home)
+            put_back(home, "old")
             after_s = draw.choice([0.0, draw.uniform(0.0, LATEST_S)])
             killed = target("migrate", at, after_s)
             assert killed.returncode == -signal.SIGKILL, killed.stderr[-3000:]

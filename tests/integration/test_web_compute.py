@@ -15,7 +15,7 @@ from schemas.decisions import review_decisions
 from schemas.jobs import jobs_of
 from schemas.reading.visit_progress import visit_progress
 from tests.integration import compute_target, web
-from tests.integration.chain import small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 from workers import queue, run_job
 from workers.populate import populate
@@ -38,11 +38,11 @@ def browser(hold: Path) -> Iterator[Any]:
     found.app.state.computing.close()
 
 
-@pytest.fixture
-def visits(tables: None, tmp_path: Path) -> None:
+@computed_once
+def visits(folder: Path) -> None:
     """Visit 1 of recordings 1 and 2, visit 2 of recording 3; all computed."""
-    register(small_video(tmp_path, "a"), small_video(tmp_path, "b"), session_label="2026-01-10")
-    register(small_video(tmp_path, "c"), session_label="2026-04-10")
+    register(small_video(folder, "a"), small_video(folder, "b"), session_label="2026-01-10")
+    register(small_video(folder, "c"), session_label="2026-04-10")
     populate()
     assert len(qc.SessionQc()) == 2
 

@@ -20,15 +20,15 @@ from schemas.review import Decision
 from schemas.rows import delete_below
 from tests.command import pbl
 from tests.integration import web
-from tests.integration.chain import small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything, register
 from workers.populate import populate
 
 
-@pytest.fixture
-def two_alike(tables: None, tmp_path: Path) -> int:
+@computed_once
+def two_alike(folder: Path) -> int:
     """A video in which somebody has to be chosen."""
-    number = register(small_video(tmp_path, "walk", people="two alike"), session_label="2026-01-10")[0]
+    number = register(small_video(folder, "walk", people="two alike"), session_label="2026-01-10")[0]
     populate()
     assert tracking.SubjectChoice.fetch1("choice_status") == "NEEDS_CHOICE"
     return number
@@ -163,10 +163,10 @@ def test_a_fit_that_is_deleted_while_its_page_loads_is_pending(two_alike: int, m
     assert (answer.status_code, "DB_NOT_FOUND" in answer.text) == (404, True)
 
 
-@pytest.fixture
-def warned(tables: None, tmp_path: Path) -> dict[str, Any]:
+@computed_once
+def warned(folder: Path) -> dict[str, Any]:
     """A computed visit, number 1; the row of its check `residual_3d_cm`, which is WARN."""
-    register(small_video(tmp_path, "walk"), session_label="2026-01-10")
+    register(small_video(folder, "walk"), session_label="2026-01-10")
     populate()
     return (qc.SessionQc.proj("qc_computed") * qc.SessionQc.Check & {"qc_check": "residual_3d_cm"}).fetch1()
 

@@ -26,17 +26,17 @@ from schemas.review import Decision
 from schemas.rows import delete_below
 from schemas.studies import slices
 from tests.integration import decide_target, web
-from tests.integration.chain import small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 from workers.populate import populate
 from workers.web import export
 from workers.web.corrections import _events
 
 
-@pytest.fixture
-def visit(tables: None, tmp_path: Path) -> str:
+@computed_once
+def visit(folder: Path) -> str:
     """A computed visit of two recordings, 1 and 2; the method of its events."""
-    register(small_video(tmp_path, "a"), small_video(tmp_path, "b", n=250), session_label="2026-01-10")
+    register(small_video(folder, "a"), small_video(folder, "b", n=250), session_label="2026-01-10")
     populate()
     return str(gait.GaitPlan.fetch1("gait_method"))
 

@@ -23,15 +23,15 @@ from schemas.review import Decision
 from schemas.studies import slices
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
-from tests.integration.chain import small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 from workers.populate import populate
 
 
-@pytest.fixture
-def visit(tables: None, tmp_path: Path) -> tuple[int, int]:
+@computed_once
+def visit(folder: Path) -> tuple[int, int]:
     """A computed visit of two recordings, numbers 1 and 2."""
-    one, two = register(small_video(tmp_path, "a"), small_video(tmp_path, "b"), session_label="2026-01-10")
+    one, two = register(small_video(folder, "a"), small_video(folder, "b"), session_label="2026-01-10")
     populate()
     assert len(gdi.SessionGdi()) == 1
     return one, two

@@ -12,12 +12,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import load_attitude
-from tests.inputs import LEVEL, PHONE_T, UPRIGHT, about, changed, csv_log, keypoints
-
-
-def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
-    return error.value.code
-
+from tests.inputs import LEVEL, PHONE_T, UPRIGHT, about, changed, code_of, csv_log, keypoints
 
 # --- the phone's orientation in the keypoints -------------------------------------------------------------------
 

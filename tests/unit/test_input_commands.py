@@ -24,16 +24,13 @@ from tests.inputs import (
     UPRIGHT,
     about,
     changed,
+    code_of,
     csv_log,
     keypoints,
     markers,
     trc_text,
 )
 from tests.integration import chain
-
-
-def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
-    return error.value.code
 
 
 @pytest.fixture

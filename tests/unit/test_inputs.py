@@ -21,11 +21,7 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.video import Camera, CameraPose, load_camera, load_camera_poses
 from tests import SHARED
-from tests.inputs import CALIBRATION, LENS, NAMES, POSE, ROWS, J, T, changed, keypoints, markers, trc_text
-
-
-def code_of(error: pytest.ExceptionInfo[PblError]) -> str:
-    return error.value.code
+from tests.inputs import CALIBRATION, LENS, NAMES, POSE, ROWS, J, T, changed, code_of, keypoints, markers, trc_text
 
 
 @pytest.fixture
