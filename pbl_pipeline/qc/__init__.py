@@ -2,18 +2,3 @@
 
 from ._check import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, failed, in_session, worst
 from ._order import ORDER, in_order
-
-__all__ = [
-    "EMPTY",
-    "FAIL",
-    "NEEDS_CHOICE",
-    "ORDER",
-    "OUTCOMES",
-    "PASS",
-    "WARN",
-    "Check",
-    "failed",
-    "in_order",
-    "in_session",
-    "worst",
-]
