@@ -209,10 +209,7 @@ def needed() -> list[str]:
 def folder() -> Path:
     """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
 
-    Raises
-    ------
-    PblError
-        ASSET_MISSING: the folder cannot be made.
+    Raises `PblError` ASSET_MISSING: the folder cannot be made.
     """
     try:
         path = settings.cache_dir() / "assets"

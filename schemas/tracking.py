@@ -234,10 +234,7 @@ def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
 def set_override(key: Mapping[str, Any], person_id: int) -> None:
     """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes what it contradicts.
 
-    Raises
-    ------
-    PblError
-        SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
+    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
     """
     key = {"video_id": key["video_id"], "tracking_method": key["tracking_method"]}
     if Tracking & key:

@@ -62,6 +62,8 @@ def populate(
 ) -> Run:
     """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
+    Raises `PblError` USAGE for an unknown table name.
+
     Parameters
     ----------
     tables
@@ -73,11 +75,6 @@ def populate(
     visit
         session_id of the visit of which alone is computed, its usable recordings and current sets; jobs of it that
         other workers hold are waited for. None: everything.
-
-    Raises
-    ------
-    PblError
-        USAGE for an unknown table name.
     """
     for name in ("datajoint", "pbl.worker"):  # they would print into the bar what the summary and `pbl status` say
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -89,10 +89,8 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     The column `weight_3d` may be there too (`MarkerSet`); an empty cell means 1. Lines that start with `#` are
     comments, further columns are ignored. `name` is the file's stem unless given.
 
-    Raises
-    ------
-    PblError
-        FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model lacks, no rows.
+    Raises `PblError` FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model
+    lacks, no rows.
     """
     path = Path(path)
     known = load_body().body_names

@@ -196,6 +196,9 @@ def score_gdi(
     `GdiCycle.explained` says how much was. Where the fit knows how sure its angles are, what their errors lengthen is
     taken back from the distance (`GdiParams.lengthening`; docs/measures.md).
 
+    Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another
+    model; ANGLE_UNITS for curves that are not in degrees.
+
     Parameters
     ----------
     cycles
@@ -207,12 +210,6 @@ def score_gdi(
     model, version
         A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
         the norm's angles decide; a norm of other angles than the two indices have gives an index of its own name.
-
-    Raises
-    ------
-    PblError
-        NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another model;
-        ANGLE_UNITS for curves that are not in degrees.
     """
     method = GDI_METHODS.find(model)
     basis = norm_of(norm, params or method.params)

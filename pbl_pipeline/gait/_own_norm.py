@@ -33,6 +33,9 @@ def norm_from_cycles(
 ) -> tuple[NormativeSet, tuple[Check, ...]]:
     """The set that the used cycles of healthy people make, and checks of it.
 
+    Raises `PblError` NORM_INVALID: fewer than 30 usable cycles, no more cycles than components, angles of several
+    definitions, or other angles than an index has. ANGLE_UNITS.
+
     Parameters
     ----------
     cycles, people
@@ -41,12 +44,6 @@ def norm_from_cycles(
         Angles of the index: three (curves at 0, 2, ..., 98 %, as the paper's) or nine (0, 2, ..., 100 %).
     variance, n_components, pooled
         As in `fit_norm`; `pooled` are cycles of patients that the components are fitted to as well.
-
-    Raises
-    ------
-    PblError
-        NORM_INVALID: fewer than 30 usable cycles, no more cycles than components, angles of several definitions, or
-        other angles than an index has. ANGLE_UNITS.
     """
     variables = tuple(variables)
     if variables not in MODEL_ANGLES.values():

@@ -22,6 +22,9 @@ SAME_TIME_S = 1e-3
 class MultiView:
     """Keypoints of the same moments from at least two cameras that stand still.
 
+    Raises `PblError` FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another
+    number of poses.
+
     Attributes
     ----------
     views
@@ -30,12 +33,6 @@ class MultiView:
         Where each camera stands, in the same order; one world for all.
     cameras
         What each is called, for messages; empty where they have no names.
-
-    Raises
-    ------
-    PblError
-        FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another number of
-        poses.
     """
 
     views: tuple[Keypoints, ...]
@@ -85,10 +82,7 @@ class MultiView:
         `cameras` names each view's camera in the file; None: the views are in the file's order and number. The lens of
         the calibration replaces that of the keypoints.
 
-        Raises
-        ------
-        PblError
-            FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
+        Raises `PblError` FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
         """
         poses = load_camera_poses(calibration)
         names = list(poses if cameras is None else cameras)

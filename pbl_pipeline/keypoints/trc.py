@@ -33,12 +33,9 @@ class Trc:
 def read_trc(path: str | Path) -> Trc:
     """Read a TRC file.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such file. FILE_FORMAT: no TRC, other counts of frames or markers than its header says, a row
-        with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit other
-        than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
+    Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: no TRC, other counts of frames or markers than its header
+    says, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
+    other than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
     """
     try:
         # Only names matter: a path in the first line may be in any encoding.

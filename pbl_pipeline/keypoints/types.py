@@ -51,6 +51,8 @@ class PersonKeypoints:
 class Keypoints:
     """One trial. Missing values are NaN with confidence 0.
 
+    Raises `PblError` FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
+
     Attributes
     ----------
     time_s : (T,) float64
@@ -84,11 +86,6 @@ class Keypoints:
         Fields that the file did not have, for which a default stands (`load`).
     picture
         How light and sharp the picture of the person is, or None where no video was seen.
-
-    Raises
-    ------
-    PblError
-        FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
     """
 
     time_s: np.ndarray

@@ -22,6 +22,9 @@ _FIELDS = ("time_s", "names", "marker_set", "xyz_world_m", "confidence")
 class WorldMarkers:
     """One trial of optical markers. A marker that was not seen is NaN with confidence 0.
 
+    Raises `PblError` FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with
+    a confidence above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
+
     Attributes
     ----------
     time_s : (T,) float64
@@ -34,12 +37,6 @@ class WorldMarkers:
         World: right-handed, z up, metres; origin and heading are the laboratory's.
     confidence : (T, J) float64
         0..1.
-
-    Raises
-    ------
-    PblError
-        FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with a confidence
-        above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
     """
 
     time_s: np.ndarray
@@ -115,10 +112,7 @@ class WorldMarkers:
         x stays (OpenSim's forward) and the frame stays right-handed. "z": taken as it is. Empty cells, NaN and three
         zeros, which some programs write into gaps, are missing: NaN with confidence 0; all else has confidence 1.
 
-        Raises
-        ------
-        PblError
-            FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
+        Raises `PblError` FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
         """
         if up not in ("y", "z"):
             raise PblError(

@@ -97,11 +97,8 @@ class ModelSpec:
 def load_spec(folder: str | Path) -> ModelSpec:
     """Read `model.json` of a model's folder. Whether `model.onnx` fits it, `OnnxModel` checks.
 
-    Raises
-    ------
-    PblError
-        MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a wrong kind.
-        MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
+    Raises `PblError` MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a
+    wrong kind. MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
     """
     path = Path(folder) / SPEC_FILE
     try:

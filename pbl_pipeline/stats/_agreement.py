@@ -44,10 +44,7 @@ def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
     The intervals of the limits are exact for normal differences (noncentral t; Carkeet 2015, Optom Vis Sci 92:e71-80).
     Bland and Altman's own, limit and t sqrt(3 / n) sd, are nearly that from 50 pairs on.
 
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
+    Raises `PblError` STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
     """
     difference = changes(b, a, 3)
     fraction(confidence, "confidence")

@@ -74,15 +74,12 @@ def srm(pre: Any, post: Any = None, confidence: float = 0.95) -> Srm:
     The paper, Statistics (Liang et al. 1990), with its jackknife: pseudo-values n SRM - (n - 1) SRM without one person,
     the interval by Student's t about their mean (Miller 1974).
 
+    Raises `PblError` STATS_INPUT: fewer than three persons, NaN, all changes the same (or all but one).
+
     Parameters
     ----------
     pre, post : (N,)
         In any unit, the persons in the same order.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three persons, NaN, all changes the same (or all but one).
     """
     change = changes(pre, post, MIN_PERSONS)
     n = len(change)
@@ -128,15 +125,12 @@ def effect_size(
     (expanded percentiles, Hesterberg 2015, Am Stat 69:371-386). NaN where all who changed did so in one direction:
     every resample does, too, and cannot show what other persons would do.
 
+    Raises `PblError` STATS_INPUT: fewer than three persons, NaN, all changes the same.
+
     Parameters
     ----------
     pre, post : (N,)
         In any unit, the persons in the same order.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three persons, NaN, all changes the same.
     """
     change = changes(pre, post, MIN_PERSONS)
     value = float(_effect(change[None])[0])

@@ -44,16 +44,13 @@ def correlation(x: Any, y: Any, kind: str = "pearson", persons: Any = None, conf
     Intervals: Fisher's z with standard error 1 / sqrt(df - 1), where df = n - 2, or pairs - persons - 1 ("repeated");
     for Spearman sqrt((1 + r^2 / 2) / (df - 1)) (Bonett & Wright 2000, Psychometrika 65:23-28).
 
+    Raises `PblError` STATS_INPUT: unknown kind, fewer than four pairs, NaN, other lengths, a measure with the same
+    value throughout (for "repeated": within every person), fewer than two persons or too few repeats.
+
     Parameters
     ----------
     persons : (N,)
         Labels, for "repeated" only.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: unknown kind, fewer than four pairs, NaN, other lengths, a measure with the same value throughout
-        (for "repeated": within every person), fewer than two persons or too few repeats.
     """
     one_of(kind, CORRELATIONS, "kind")
     fraction(confidence, "confidence")

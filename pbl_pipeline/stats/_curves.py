@@ -103,6 +103,9 @@ def curve_test(
     over neighbouring points of one sign with |t| above its quantile at `cluster_p` (Maris & Oostenveld 2007, J Neurosci
     Methods 164:177-190): it finds long weak phases and judges no single point.
 
+    Raises `PblError` STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only
+    (paired) or in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
+
     Parameters
     ----------
     a, b : (N, P), (M, P)
@@ -111,12 +114,6 @@ def curve_test(
         Whose curve each is. Without them each row is a person of its own ("paired": the same in both, in order).
     n_permutations
         At most; all there are where these are no more.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only (paired) or
-        in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
     """
     one_of(method, CURVE_METHODS, "method")
     for value, name in ((alpha, "alpha"), (cluster_p, "cluster_p")):

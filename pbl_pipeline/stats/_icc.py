@@ -91,6 +91,11 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     McGraw & Wong 1996 (Psychol Methods 1:30-46): exact for kinds 1 and 3, Satterthwaite's approximation for kinds 2.
     The paper's ICC2 and ICC2k (Clinical Construct Validity; Table 2) are "2,1" and "2,k" over steps of one day.
 
+    Raises `PblError` STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all
+    ratings equal, a subject or rater without any rating, no subject with two ratings; no variance of which subjects
+    could have a share; for the mean of k ratings also means of the subjects that differ so little that it is not
+    defined.
+
     Parameters
     ----------
     ratings : (n, k)
@@ -111,13 +116,6 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     Icc
         With low <= value <= high <= 1. A value is negative where subjects differ less than error alone would make them;
         `low` of a mean of k is -inf where the ratings put no lower bound on it.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all ratings equal,
-        a subject or rater without any rating, no subject with two ratings; no variance of which subjects could have a
-        share; for the mean of k ratings also means of the subjects that differ so little that it is not defined.
     """
     one_of(kind, ICC_KINDS, "kind")
     one_of(interval, ICC_INTERVALS, "interval")

@@ -52,6 +52,9 @@ def sample_size(
 ) -> SampleSize:
     """Persons whom a two-sided t test needs to find a true mean `change` (Cohen 1988; power from the noncentral t).
 
+    Raises `PblError` STATS_INPUT: a number outside its range, no `icc` where one is needed, more than a million
+    persons.
+
     Parameters
     ----------
     change, sd
@@ -67,11 +70,6 @@ def sample_size(
     change_sd
         By how much persons differ in their true change (same unit); adds to the above in squares. 0 presumes that
         everybody changes alike, which gives the smallest study.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: a number outside its range, no `icc` where one is needed, more than a million persons.
     """
     one_of(design, DESIGNS, "design")
     for value, name in ((power, "power"), (alpha, "alpha")):

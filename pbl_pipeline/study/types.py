@@ -57,6 +57,11 @@ class StudyData:
 
     Columns are put in order and given their types when it is made; an absent frame is an empty one. Persons are codes.
 
+    Raises `PblError` STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice,
+    a row of a visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
+    excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two units, an
+    unknown score or one outside its range.
+
     Attributes
     ----------
     visits
@@ -71,14 +76,6 @@ class StudyData:
         One row per visit, side and joint angle: the mean curve at 0, 1, ..., 100 % of the cycle. May hold NaN.
     description
         Of the study.
-
-    Raises
-    ------
-    PblError
-        STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice, a row of a
-        visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
-        excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two
-        units, an unknown score or one outside its range.
     """
 
     visits: pd.DataFrame
@@ -256,17 +253,14 @@ def classes_of(text: str) -> list[tuple[float, str]]:
 def minimal_change_at(before: float, change: float | None, classes: str) -> float | None:
     """Minimal important change of a score that was `before`, in its unit; None where none is taken over.
 
+    Raises `PblError` STUDY_INVALID: `classes` that are not positive numbers by values in order.
+
     Parameters
     ----------
     change
         The one of all values, where there is one.
     classes
         Changes by the lowest value before, such as "0 3; 12 2; 15 1", which then hold instead of `change`; or "".
-
-    Raises
-    ------
-    PblError
-        STUDY_INVALID: `classes` that are not positive numbers by values in order.
     """
     for lowest, text in classes_of(classes):
         try:

@@ -51,10 +51,7 @@ def write_study_report(
     the CSV tables have its code as well. `change_from`, `change_to` (roles) and `change_group` take precedence over
     those of the study's description. Without `pdf` the figures are SVG alone, in a third of the time.
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
+    Raises `PblError` FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
     """
     folder = Path(folder)
     check_out_folder(folder)

@@ -278,10 +278,7 @@ def synthesise(spec: SynthSpec) -> Synthetic:
     Normal curves by speed (Schwartz et al. 2008) and impairments give the angles that the motion aims at; footprints
     and the pelvis' way are planned; the least-squares solution keeps the standing feet where they stand.
 
-    Raises
-    ------
-    PblError
-        USAGE: more seconds than the task lasts, or a walk that leaves the picture of a static camera.
+    Raises `PblError` USAGE: more seconds than the task lasts, or a walk that leaves the picture of a static camera.
     """
     markers = marker_set(spec.marker_set)
     style = style_of(spec.impairments)

@@ -45,17 +45,14 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
     """Fit and measure the recordings of `BRIDGE_SET` by the default methods but one, and write each visit into a
     separate folder below `folder`, which another version can then be compared with.
 
+    Raises `PblError` SOLVER_UNKNOWN for a name that no method has, and what fitting and measuring raise.
+
     Parameters
     ----------
     name
         Of a method of the fit, the events or the index.
     done
         Called after each recording.
-
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN for a name that no method has, and what fitting and measuring raise.
     """
     from pbl_pipeline.fit import METHODS, default_fit, fit_session
 

@@ -112,10 +112,8 @@ def compare(
     the vertical by the one angle that fits the reference best before its angles are compared, and the pelvis' path is
     turned about the vertical and shifted (`align_path`).
 
-    Raises
-    ------
-    PblError
-        REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames. GAIT_INPUT: a fit without frames.
+    Raises `PblError` REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames. GAIT_INPUT: a fit
+    without frames.
     """
     poses = trial_poses(fit)
     result = compare_angles(

@@ -23,6 +23,9 @@ _FIELDS = ("time_s", "names", "angles_deg", "pelvis_m", "name", "source", "conve
 class Reference:
     """Reference kinematics of one recording.
 
+    Raises `PblError` REFERENCE_INPUT: time stamps out of order, shapes that do not belong together, an unknown
+    convention.
+
     Attributes
     ----------
     name
@@ -38,11 +41,6 @@ class Reference:
         are not known are absent; NaN where a joint is not known at that time.
     pelvis_m
         (T, 3) origin of the pelvis in the reference's own z-up world, or None.
-
-    Raises
-    ------
-    PblError
-        REFERENCE_INPUT: time stamps out of order, shapes that do not belong together, an unknown convention.
     """
 
     name: str

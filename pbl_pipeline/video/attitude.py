@@ -59,11 +59,8 @@ class Attitude:
 def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tuple[np.ndarray, np.ndarray]:
     """(P,) times and (P, 4) unit quaternions without a jump from q to -q, or an error.
 
-    Raises
-    ------
-    PblError
-        PHONE_LOG: other shapes, fewer than two samples, values that are not finite, stamps that repeat or run
-        backwards, a quaternion of length (nearly) zero.
+    Raises `PblError` PHONE_LOG: other shapes, fewer than two samples, values that are not finite, stamps that repeat or
+    run backwards, a quaternion of length (nearly) zero.
     """
     try:
         time, quat = np.asarray(time_s, np.float64), np.asarray(quat_wxyz, np.float64)

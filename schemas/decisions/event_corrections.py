@@ -90,6 +90,9 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
     the last one is withdrawn, as by `take_back`. Cycles, measures and indices that were computed from other
     events of this trial are deleted and pending again.
 
+    Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without
+    events; USAGE where nothing was changed.
+
     Parameters
     ----------
     events
@@ -101,12 +104,6 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
     -------
     dict
         Table name to number of deleted rows.
-
-    Raises
-    ------
-    PblError
-        EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without events;
-        USAGE where nothing was changed.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
 

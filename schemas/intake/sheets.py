@@ -82,11 +82,8 @@ def read_sheets(path: Path) -> list[Sheet]:
     """The sheets of a CSV file (UTF-8; a comma, semicolon or tab between columns) or a workbook (.xlsx), empty ones
     left out. A date cell is YYYY-MM-DD, a number its shortest text.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, merged cells, formulas, error values,
-        no such file format. Cells beside the header's columns are an error of their row.
+    Raises `PblError` FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, merged cells, formulas,
+    error values, no such file format. Cells beside the header's columns are an error of their row.
     """
     if not path.is_file():
         raise PblError(

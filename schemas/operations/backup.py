@@ -65,6 +65,9 @@ def backup(
 ) -> Backup:
     """Save the database and the store into a new folder, where asked for with the recordings.
 
+    Raises `PblError` FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named);
+    STORE_UNAVAILABLE; DB_REFUSED when a table was changed in the middle.
+
     Parameters
     ----------
     folder
@@ -77,12 +80,6 @@ def backup(
         Also save the registered videos. One that is gone or changed is left out and named.
     previous
         An earlier backup: recordings that it holds are linked instead of copied.
-
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named); STORE_UNAVAILABLE;
-        DB_REFUSED when a table was changed in the middle.
     """
     _new_folder(folder)
     prefix = connection.prefix()
@@ -142,10 +139,7 @@ def backup(
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     """Compare every byte of a backup with its checksums; return the manifest.
 
-    Raises
-    ------
-    PblError
-        BACKUP_INVALID, which names the missing or changed files.
+    Raises `PblError` BACKUP_INVALID, which names the missing or changed files.
     """
     try:
         manifest = read_json(folder / "manifest.json")
@@ -186,6 +180,9 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
 def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
     """Restore a backup into an empty database and its store. Everything is checked before anything is written.
 
+    Raises `PblError` BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is
+    another one than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
+
     Parameters
     ----------
     folder
@@ -194,12 +191,6 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
         After an interrupted restore: remove the tables it left, then start again.
     say
         Called with a sentence for each step.
-
-    Raises
-    ------
-    PblError
-        BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is another one
-        than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
     """
     manifest = check(folder, say)
     connection.connect(start=True)  # a new place has no server yet

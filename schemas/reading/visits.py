@@ -79,6 +79,9 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
     """Return everything that the tables hold of one visit. Arrays are loaded when they are asked for.
 
+    Raises `PblError` DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN
+    and NORM_UNKNOWN for unknown methods.
+
     Parameters
     ----------
     restriction
@@ -87,12 +90,6 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
         recordings of one camera, of several, or markers.
     measures
         Also events, cycles, measures and index.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN and
-        NORM_UNKNOWN for unknown methods.
     """
     found, key = find_visit(restriction)
     videos = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
@@ -125,18 +122,15 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     Rows with `subject`, `session_label`, `folder` (subject and session as the names of a folder in a folder) and the
     key of the fit and its measures.
 
+    Raises `PblError` DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds
+    of recordings or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
+
     Parameters
     ----------
     restriction
         Subject, session, methods (short names too), `fit_set_kind`.
     slice_name
         The visits that count in this slice alone, with the sets and methods that it was frozen with.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds of recordings
-        or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
     """
     sets: Any = fit.current()
     restriction = with_keys(restriction)

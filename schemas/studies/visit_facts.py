@@ -143,6 +143,9 @@ def correct(
 
     What was computed with another height, or pools other recordings now, is deleted and pending again.
 
+    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored
+    meanwhile.
+
     Parameters
     ----------
     values
@@ -156,11 +159,6 @@ def correct(
     -------
     tuple
         The fields that were changed; the errors by field, with any of which nothing was written.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored meanwhile.
     """
     return in_transaction(lambda: _correct(session_id, _stripped(values), by, seen, reason))
 

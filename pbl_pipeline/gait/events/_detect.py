@@ -13,6 +13,9 @@ from .types import GaitEvents
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     """Foot down and foot up of both sides in order of time, in bouts of walking.
 
+    Raises `PblError` GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
+    SOLVER_UNKNOWN for an unknown method; ASSET_MISSING where the event model's weights are not there.
+
     Parameters
     ----------
     feet
@@ -24,12 +27,6 @@ def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     -------
     GaitEvents
         Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view).
-
-    Raises
-    ------
-    PblError
-        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
-        SOLVER_UNKNOWN for an unknown method; ASSET_MISSING where the event model's weights are not there.
     """
     method = METHODS.find(params)
     return method.function(feet, method)

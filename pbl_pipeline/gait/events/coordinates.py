@@ -49,16 +49,13 @@ def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -
     threshold, near 1 for one far above it, times the confidence `c` of the points where the source states one. It
     orders events by how clear they are; it is not calibrated against truth.
 
+    Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
+
     Returns
     -------
     GaitEvents
         Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot is
         never seen, or the person walks backwards.
-
-    Raises
-    ------
-    PblError
-        GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
     """
     p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)

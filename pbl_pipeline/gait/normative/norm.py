@@ -130,11 +130,8 @@ def fit_norm(
     normative vectors alone or, as in the paper, of these together with the vectors `pooled` (M, V * P) of patients:
     mean and log distances are those of the normative vectors either way. `n_components` stands for `variance`.
 
-    Raises
-    ------
-    PblError
-        NORM_INVALID for too few vectors, no more vectors than components, another length or values that are not
-        finite; ANGLE_UNITS.
+    Raises `PblError` NORM_INVALID for too few vectors, no more vectors than components, another length or values that
+    are not finite; ANGLE_UNITS.
     """
     vectors = _vectors(vectors, variables, percent)
     _enough(len(vectors), n_components or 0)
