@@ -24,20 +24,12 @@ class MultiView:
 
     Raises `PblError` FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another
     number of poses.
-
-    Attributes
-    ----------
-    views
-        Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
-    poses
-        Where each camera stands, in the same order; one world for all.
-    cameras
-        What each is called, for messages; empty where they have no names.
     """
 
+    #: Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
     views: tuple[Keypoints, ...]
-    poses: tuple[CameraPose, ...]
-    cameras: tuple[str, ...] = ()
+    poses: tuple[CameraPose, ...]  # where each camera stands, in the same order; one world for all
+    cameras: tuple[str, ...] = ()  # what each is called, for messages; empty where they have no names
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))

@@ -24,26 +24,13 @@ class WorldMarkers:
 
     Raises `PblError` FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with
     a confidence above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
-
-    Attributes
-    ----------
-    time_s : (T,) float64
-        Time stamps, finite.
-    names : tuple of J str
-        All different.
-    marker_set
-        Name of the marker set; for a laboratory's own, the stem of its table.
-    xyz_world_m : (T, J, 3) float64
-        World: right-handed, z up, metres; origin and heading are the laboratory's.
-    confidence : (T, J) float64
-        0..1.
     """
 
-    time_s: np.ndarray
-    names: tuple[str, ...]
-    marker_set: str
-    xyz_world_m: np.ndarray
-    confidence: np.ndarray
+    time_s: np.ndarray  # (T,) time stamps, finite
+    names: tuple[str, ...]  # all different
+    marker_set: str  # name of the marker set; for a laboratory's own, the stem of its table
+    xyz_world_m: np.ndarray  # (T, J, 3) world: right-handed, z up, metres; origin and heading are the laboratory's
+    confidence: np.ndarray  # (T, J) 0..1
 
     def __post_init__(self) -> None:
         for field in ("time_s", "xyz_world_m", "confidence"):

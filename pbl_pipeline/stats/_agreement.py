@@ -17,25 +17,14 @@ LIMIT_SD = 1.96
 
 @dataclasses.dataclass(frozen=True)
 class BlandAltman:
-    """Limits of agreement, in the unit of the values.
+    """Limits of agreement, in the unit of the values."""
 
-    Attributes
-    ----------
-    bias
-        Mean of a - b with Student's interval.
-    lower, upper
-        bias - and + 1.96 sd, each with its interval.
-    sd
-        Of the differences (n - 1).
-    n
-        Pairs.
-    """
-
-    bias: Estimate
+    bias: Estimate  # mean of a - b with Student's interval
+    #: bias - and + 1.96 sd, each with its interval.
     lower: Estimate
     upper: Estimate
-    sd: float
-    n: int
+    sd: float  # of the differences (n - 1)
+    n: int  # pairs
 
 
 def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:

@@ -23,49 +23,28 @@ _CHUNK = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Srm(Estimate):
-    """A standardised response mean.
+    """A standardised response mean."""
 
-    Attributes
-    ----------
-    jackknife, standard_error
-        Mean of the pseudo-values (the centre of the interval) and its standard error.
-    t, p
-        Of the mean pseudo-value against 0, with n - 1 degrees of freedom, two-sided.
-    n
-        Persons.
-    """
-
+    #: Mean of the pseudo-values (the centre of the interval) and its standard error.
     jackknife: float
     standard_error: float
+    #: Of the mean pseudo-value against 0, with n - 1 degrees of freedom, two-sided.
     t: float
     p: float
-    n: int
+    n: int  # persons
 
 
 @dataclasses.dataclass(frozen=True)
 class Wilcoxon:
-    """Wilcoxon's signed-rank test.
+    """Wilcoxon's signed-rank test."""
 
-    Attributes
-    ----------
-    statistic
-        Sum of the ranks of the positive changes.
-    p
-        Two-sided; exact for up to 50 persons without equal changes, by `scipy.stats.wilcoxon`.
-    n, zeros
-        Persons in all; those who did not change, whom the test leaves out.
-    effect
-        `effect_size` with its interval.
-    rank_biserial
-        Matched-pairs rank-biserial correlation: (positive - negative) / all ranks (Kerby 2014).
-    """
-
-    statistic: float
-    p: float
+    statistic: float  # sum of the ranks of the positive changes
+    p: float  # Two-sided; exact for up to 50 persons without equal changes, by `scipy.stats.wilcoxon`
+    #: Persons in all; those who did not change, whom the test leaves out.
     n: int
     zeros: int
-    effect: Estimate
-    rank_biserial: float
+    effect: Estimate  # `effect_size` with its interval
+    rank_biserial: float  # Matched-pairs rank-biserial correlation: (positive - negative) / all ranks (Kerby 2014)
 
 
 def srm(pre: Any, post: Any = None, confidence: float = 0.95) -> Srm:

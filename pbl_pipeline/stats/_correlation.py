@@ -16,21 +16,12 @@ CORRELATIONS = ("pearson", "spearman", "repeated")
 
 @dataclasses.dataclass(frozen=True)
 class Correlation(Estimate):
-    """A correlation coefficient.
+    """A correlation coefficient."""
 
-    Attributes
-    ----------
-    kind
-        One of `CORRELATIONS`.
-    p
-        Two-sided, against 0, by Student's t with `df` degrees of freedom.
-    n, persons
-        Pairs of values; persons that they are of (as many, unless "repeated").
-    """
-
-    kind: str
-    p: float
+    kind: str  # one of `CORRELATIONS`
+    p: float  # Two-sided, against 0, by Student's t with `df` degrees of freedom
     df: int
+    #: Pairs of values; persons that they are of (as many, unless "repeated").
     n: int
     persons: int
 

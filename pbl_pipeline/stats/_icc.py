@@ -24,26 +24,16 @@ _ROUNDING = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class Icc(Estimate):
-    """An intraclass correlation.
+    """An intraclass correlation."""
 
-    Attributes
-    ----------
-    kind
-        One of `ICC_KINDS`.
-    n, k
-        Subjects; ratings per subject, of which "1,k" to "3,k" are the mean: their harmonic mean where some are missing.
-    missing
-        How many ratings were NaN: with any, the variances are by REML.
-    sem
-        Standard error of measurement of one rating ("x,1") or of the mean of k ("x,k"), in the unit of the ratings: the
-        square root of the variance that is not the subjects', so sd sqrt(1 - ICC) (Weir 2005, J Strength Cond Res
-        19:231-240). Kinds 2 count the variance of the raters with it, kinds 3 do not.
-    """
-
-    kind: str
+    kind: str  # one of `ICC_KINDS`
+    #: Subjects; ratings per subject, of which "1,k" to "3,k" are the mean: their harmonic mean where some are missing.
     n: int
     k: float
-    missing: int
+    missing: int  # how many ratings were NaN: with any, the variances are by REML
+    #: Standard error of measurement of one rating ("x,1") or of the mean of k ("x,k"), in the unit of the ratings: the
+    #: square root of the variance that is not the subjects', so sd sqrt(1 - ICC) (Weir 2005, J Strength Cond Res
+    #: 19:231-240). Kinds 2 count the variance of the raters with it, kinds 3 do not.
     sem: float
 
     @property

@@ -17,27 +17,13 @@ _MOST = 1_000_000
 
 @dataclasses.dataclass(frozen=True)
 class SampleSize:
-    """What a study needs.
+    """What a study needs."""
 
-    Attributes
-    ----------
-    n
-        Persons who complete it: in all ("paired") or in each of two groups.
-    recruited
-        Persons to recruit (in each group) so that `n` are left after the drop-outs.
-    power
-        Reached with `n`.
-    effect
-        The change in units of `sd`.
-    sd
-        Standard deviation of what is compared: of the change, or of the values ("parallel").
-    """
-
-    n: int
-    recruited: int
-    power: float
-    effect: float
-    sd: float
+    n: int  # persons who complete it: in all ("paired") or in each of two groups
+    recruited: int  # persons to recruit (in each group) so that `n` are left after the drop-outs
+    power: float  # reached with `n`
+    effect: float  # the change in units of `sd`
+    sd: float  # standard deviation of what is compared: of the change, or of the values ("parallel")
 
 
 def sample_size(

@@ -26,25 +26,14 @@ _HOLM = "p, Holm: corrected for those"
 
 @dataclasses.dataclass(frozen=True)
 class PageTable:
-    """A table as it is shown.
+    """A table as it is shown."""
 
-    Attributes
-    ----------
-    name
-        Stem of its files.
-    title, note
-        What it shows; how to read it.
-    body
-        Texts; its columns may have two levels.
-    messages
-        Why cells without a number have none: (mark of the cells, text).
-    """
-
-    name: str
+    name: str  # stem of its files
+    #: What it shows; how to read it.
     title: str
     note: str
-    body: pd.DataFrame
-    messages: tuple[tuple[str, str], ...] = ()
+    body: pd.DataFrame  # texts; its columns may have two levels
+    messages: tuple[tuple[str, str], ...] = ()  # why cells without a number have none: (mark of the cells, text)
 
     def head(self) -> list[list[tuple[str, int]]]:
         """Rows of the head: (text, columns that it spans)."""

@@ -22,17 +22,10 @@ class CameraPose:
     """Extrinsics of one camera, validated when made.
 
     Raises `PblError` CAMERA_INVALID: other shapes, not finite, R not a rotation.
-
-    Attributes
-    ----------
-    R_nc : (3, 3) float64
-        Turns camera vectors (x right, y down, z forward) into world vectors (z up).
-    p_nc : (3,) float64
-        The camera's position in the world, m.
     """
 
-    R_nc: np.ndarray
-    p_nc: np.ndarray
+    R_nc: np.ndarray  # (3, 3) turns camera vectors (x right, y down, z forward) into world vectors (z up)
+    p_nc: np.ndarray  # (3,) the camera's position in the world, m
 
     def __post_init__(self) -> None:
         try:
