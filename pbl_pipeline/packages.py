@@ -133,6 +133,5 @@ class NpmPackage(Package):
 
 
 def _lines(text: str, *starts: str) -> list[str]:
-    """The lines that begin so; of npm's, what follows."""
     found = [line.strip() for line in text.splitlines() if line.strip().startswith(starts)]
     return [line.removeprefix("npm ERR!").removeprefix("npm error").strip() for line in found]

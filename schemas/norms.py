@@ -154,7 +154,6 @@ def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dic
 
 
 def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[str]]:
-    """The library's cycles with their curves, and whose each is."""
     cycles, people = [], []
     for key in keys:
         found = gait.load_cycles({k: key[k] for k in gait.GaitCycle.primary_key}, str(key["video_id"]))

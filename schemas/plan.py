@@ -120,7 +120,6 @@ def plan_anew(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _with_unusable() -> Any:
-    """Sets (with `session_id`) that hold a recording which is marked as not usable."""
     return fit.FitSet.proj("session_id") & (fit.FitSet.Video & video.NotUsable).proj()
 
 

@@ -330,7 +330,6 @@ def registered_video(video_id: int) -> dict[str, Any]:
 
 
 def unknown_video(video_id: int) -> PblError:
-    """DB_NOT_FOUND for a number that no video has."""
     return PblError(
         "DB_NOT_FOUND",
         found=f"no video_id {video_id}",

@@ -105,7 +105,6 @@ def populate(
 
 
 def _ready(tables: Sequence[Any], limit: int | None) -> int:
-    """How many jobs can be taken now."""
     counts = [len(jobs_of(t).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)") for t in tables]
     return sum(n if limit is None else min(n, limit) for n in counts)
 

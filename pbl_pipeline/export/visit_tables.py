@@ -132,7 +132,6 @@ def joint_sign(joint: str) -> str:
 
 
 def _repeated(texts: Sequence[str], n: int) -> Labels:
-    """Each text n times."""
     one = Labels.of(texts)
     return Labels(np.repeat(one.codes, n), one.texts)
 

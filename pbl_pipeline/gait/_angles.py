@@ -44,7 +44,6 @@ class AngleSeries:
     sd: dict[str, dict[str, np.ndarray]] = dataclasses.field(default_factory=dict)
 
     def of_side(self, side: str) -> dict[str, np.ndarray]:
-        """The angles of "left" or "right"."""
         return self.right if side == RIGHT else self.left
 
 

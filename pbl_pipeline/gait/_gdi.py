@@ -393,7 +393,6 @@ def _changes(
 
 
 def _of_mean(values: np.ndarray) -> float:
-    """Variance of the mean of values."""
     return float(np.var(values, ddof=min(1, len(values) - 1))) / len(values)
 
 

@@ -212,7 +212,6 @@ def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
 
 
 def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
-    """(..., 2) of scores (..., 2K)."""
     return norm.index_of_scores(scores.reshape(*scores.shape[:-1], 2, -1))
 
 

@@ -317,7 +317,6 @@ def _gap(motion: TaskMotion, begin_s: float, end_s: float) -> str:
 
 
 def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angle between vectors (..., 3) in degrees."""
     cosine = (a * b).sum(axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 

@@ -84,7 +84,6 @@ def _count(path: str | Path, header: dict[str, str], name: str) -> int:
 
 
 def _numbers(path: str | Path, number: int, line: str, n_cells: int) -> np.ndarray:
-    """One row; empty cells are NaN."""
     cells = _cells(line)
     if len(cells) < n_cells or any(cells[n_cells:]):
         raise _damaged(path, f"line {number}: {len(cells)} cells", f"{n_cells} cells between tabs")

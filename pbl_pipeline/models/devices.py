@@ -53,7 +53,6 @@ def device_of(providers: Sequence[str]) -> str:
 
 
 def unavailable(found: str) -> PblError:
-    """DEVICE_UNAVAILABLE about CUDA."""
     return PblError(
         "DEVICE_UNAVAILABLE",
         found=found,

@@ -99,7 +99,6 @@ def _norm(visit: Visit) -> NormativeSet | None:
 
 
 def _bands(visit: Visit) -> NormalBands:
-    """Return the normal curves at the person's speed."""
     fit = next((r.fit for r in visit.fitted), None)
     leg = None if fit is None else leg_length_m(fit.scale)
     return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal, leg)
@@ -360,7 +359,6 @@ _EVENT_NOTES = {
 
 
 def _event_methods(visit: Visit) -> list[str]:
-    """Return the event methods of the trials, each once."""
     trials = () if visit.measures is None else visit.measures.trials
     return [m for m in dict.fromkeys(t.events.method for t in trials) if m in _EVENT_NOTES]
 

@@ -256,5 +256,4 @@ def _row(frame: Any, where: Any, key: tuple[str, ...]) -> str:
 
 
 def invalid(frame: str, found: str, expected: str, next_step: str) -> PblError:
-    """A `PblError` STUDY_INVALID about a frame."""
     return PblError("STUDY_INVALID", found=found, expected=expected, next_step=next_step, key=frame)

@@ -406,7 +406,6 @@ def comparison_of(result: Any) -> str:
 
 
 def _one(frame: pd.DataFrame, **values: str) -> dict[str, Any] | None:
-    """The row with these values."""
     found: Any = frame
     for column, value in values.items():
         found = found[found[column] == value]

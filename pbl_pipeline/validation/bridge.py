@@ -74,7 +74,6 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
 
 
 def _method(name: str, stages: Mapping[str, Stage[Any]]) -> tuple[str, Method[Any]]:
-    """The stage and the method of a name or key."""
     for stage, methods in stages.items():
         for method in methods.values():
             if name in (method.name, method.key):

@@ -270,7 +270,6 @@ _Cell = Callable[[Any], Cell]
 
 
 def _cells(rows: Mapping[str, _Cell], columns: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """Return the cell of each row of each part of a frame."""
     return {(row, name): cell(part) for row, cell in rows.items() for name, part in columns.items()}
 
 
@@ -295,7 +294,6 @@ _OF_JOINTS = {label: _over("median_abs_deg", joint) for label, joint in ROWS_PAP
 def _table(
     name: str, title: str, cells: Mapping[tuple[str, str], Cell], note: str, digits: dict[str, int] | None = None
 ) -> Table:
-    """Return a table with the paper's figures put in."""
     paper = paper_cells(name)
     filled = {}
     for (row, column), cell in cells.items():

@@ -340,7 +340,6 @@ def _picture_bytes(stream: av.VideoStream) -> int:
 
 
 def _words(error: BaseException) -> str:
-    """What FFmpeg says."""
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 

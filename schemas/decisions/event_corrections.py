@@ -164,7 +164,6 @@ def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str)
 
 
 def _of_events(key: Mapping[str, Any]) -> dict[str, Any]:
-    """The trial and the method whose events are corrected, of a key of GaitEvents."""
     return {k: key[k] for k in ("video_id", "gait_method")}
 
 
@@ -176,7 +175,6 @@ def _standing(key: Mapping[str, Any]) -> list[Person]:
 
 
 def _insert(key: Mapping[str, Any], person: Person, by: str, **columns: Any) -> dict[str, Any]:
-    """Insert the next correction; returns its key."""
     of_events = _of_events(key)
     number = of_events | {"correction_no": 1 + len(gait.EventCorrection & of_events)}
     gait.EventCorrection.insert1(

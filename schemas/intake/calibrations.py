@@ -161,7 +161,6 @@ def calibrations() -> list[dict[str, Any]]:
 
 
 def _device(lens: PhoneLens) -> str:
-    """Short name of a lens's device, which is registered where it is new."""
     columns = lab.device_columns(lens)
     known = (lab.Device & columns).keys()
     if known:

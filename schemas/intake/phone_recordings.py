@@ -261,7 +261,6 @@ def refused(number: int, error: PblError) -> None:
 
 
 def upload_refused(found: str, next_step: str = "film again; if it happens again, report it") -> PblError:
-    """Return a `PblError` UPLOAD_REFUSED about what a phone sends."""
     return PblError(
         "UPLOAD_REFUSED",
         found=found,

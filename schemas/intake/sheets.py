@@ -24,8 +24,6 @@ from ..subject_codes import folded
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A row of a sheet."""
-
     where: str  # for errors
     cells: dict[str, str]  # those that are not empty, by column
     error: PblError | None = None  # of the row as a whole

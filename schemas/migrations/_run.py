@@ -34,7 +34,6 @@ class Migration:
 
     @property
     def title(self) -> str:
-        """Number and name."""
         return title(self.number, self.name)
 
 

@@ -241,7 +241,6 @@ def _snapshot(server: pymysql.Connection[Any]) -> str:
 
 
 def _videos(server: pymysql.Connection[Any], prefix: str) -> list[tuple[str, str]]:
-    """Return path and SHA-256 of the registered videos."""
     with server.cursor() as cursor:
         cursor.execute(f"SELECT video_path, video_sha256 FROM {quote(f'{prefix}_video', 'video')}")  # noqa: S608
         return [(str(path), str(sha)) for path, sha in cursor.fetchall()]

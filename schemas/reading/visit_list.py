@@ -439,7 +439,6 @@ def _unusable() -> str:
 
 
 def _is_usable(alias: str) -> str:
-    """Condition on a table with `video_id`."""
     return f"NOT EXISTS (SELECT 1 FROM {_name(video.NotUsable)} u WHERE u.video_id = {alias}.video_id)"
 
 

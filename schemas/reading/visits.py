@@ -303,7 +303,6 @@ def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLo
 
 
 def _kind_of(row: Mapping[str, Any], trial_of: Mapping[int, int]) -> str:
-    """Return the kind of set that a recording (row of Video) belongs to."""
     if row["camera_motion"] == video.NO_CAMERA:
         return fit.MARKERS
     return fit.RIG if int(row["video_id"]) in trial_of else fit.SINGLE

@@ -295,7 +295,6 @@ def _tasks(visit: Visit) -> dict[str, dict[str, tuple[Measure | None, str]]]:
 
 
 def _subject(visit: Visit) -> str:
-    """Return the code of the person; empty where the files do not have one."""
     return "" if visit.subject == "-" else visit.subject
 
 

@@ -51,7 +51,6 @@ class Folder:
 
     @staticmethod
     def default() -> Folder:
-        """The folder in `settings.home_dir()`."""
         return Folder(settings.home_dir() / "db")
 
     @property
