@@ -68,8 +68,6 @@ def populate(
     ----------
     tables
         Names of the tables to visit (default: all).
-    limit
-        Most computations per table.
     retry_errors
         Clear error rows first, so that their keys are tried again.
     visit

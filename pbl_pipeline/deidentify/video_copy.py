@@ -128,8 +128,6 @@ def deidentify(
         The recording, and an .mp4 file.
     how
         "blur", "pixelate", or "skeleton": the bodies' keypoints on black.
-    overwrite
-        Replace files of these names.
     params, info, heads
         How heads are found; what `video.probe` said; heads that were found before.
     """

@@ -112,14 +112,10 @@ def render_overlay(
 
     Parameters
     ----------
-    video_path
-        The recording the fit was made from.
     fit
         One trial; its frames are those of the video.
     out_path
         An .mp4 file; written beside it first and moved when complete, so that no half file is left under this name.
-    keypoints
-        Detected points, drawn as small dots.
     events
         Foot contacts of this trial, `GaitEvents.events`.
     max_side_px

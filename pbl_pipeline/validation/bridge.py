@@ -46,13 +46,6 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
     separate folder below `folder`, which another version can then be compared with.
 
     Raises `PblError` SOLVER_UNKNOWN for a name that no method has, and what fitting and measuring raise.
-
-    Parameters
-    ----------
-    name
-        Of a method of the fit, the events or the index.
-    done
-        Called after each recording.
     """
     from pbl_pipeline.fit import METHODS, default_fit, fit_session
 

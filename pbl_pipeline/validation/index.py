@@ -52,11 +52,6 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
     """Pearson's r, bias and limits of agreement of the index of one camera and of several.
 
     Raises `PblError` STATS_INPUT: fewer than four visits, or indices that are all the same.
-
-    Parameters
-    ----------
-    pairs
-        One row per visit, with `PAIR_COLUMNS`; both indices known.
     """
     one, several = (pairs[k].to_numpy(float) for k in ("single", "rig"))
     r, agreement, n = correlation(one, several), bland_altman(one, several), len(pairs)

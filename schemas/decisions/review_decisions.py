@@ -86,8 +86,6 @@ def decide_person(
     ----------
     tracking_method
         Tracking in which the person has this number; needed where several methods track the video.
-    by
-        Name of who decides.
     seen
         `person_state` of the page on which it was decided; None where nothing was shown.
 
@@ -132,8 +130,6 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     ----------
     reason, note
         One of `words.UNUSABLE`, and more in free words (no names), which "other" asks for.
-    by
-        Name of who decides.
     seen
         `usable_state` of the page on which it was decided; None: whatever it is.
     """

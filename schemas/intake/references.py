@@ -129,13 +129,9 @@ def add_reference(
     ----------
     about
         The video: its number, its path, or the name of its file where that is unique.
-    path
-        The reference, see `read_reference`.
     dataset, source, origin
         Collection it is reported with (None: as it was, else "unnamed"), instrument (None: what the file says), where
         it comes from (None: the path).
-    shift_s
-        As in `read_reference`.
     """
     from pbl_pipeline.video import sha256_of
 

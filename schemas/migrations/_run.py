@@ -65,8 +65,6 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     ----------
     dry_run
         Change nothing, return what would be done.
-    say
-        Called with each statement before it is executed.
     """
     refuse_newer()
     if dry_run:

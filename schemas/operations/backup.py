@@ -74,8 +74,6 @@ def backup(
         Must not exist, or be empty.
     store
         False leaves the files out, where the object store is saved by other means.
-    say
-        Called with a sentence for each step.
     with_recordings
         Also save the registered videos. One that is gone or changed is left out and named.
     previous
@@ -185,12 +183,8 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
 
     Parameters
     ----------
-    folder
-        A folder that `backup` made.
     again
         After an interrupted restore: remove the tables it left, then start again.
-    say
-        Called with a sentence for each step.
     """
     manifest = check(folder, say)
     connection.connect(start=True)  # a new place has no server yet

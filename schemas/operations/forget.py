@@ -102,12 +102,8 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
 
     Parameters
     ----------
-    subject
-        Code of the person.
     videos
         Delete the video files as well, where they still are what was registered.
-    say
-        Called with a sentence for each step.
     """
     try:
         with worker.alone(archive.LOCK, connection.connect()) as obtained:

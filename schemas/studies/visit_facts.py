@@ -64,8 +64,6 @@ def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict
     ----------
     values
         Text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
-    by
-        Name of who registers it.
 
     Returns
     -------

@@ -81,8 +81,6 @@ def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_change
 
     Parameters
     ----------
-    detected
-        The events that the method found.
     events
         All events that there are now, as `check_correction` returned them.
     n_changed

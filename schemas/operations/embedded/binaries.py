@@ -75,11 +75,6 @@ def get_server(say: Say = silent) -> Binaries:
     """The server of this machine, fetched with apt when it is absent.
 
     Raises `PblError` DB_UNAVAILABLE with the reason and the remedy.
-
-    Parameters
-    ----------
-    say
-        Called with a sentence for each step.
     """
     found = find_server()
     if found:

@@ -43,13 +43,6 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     Raises `PblError` DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start
     (with its last log lines).
 
-    Parameters
-    ----------
-    say
-        Called with a sentence for each step.
-    folder
-        Where; default `settings.home_dir()/db`.
-
     Returns
     -------
     Status
