@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import PASS, WARN, Check
+from pbl_pipeline.qc import Check, warn_if
 
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
@@ -75,22 +75,12 @@ def norm_from_cycles(
         pooled=np.array([_vector(c, variables, at) for c in others]) if others else None,
         angle_model=model,
     )
-    few, most = len(counts) < ADVISED_PEOPLE, max(counts.values()) / len(known)
+    n, most = len(counts), max(counts.values()) / len(known)
+    few = "few people: the set says how these walk, not how healthy people do"
+    leans = "one person has a large part of the cycles: the set leans towards that gait"
     return norm, (
-        Check(
-            "norm_people",
-            WARN if few else PASS,
-            float(len(counts)),
-            float(ADVISED_PEOPLE),
-            "few people: the set says how these walk, not how healthy people do" if few else "",
-        ),
-        Check(
-            "norm_share_of_one_person",
-            WARN if most > MAX_SHARE else PASS,
-            round(most, 3),
-            MAX_SHARE,
-            "one person has a large part of the cycles: the set leans towards that gait" if most > MAX_SHARE else "",
-        ),
+        warn_if(n < ADVISED_PEOPLE, "norm_people", float(n), float(ADVISED_PEOPLE), few),
+        warn_if(most > MAX_SHARE, "norm_share_of_one_person", round(most, 3), MAX_SHARE, leans),
     )
 
 
