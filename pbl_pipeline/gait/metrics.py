@@ -223,6 +223,8 @@ def pool_trials(
 ) -> SessionMetrics:
     """Measures and index of a session over all used cycles of its pooled trials.
 
+    Returns EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
+
     Parameters
     ----------
     trials
@@ -231,11 +233,6 @@ def pool_trials(
         Norm and method of the index (`score_gdi`); `params.events` only enters `params_hash`.
     conditions
         What is done in each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
-
-    Returns
-    -------
-    SessionMetrics
-        EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
     """
     given = [Condition()] * len(trials) if conditions is None else conditions
     pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]

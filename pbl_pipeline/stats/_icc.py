@@ -86,6 +86,9 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     could have a share; for the mean of k ratings also means of the subjects that differ so little that it is not
     defined.
 
+    Returns `Icc`, with low <= value <= high <= 1. A value is negative where subjects differ less than error alone would
+    make them; `low` of a mean of k is -inf where the ratings put no lower bound on it.
+
     Parameters
     ----------
     ratings : (n, k)
@@ -100,12 +103,6 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
         "f" as above. "generalized": from draws of the mean squares, with `seed` (Weerahandi 1993, J Am Stat Assoc
         88:899-905; compared by Ionan et al. 2014, BMC Med Res Methodol 14:121). For kinds 2 with few raters whose means
         differ: there "f" holds the truth in as few as 80 % of studies (docs/statistics.md).
-
-    Returns
-    -------
-    Icc
-        With low <= value <= high <= 1. A value is negative where subjects differ less than error alone would make them;
-        `low` of a mean of k is -inf where the ratings put no lower bound on it.
     """
     one_of(kind, ICC_KINDS, "kind")
     one_of(interval, ICC_INTERVALS, "interval")

@@ -151,18 +151,15 @@ def _shifts(pairs: pd.DataFrame) -> Iterator[tuple[str, int, np.ndarray]]:
 def touched(visits: pd.DataFrame) -> pd.DataFrame:
     """Return the pairs of successive visits of a person that a change of method touches.
 
+    Returns `subject, before, visit, what`: "across" where the one has only a result by the old and the other only one
+    by the new, which cannot be compared; "old" where both have only old ones, which compare with each other but not
+    with later visits.
+
     Parameters
     ----------
     visits
         One row per visit with a result by either, in the order of their days: `subject`, `visit`, and whether it has
         one by `old` and by `new`.
-
-    Returns
-    -------
-    frame
-        `subject, before, visit, what`: "across" where the one has only a result by the old and the other only one by
-        the new, which cannot be compared; "old" where both have only old ones, which compare with each other but not
-        with later visits.
     """
     rows = []
     for subject, own in visits.groupby("subject", sort=False):

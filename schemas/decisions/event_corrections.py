@@ -93,17 +93,14 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
     Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without
     events; USAGE where nothing was changed.
 
+    Returns the number of deleted rows by table.
+
     Parameters
     ----------
     events
         Time (s), side and kind of all events that there are now.
     seen
         `Shown.state` of the page on which they were set.
-
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
 

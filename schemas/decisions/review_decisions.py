@@ -82,17 +82,14 @@ def decide_person(
     Raises `PblError` DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
     `selection_of` raises.
 
+    Returns the number of deleted rows by table, which the next populate computes anew.
+
     Parameters
     ----------
     tracking_method
         Tracking in which the person has this number; needed where several methods track the video.
     seen
         `person_state` of the page on which it was decided; None where nothing was shown.
-
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows, which the next populate computes anew.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction

@@ -39,11 +39,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     apply to the kind of recording; FIT_INPUT for a height; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set;
     SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Nothing is registered then.
 
-    Returns
-    -------
-    list of Registered
-        One for each file, in their order. Missing, empty and unreadable files are refused with their error, all videos
-        of a trial of several cameras together; the other recordings are registered.
+    Returns a `Registered` for each file, in their order. Missing, empty and unreadable files are refused with their
+    error, all videos of a trial of several cameras together; the other recordings are registered.
     """
     recordings, named = list(recordings), methods or Methods()
     for recording in recordings:

@@ -51,11 +51,8 @@ def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -
 
     Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
 
-    Returns
-    -------
-    GaitEvents
-        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot is
-        never seen, or the person walks backwards.
+    The status is PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot
+    is never seen, or the person walks backwards.
     """
     p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)

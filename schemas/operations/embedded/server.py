@@ -43,10 +43,7 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     Raises `PblError` DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start
     (with its last log lines).
 
-    Returns
-    -------
-    Status
-        With `running` True.
+    Returns `Status`, with `running` True.
     """
     folder = folder or Folder.default()
     if running_pid(folder) is None:
@@ -74,15 +71,12 @@ def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = Fals
 
     Raises `PblError` DB_REFUSED when it does not end within a minute.
 
+    Returns True when one was running.
+
     Parameters
     ----------
     on_demand
         The next connection starts it again (`starts_on_demand`), until it is stopped without this.
-
-    Returns
-    -------
-    bool
-        True when one was running.
     """
     folder = folder or Folder.default()
     if not folder.initialised():
