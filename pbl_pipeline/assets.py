@@ -65,8 +65,9 @@ def _listed() -> dict[str, Asset]:
     content = tomllib.loads(resources.files("pbl_pipeline").joinpath("assets.toml").read_text(encoding="utf-8"))
     packages: dict[str, Package] = {}
     for name, given in content["packages"].items():
-        options = {"pip_options": tuple(given.pop("pip_options"))} if "pip_options" in given else {}
-        packages[name] = CLIENTS[given.pop("client")](**given, **options)
+        if "pip_options" in given:
+            given["pip_options"] = tuple(given["pip_options"])
+        packages[name] = CLIENTS[given.pop("client")](**given)
     assets = [Asset(**{**given, "package": packages[given["package"]]}) for given in content["assets"]]
     return {asset.name: asset for asset in assets}
 
