@@ -9,7 +9,8 @@ import griffe
 
 
 class OurDocstrings(griffe.Extension):
-    """The `#:` comment above a constant documents it; docstring and signature of a dataclass document its fields."""
+    """The `#:` comment above a constant or field documents it, or what stands behind the field; docstring and signature
+    of a dataclass document its other fields."""
 
     def on_module_members(self, *, node: ast.AST | griffe.ObjectNode, mod: griffe.Module, **_: Any) -> None:
         """Adds what griffe leaves out: the names of `LEFT, RIGHT = "left", "right"`."""
@@ -25,15 +26,18 @@ class OurDocstrings(griffe.Extension):
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
         """Called by griffe for every attribute that it has collected."""
-        if attr.docstring or not attr.lineno or not isinstance(attr.parent, griffe.Module):
+        if attr.docstring or not attr.lineno or not isinstance(attr.parent, griffe.Module | griffe.Class):
             return
         path = attr.parent.filepath
         lines = attr.parent.lines_collection[path] if not isinstance(path, list) else []
         comment: list[str] = []
-        for line in reversed(lines[: attr.lineno - 1]):
+        for line in map(str.strip, reversed(lines[: attr.lineno - 1])):
             if not line.startswith("#:"):
                 break
             comment.insert(0, line.removeprefix("#:").strip())
+        if isinstance(attr.parent, griffe.Class) and not comment:
+            behind = lines[attr.lineno - 1].partition("  # ")[2]
+            comment = [behind] if behind and not behind.startswith(("pyright", "type:", "noqa")) else []
         if comment:
             attr.docstring = griffe.Docstring("\n".join(comment), lineno=attr.lineno - len(comment), parent=attr)
 

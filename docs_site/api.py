@@ -29,17 +29,17 @@ MODULES: dict[str, tuple[str, ...]] = {
 
 
 def public(root: Path) -> dict[str, list[str]]:
-    """Package or module -> its public names: `__all__`, or what it defines without an underscore."""
+    """Package or module -> its public names: what it defines or a package imports from here, without an underscore."""
     found: dict[str, list[str]] = {}
     for file in sorted((root / "pbl_pipeline").rglob("__init__.py")):
         name = ".".join(file.parent.relative_to(root).parts)
-        names = _all(file)
+        names = _offered(file)
         if names and name != "pbl_pipeline.cli":  # the commands have pages of their own
             found[name] = names
     for name, names in MODULES.items():
         path = root.joinpath(*name.split("."))
         file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        found[name] = list(names) or _all(file) or _defined(file)
+        found[name] = list(names) or _offered(file)
     return dict(sorted(found.items()))
 
 
@@ -64,14 +64,13 @@ def pages(root: Path) -> dict[str, str]:
     return found
 
 
-def _all(file: Path) -> list[str]:
+def _offered(file: Path) -> list[str]:
+    offered = []
     for node in ast.parse(file.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets):
-            return list(ast.literal_eval(node.value))
-    return []
-
-
-def _defined(file: Path) -> list[str]:
-    kinds = (ast.FunctionDef, ast.ClassDef)
-    body = ast.parse(file.read_text(encoding="utf-8")).body
-    return [node.name for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            offered.append(node.name)
+        elif not isinstance(node, ast.ImportFrom) or file.name != "__init__.py":
+            continue
+        elif node.level or str(node.module).startswith("pbl_pipeline."):
+            offered += [alias.asname or alias.name for alias in node.names]
+    return [n for n in offered if not n.startswith("_")]

@@ -12,7 +12,9 @@ import hashlib
 import os
 import subprocess
 import threading
+import tomllib
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 
 from pbl_pipeline.temporary import new_folder
@@ -20,7 +22,7 @@ from pbl_pipeline.temporary import new_folder
 from . import progress, settings
 from .errors import PblError
 from .files import one_process
-from .packages import NpmPackage, Package, Wheel
+from .packages import CLIENTS, Package
 
 #: Longest that a download may take (s); the largest package has 51 MB.
 _TIMEOUT_S = 1200.0
@@ -59,146 +61,19 @@ class AssetStatus:
     state: str
 
 
-# The wheel of one platform for every machine: its models are plain data, and newer wheels carry none.
-_MEDIAPIPE = Wheel(
-    requirement="mediapipe==0.10.21",
-    filename="mediapipe-0.10.21-cp311-cp311-manylinux_2_28_x86_64.whl",
-    sha256="05dc4a9e593655a79558d05d6227d31018c2537a4bd3362b51e230cf22aecfe3",
-    size_bytes=35_622_638,
-    pip_options=(
-        *("--only-binary=:all:", "--platform", "manylinux_2_28_x86_64"),
-        *("--python-version", "311", "--implementation", "cp", "--abi", "cp311"),
-    ),
-)
-_SPORTS2D = Wheel(
-    requirement="sports2d==0.8.34",
-    filename="sports2d-0.8.34-py3-none-any.whl",
-    sha256="733b6db70742636ae9c35d870c22bd416582f579abd5881bee93a14bb0e2655d",
-    size_bytes=9_050_415,
-    # Named so that pip takes the wheel whatever Python asks; 311 is within the range the package declares.
-    pip_options=("--only-binary=:all:", "--python-version", "311"),
-)
-_MEDIAPIPE_POSE = NpmPackage(
-    requirement="@mediapipe/pose@0.5.1675469404",
-    filename="mediapipe-pose-0.5.1675469404.tgz",
-    sha256="8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84",
-    size_bytes=40_985_403,
-)
-_POSE2SIM = Wheel(
-    requirement="pose2sim==0.10.49",
-    filename="pose2sim-0.10.49-py3-none-any.whl",
-    sha256="403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
-    size_bytes=51_189_031,
-    pip_options=("--only-binary=:all:", "--python-version", "311"),
-)
+def _listed() -> dict[str, Asset]:
+    content = tomllib.loads(resources.files("pbl_pipeline").joinpath("assets.toml").read_text(encoding="utf-8"))
+    packages: dict[str, Package] = {}
+    for name, given in content["packages"].items():
+        if "pip_options" in given:
+            given["pip_options"] = tuple(given["pip_options"])
+        packages[name] = CLIENTS[given.pop("client")](**given)
+    assets = [Asset(**{**given, "package": packages[given["package"]]}) for given in content["assets"]]
+    return {asset.name: asset for asset in assets}
 
-_BLAZEPOSE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204")
-_BLAZEFACE = ("Apache-2.0", "MediaPipe 0.10.21, Google LLC; Bazarevsky et al. 2019, arXiv:1907.05047")
-_AUGMENTER = ("BSD-3-Clause", "Pose2Sim 0.10.49, David Pagnon; OpenCap 0.3, Falisse et al. 2025, IEEE TBME 72:2013")
-_DEMO = ("BSD-3-Clause", "Sports2D 0.8.34, David Pagnon; doi:10.21105/joss.06849")
 
-#: Every asset by name, optional ones included (`needed`).
-ASSETS: dict[str, Asset] = {
-    asset.name: asset
-    for asset in (
-        Asset(
-            "blazepose_detector",
-            "person detector (BlazePose)",
-            _MEDIAPIPE,
-            "mediapipe/modules/pose_detection/pose_detection.tflite",
-            "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c",
-            2_959_046,
-            *_BLAZEPOSE,
-        ),
-        Asset(
-            "blazepose_landmarks",
-            "33 body landmarks (BlazePose, full)",
-            _MEDIAPIPE,
-            "mediapipe/modules/pose_landmark/pose_landmark_full.tflite",
-            "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f",
-            6_440_512,
-            *_BLAZEPOSE,
-        ),
-        Asset(
-            "blazepose_landmarks_heavy",
-            "33 body landmarks (BlazePose, heavy)",
-            _MEDIAPIPE_POSE,
-            "package/pose_landmark_heavy.tflite",
-            "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe",
-            27_709_200,
-            "Apache-2.0",
-            "@mediapipe/pose 0.5.1675469404, Google LLC; Bazarevsky et al. 2020, arXiv:2006.10204",
-        ),
-        Asset(
-            "face_detector",
-            "faces near and far (BlazeFace, full range)",
-            _MEDIAPIPE,
-            "mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite",
-            "2c3728e6da56f21e21a320433396fb06d40d9088f2247c05e5635a688d45dfe1",
-            676_746,
-            *_BLAZEFACE,
-            optional=True,
-        ),
-        Asset(
-            "face_detector_near",
-            "faces in a close view (BlazeFace, short range)",
-            _MEDIAPIPE,
-            "mediapipe/modules/face_detection/face_detection_short_range.tflite",
-            "bbff11cebd1eb27a1e004cae0b0e63ec8c551cbf34a4451148b4908b8db3eca8",
-            229_714,
-            *_BLAZEFACE,
-            optional=True,
-        ),
-        Asset(
-            "augmenter_network",
-            "marker augmenter (OpenCap, 35 markers)",
-            _POSE2SIM,
-            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/model.onnx",
-            "8dbd686784f6c6e3b42fdfe968a8808a789bdcaff284e3dd9e8c321bbca4e52c",
-            2_080_428,
-            *_AUGMENTER,
-            file="marker_augmenter.onnx",
-        ),
-        Asset(
-            "augmenter_mean",
-            "mean of the marker augmenter's inputs",
-            _POSE2SIM,
-            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/mean.npy",
-            "e8783601a37f827c728bb1f2bbb143d66f59c92a3268306697cfc2932e99888f",
-            504,
-            *_AUGMENTER,
-            file="marker_augmenter_mean.npy",
-        ),
-        Asset(
-            "augmenter_std",
-            "standard deviation of the marker augmenter's inputs",
-            _POSE2SIM,
-            "Pose2Sim/MarkerAugmenter/LSTM/v0.3_lower/std.npy",
-            "e7bcbe84f460666696fb500663a281c418ed20205aab9d8e1b18fd8568c77436",
-            504,
-            *_AUGMENTER,
-            file="marker_augmenter_std.npy",
-        ),
-        Asset(
-            "demo_video",
-            "demo recording: a woman walks, a man jumps",
-            _SPORTS2D,
-            "Sports2D/Demo/demo.mp4",
-            "d9a66417185647b112304b57093f0c180f37a768e6a14daca75ca541f3b78039",
-            3_968_304,
-            *_DEMO,
-        ),
-        Asset(
-            "demo_camera",
-            "camera of the demo recording",
-            _SPORTS2D,
-            "Sports2D/Demo/Calib_demo.toml",
-            "77a9b2a0e921873ddce4b3b00842500564fd7b2aabe91498a1a3db16304c8b37",
-            369,
-            *_DEMO,
-        ),
-    )
-}
+#: Every asset by name, optional ones included (`needed`); they stand in assets.toml.
+ASSETS = _listed()
 
 
 def needed() -> list[str]:
@@ -209,10 +84,7 @@ def needed() -> list[str]:
 def folder() -> Path:
     """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
 
-    Raises
-    ------
-    PblError
-        ASSET_MISSING: the folder cannot be made.
+    Raises `PblError` ASSET_MISSING: the folder cannot be made.
     """
     try:
         path = settings.cache_dir() / "assets"

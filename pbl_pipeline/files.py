@@ -27,11 +27,8 @@ _WIDEST_PX = 100_000
 def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:
     """Those of `fields` that an .npz file has. Reads no other array and never unpickles.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such file, or it cannot be read. FILE_FORMAT: not an .npz, damaged, with pickled objects, or
-        more than `bounded.MAX_ARRAYS`.
+    Raises `PblError` FILE_MISSING: no such file, or it cannot be read. FILE_FORMAT: not an .npz, damaged, with pickled
+    objects, or more than `bounded.MAX_ARRAYS`.
     """
     with _coded(path):
         return read_npz(path, fields)

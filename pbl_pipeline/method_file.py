@@ -23,11 +23,8 @@ def read_method(path: Path) -> Method[Any]:
     """The method that a file describes, as version 1: `stage` (else: fit), `name` (else: that of the file), `base`, the
     method whose parameters are changed (else: the stage's default), and the changes, group by group.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, FILE_FORMAT: no such file or JSON object, a stage, base or parameter that there is not, a value of
-        another type, a name that ships or is none.
+    Raises `PblError` FILE_MISSING, FILE_FORMAT: no such file or JSON object, a stage, base or parameter that there is
+    not, a value of another type, a name that ships or is none.
     """
     base = "a method"
     try:

@@ -42,10 +42,8 @@ def of_stage(name: str) -> Stage[Any]:
 def stored(*, stage: str, name: str, version: int, params: Mapping[str, Any], sha: str) -> Method[Any]:
     """The method of a row of a method table, checked against the row's hash.
 
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN where this version has no such function or parameters, or where somebody edited the row.
+    Raises `PblError` SOLVER_UNKNOWN where this version has no such function or parameters, or where somebody edited the
+    row.
     """
     method: Method[Any] = of_stage(stage).of(Paramset(stage, name, version, params))
     if method.hash != sha:
@@ -186,10 +184,7 @@ class Stage(Mapping[str, Method[P]]):
         """The method that is meant: by name, also with its version (`zeni-2008-v1`), or of the machine's provider; a
         paramset; a family's own parameters; None for the default.
 
-        Raises
-        ------
-        PblError
-            SOLVER_UNKNOWN; what the provider raises.
+        Raises `PblError` SOLVER_UNKNOWN; what the provider raises.
         """
         if given is None:
             return self[self.default]

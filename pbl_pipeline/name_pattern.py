@@ -22,11 +22,8 @@ def read_names(text: str, paths: Sequence[Path]) -> tuple[tuple[str, ...], list[
     The pattern is a regular expression of Python with named groups. Some take years for a short name, so they are
     matched in a process with limits.
 
-    Raises
-    ------
-    PblError
-        USAGE for an invalid regular expression, one without named groups, with others than `GROUPS`, or one that takes
-        more than `LONGEST_S`.
+    Raises `PblError` USAGE for an invalid regular expression, one without named groups, with others than `GROUPS`, or
+    one that takes more than `LONGEST_S`.
     """
     try:
         return limited(_matched, text, [p.stem for p in paths], seconds=LONGEST_S, n_bytes=_MOST_BYTES, returns=True)

@@ -132,7 +132,10 @@ class NpmPackage(Package):
             return file.read()
 
 
+#: Client -> the kind of package that it downloads.
+CLIENTS: dict[str, type[Package]] = {"pip": Wheel, "npm": NpmPackage}
+
+
 def _lines(text: str, *starts: str) -> list[str]:
-    """The lines that begin so; of npm's, what follows."""
     found = [line.strip() for line in text.splitlines() if line.strip().startswith(starts)]
     return [line.removeprefix("npm ERR!").removeprefix("npm error").strip() for line in found]

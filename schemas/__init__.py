@@ -26,6 +26,3 @@ def load_visit(restriction: Any) -> Visit:
     from .reading import load_visit as load
 
     return load(restriction)
-
-
-__all__ = ["STAGES", "activate", "computed_tables", "load_visit"]

@@ -10,6 +10,9 @@ _methods_done: set[str] = set()
 def activate(start: bool = False, methods: bool = True) -> None:
     """Bind all tables to the database; safe to call again.
 
+    Raises `PblError` What `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or
+    newer.
+
     Parameters
     ----------
     start
@@ -17,11 +20,6 @@ def activate(start: bool = False, methods: bool = True) -> None:
     methods
         Insert the method, body and norm rows of this version of the code (loads the numerical libraries, a few
         seconds). Commands that only look leave it out.
-
-    Raises
-    ------
-    PblError
-        What `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or newer.
     """
     from . import connection, fit, plan, tables_version
 

@@ -36,17 +36,14 @@ _current: datajoint.Connection | None = None
 def connect(start: bool = False) -> datajoint.Connection:
     """The process's connection, made on first use and again when the server has moved.
 
+    Raises `PblError` DB_NOT_RUNNING when nothing answers within a few seconds, DB_REFUSED when the login is refused,
+    DB_UNAVAILABLE when `start` fails.
+
     Parameters
     ----------
     start
         Start the embedded server when it is not running (never done when DJ_HOST names a server). After `pbl demo`
         has stopped it, any connection does.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_RUNNING when nothing answers within a few seconds, DB_REFUSED when the login is refused,
-        DB_UNAVAILABLE when `start` fails.
     """
     target = _target(start)
     configure(target)
@@ -197,10 +194,7 @@ def _tls() -> bool | dict[str, Any] | None:
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
     """A connection of the driver with the login of the tables, for statements that are not queries of a table.
 
-    Raises
-    ------
-    PblError
-        What `connect` raises.
+    Raises `PblError` What `connect` raises.
     """
     target = _target(start=False)
     _check_answers(target)

@@ -433,7 +433,6 @@ def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
 
 
 def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False) -> lib.Trial:
-    """A trial from its files: keypoints of one camera, or of several with their calibration, or markers."""
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
     paths = [stack.enter_context(stored_file(ref)) for ref in refs]

@@ -490,7 +490,6 @@ def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEve
 
 
 def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:
-    """The library's `GaitCycle`."""
     from pbl_pipeline import gait as lib
 
     return lib.GaitCycle(

@@ -24,10 +24,7 @@ def with_keys(restriction: Mapping[str, Any]) -> dict[str, Any]:
     """A restriction of results whose methods (and normative set) may be named short: `blazepose` becomes the key of its
     newest version that has results, else of the newest.
 
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN, NORM_UNKNOWN.
+    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN.
     """
     out = dict(restriction)
     for column in out.keys() & _RESULTS.keys():

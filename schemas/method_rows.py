@@ -30,10 +30,8 @@ def method_columns(prefix: str) -> str:
 def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
     """Insert the methods that the table lacks. A row is never edited.
 
-    Raises
-    ------
-    PblError
-        FILE_FORMAT when code holds other parameters under a name and version that the table already knows.
+    Raises `PblError` FILE_FORMAT when code holds other parameters under a name and version that the table already
+    knows.
     """
     prefix = _prefix(table)
     for method in found:
@@ -62,10 +60,7 @@ def resolve_method(table: Any, name: str) -> str:
     machine offers under that name, such as a registered model. That becomes a row when it is first asked for; other
     parameters (another graph or `model.json`) under the same name are its next version.
 
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
+    Raises `PblError` SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
     offered = methods.of_stage(table.stage).offered(name)
     return stored_key(table, name) if offered is None else register(table, offered)[0]

@@ -55,6 +55,9 @@ def build_norm(
     Nothing that was registered changes: sessions keep the set they were planned with. Where the cycles are those of
     the newest version, that version is given back.
 
+    Raises `PblError` USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown
+    population or subject), SOLVER_UNKNOWN (a method that there is not), NORM_INVALID, ANGLE_UNITS.
+
     Parameters
     ----------
     name
@@ -70,12 +73,6 @@ def build_norm(
         All nine angles (for `gillette-2008`) and not three.
     pace
         Cycles of videos that are walked at this pace; one of unknown pace counts as self-selected.
-
-    Raises
-    ------
-    PblError
-        USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown population or
-        subject), SOLVER_UNKNOWN (a method that there is not), NORM_INVALID, ANGLE_UNITS.
     """
     from pbl_pipeline import gait as lib
 
@@ -157,7 +154,6 @@ def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dic
 
 
 def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[str]]:
-    """The library's cycles with their curves, and whose each is."""
     cycles, people = [], []
     for key in keys:
         found = gait.load_cycles({k: key[k] for k in gait.GaitCycle.primary_key}, str(key["video_id"]))

@@ -68,15 +68,12 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     current. A recording that is marked as not usable (`video.NotUsable`) takes no part, and sets with it cease to be
     current. Workers take turns at a session, and where several sets of it are current all but one cease to be.
 
+    Returns `fit_set` and `fit_method` of the sets that became current now.
+
     Parameters
     ----------
     sessions
         session_id of those to look at (None: all; that reads whole tables).
-
-    Returns
-    -------
-    list of dict
-        fit_set and fit_method of the sets that became current now.
     """
     chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
     current = fit.current() & (fit.FitSet & chosen)
@@ -120,7 +117,6 @@ def plan_anew(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _with_unusable() -> Any:
-    """Sets (with `session_id`) that hold a recording which is marked as not usable."""
     return fit.FitSet.proj("session_id") & (fit.FitSet.Video & video.NotUsable).proj()
 
 

@@ -112,10 +112,7 @@ def shown(video_id: int) -> Iterator[Path | None]:
     """The recording whose pictures overlays and reports show: the de-identified copy where PBL_DEIDENTIFY asks for it,
     None where it does not.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND: there is no copy of that kind yet. HEAD_NOT_FOUND: nothing was covered in it.
+    Raises `PblError` DB_NOT_FOUND: there is no copy of that kind yet. HEAD_NOT_FOUND: nothing was covered in it.
     """
     from pbl_pipeline.deidentify import nothing_covered
 

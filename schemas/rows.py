@@ -59,10 +59,7 @@ def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
 def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
     """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for none, USAGE for several.
+    Raises `PblError` DB_NOT_FOUND for none, USAGE for several.
     """
     found = rows(table, key)
     if len(found) == 1:

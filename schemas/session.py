@@ -44,7 +44,6 @@ def lock(session_id: int) -> None:
 
 
 def unknown_visit(session_id: int) -> PblError:
-    """DB_NOT_FOUND for a number that no visit has."""
     return PblError(
         "DB_NOT_FOUND",
         found=f"no session_id {session_id}",

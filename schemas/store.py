@@ -42,11 +42,8 @@ def bucket() -> str:
 def store_spec() -> dict[str, Any]:
     """The store as DataJoint's configuration has it. Makes the folder; asks no object store yet (`check_store` does).
 
-    Raises
-    ------
-    PblError
-        DB_REFUSED for a folder that cannot be used, USAGE for settings of an object store that cannot work,
-        STORE_UNAVAILABLE where the package for object stores is missing.
+    Raises `PblError` DB_REFUSED for a folder that cannot be used, USAGE for settings of an object store that cannot
+    work, STORE_UNAVAILABLE where the package for object stores is missing.
     """
     if is_remote():
         return _bucket_spec()
@@ -95,10 +92,8 @@ def _bucket_spec() -> dict[str, Any]:
 def further_stores(taken: str) -> dict[str, Any]:
     """The stores that DJ_STORES describes (JSON, as DataJoint reads it), for a lab's custom tables.
 
-    Raises
-    ------
-    PblError
-        USAGE where it is not a JSON object of stores, or describes the store `taken`, which other variables decide.
+    Raises `PblError` USAGE where it is not a JSON object of stores, or describes the store `taken`, which other
+    variables decide.
     """
     raw = os.environ.get("DJ_STORES")
     if not raw:
@@ -123,17 +118,14 @@ def further_stores(taken: str) -> dict[str, Any]:
 def check_store(backend: Any, create: bool = False) -> None:
     """Write, read and compare a small object in the store.
 
+    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
+
     Parameters
     ----------
     backend
         DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`).
     create
         Make the bucket where it is missing.
-
-    Raises
-    ------
-    PblError
-        STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     # In a bucket always the same object, for a worker's key may not delete; in a folder a separate file that goes
     # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
@@ -156,10 +148,7 @@ def check_store(backend: Any, create: bool = False) -> None:
 def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
     """The files under a folder of the store (a path in it; default: all), with what the store says of each.
 
-    Raises
-    ------
-    PblError
-        STORE_UNAVAILABLE with what the store said, STORE_FULL.
+    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     try:
         base = full_path(backend, "")
@@ -173,10 +162,7 @@ def purge(fs: Any, folder: str) -> None:
     """Remove what a bucket holds below a folder (`bucket/path`), older versions and the parts of uploads that broke off
     included.
 
-    Raises
-    ------
-    PblError
-        STORE_UNAVAILABLE with what the store said, STORE_FULL.
+    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
     """
     name, _, path = folder.partition("/")
     where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}

@@ -96,10 +96,7 @@ def check_version() -> None:
     """Refuse tables of another version; on a server without any, record the migrations that new ones need not go
     through. Call it before the tables are declared.
 
-    Raises
-    ------
-    PblError
-        DB_MIGRATION.
+    Raises `PblError` DB_MIGRATION.
     """
     if any(not table.startswith("~") for _, table in catalog.tables()):
         refuse_other_version()
@@ -114,10 +111,7 @@ def refuse_other_version() -> None:
     """Refuse tables of a newer version (a migration was applied that this one lacks) or an older one (a migration, or a
     column of a definition, is missing). A server without tables is neither.
 
-    Raises
-    ------
-    PblError
-        DB_MIGRATION.
+    Raises `PblError` DB_MIGRATION.
     """
     refuse_newer()
     if not any(not table.startswith("~") for _, table in catalog.tables()):
@@ -138,10 +132,7 @@ def refuse_other_version() -> None:
 def refuse_newer() -> None:
     """Refuse tables that went through a migration which this version does not have, by number and name.
 
-    Raises
-    ------
-    PblError
-        DB_MIGRATION.
+    Raises `PblError` DB_MIGRATION.
     """
     ours = numbered()
     newer = [a for a in applied() if (a.number, a.name) not in ours]

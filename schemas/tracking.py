@@ -234,10 +234,7 @@ def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
 def set_override(key: Mapping[str, Any], person_id: int) -> None:
     """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes what it contradicts.
 
-    Raises
-    ------
-    PblError
-        SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
+    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
     """
     key = {"video_id": key["video_id"], "tracking_method": key["tracking_method"]}
     if Tracking & key:
@@ -280,10 +277,7 @@ def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
     Where a person decided for whom the automatic choice had chosen already, nothing that was computed changes: the
     choice becomes MANUAL and stays.
 
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows, empty when nothing was outdated. The next populate computes them anew.
+    Returns the number of deleted rows by table, empty when nothing was outdated. The next populate computes them anew.
     """
     confirmed = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
     confirmed = confirmed & "choice_status != 'MANUAL' and chosen_person_id = override_person_id" & restriction

@@ -313,10 +313,7 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 def present_file(video_id: int) -> Path:
     """Return the file of a video if it is there; its bytes are not compared with those that were registered.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND, VIDEO_MISSING.
+    Raises `PblError` DB_NOT_FOUND, VIDEO_MISSING.
     """
     path = Path(registered_video(video_id)["video_path"])
     if not path.is_file():
@@ -333,7 +330,6 @@ def registered_video(video_id: int) -> dict[str, Any]:
 
 
 def unknown_video(video_id: int) -> PblError:
-    """DB_NOT_FOUND for a number that no video has."""
     return PblError(
         "DB_NOT_FOUND",
         found=f"no video_id {video_id}",
@@ -345,10 +341,7 @@ def unknown_video(video_id: int) -> PblError:
 def registered_file(path: str, sha256: str, key: dict) -> Path:
     """The video file, after checking that it is still the one that was registered.
 
-    Raises
-    ------
-    PblError
-        VIDEO_MISSING, VIDEO_CHANGED.
+    Raises `PblError` VIDEO_MISSING, VIDEO_CHANGED.
     """
     from pbl_pipeline.video import sha256_of
 

@@ -71,11 +71,6 @@ def alone(work: str, server: Any) -> Iterator[bool]:
     Yields whether it was obtained; never waits. It ends with the process or its connection, as the server's named locks
     do. Those are anybody's to take, also an analyst's; so one counts only together with a row that names it and its
     connection, which takes the right to write.
-
-    Parameters
-    ----------
-    server
-        A connection of DataJoint.
     """
     lock, table = secrets.token_hex(16), Turn.full_table_name
     server.query("SELECT GET_LOCK(%s, 0)", args=(lock,))

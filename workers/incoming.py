@@ -89,11 +89,8 @@ def take_over(
 
     Returns None where another process does it now.
 
-    Raises
-    ------
-    PblError
-        USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE. What was not taken
-        until then stays in the drop folder.
+    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE. What
+    was not taken until then stays in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
     with worker.alone(LOCK, video.Video.connection) as obtained:
@@ -253,10 +250,8 @@ def has_room(folder: Path, n_bytes: int) -> bool:
 def check_opens(path: Path, expected: str, next_step: str) -> None:
     """Decode the first picture of a file in a process with limits.
 
-    Raises
-    ------
-    PblError
-        VIDEO_...: what is wrong with it; VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the limits.
+    Raises `PblError` VIDEO_...: what is wrong with it; VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the
+    limits.
     """
     try:
         limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
@@ -270,10 +265,7 @@ def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path
     """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
     them; return the outcome. `file`: the name that the recording came with.
 
-    Raises
-    ------
-    PblError
-        What is wrong with the recording.
+    Raises `PblError` What is wrong with the recording.
     """
     recording, *logs = copies
     for log in logs:

@@ -90,11 +90,8 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
     """Return the video, and the sensor log if there is one, as files made of the parts, checked by the sum that the
     phone stated.
 
-    Raises
-    ------
-    PblError
-        UPLOAD_REFUSED: parts are missing, or together they are not what was announced; VIDEO_... for what is not a
-        video.
+    Raises `PblError` UPLOAD_REFUSED: parts are missing, or together they are not what was announced; VIDEO_... for what
+    is not a video.
     """
     if left := missing(phone, sent):
         raise upload_refused(f"{len(left)} of {sent.n_parts} parts are missing", "the page sends them")
@@ -126,11 +123,8 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
 def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     """Register a recording that was put together, have it computed first, and remove its parts; return its video_id.
 
-    Raises
-    ------
-    PblError
-        DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND where the visit is gone;
-        what is wrong with the recording.
+    Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND where the
+    visit is gone; what is wrong with the recording.
     """
     stated = {name: sent.about[name] for name in ("activity", "pace") if name in sent.about}
     visit = VisitRecord(phone.subject, phone.label, **stated)

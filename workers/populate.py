@@ -62,22 +62,17 @@ def populate(
 ) -> Run:
     """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
+    Raises `PblError` USAGE for an unknown table name.
+
     Parameters
     ----------
     tables
         Names of the tables to visit (default: all).
-    limit
-        Most computations per table.
     retry_errors
         Clear error rows first, so that their keys are tried again.
     visit
         session_id of the visit of which alone is computed, its usable recordings and current sets; jobs of it that
         other workers hold are waited for. None: everything.
-
-    Raises
-    ------
-    PblError
-        USAGE for an unknown table name.
     """
     for name in ("datajoint", "pbl.worker"):  # they would print into the bar what the summary and `pbl status` say
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -108,7 +103,6 @@ def populate(
 
 
 def _ready(tables: Sequence[Any], limit: int | None) -> int:
-    """How many jobs can be taken now."""
     counts = [len(jobs_of(t).pending & "scheduled_time <= CURRENT_TIMESTAMP(3)") for t in tables]
     return sum(n if limit is None else min(n, limit) for n in counts)
 

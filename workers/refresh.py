@@ -84,15 +84,12 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the recordings
     that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
 
+    Returns None where another process is at it.
+
     Parameters
     ----------
     everything
         Look at all rows; None where the last such look is an hour ago, or where there are few videos.
-
-    Returns
-    -------
-    Refreshed or None
-        None where another process is at it.
     """
     server = video.Video.connection
     with alone("refresh", server) as had:

@@ -36,10 +36,7 @@ def retry(
     """Make error rows pending again, of one code, one table, one video, one key of that table if asked; table -> how
     many.
 
-    Raises
-    ------
-    PblError
-        USAGE for an unknown table or code.
+    Raises `PblError` USAGE for an unknown table or code.
     """
     tables = [table_named(table)] if table else computed_tables()
     out = {}
@@ -96,10 +93,8 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
 
     Old rows stay: a method is part of the key. `since`: only videos registered from that day on.
 
-    Raises
-    ------
-    PblError
-        USAGE for a table without methods, SOLVER_UNKNOWN for an unknown method; what `plan.default_fit` raises.
+    Raises `PblError` USAGE for a table without methods, SOLVER_UNKNOWN for an unknown method; what `plan.default_fit`
+    raises.
     """
     name = table_named(table).__name__
     if name not in _SELECTIONS:
@@ -138,10 +133,7 @@ def plan_again(
 ) -> Reprocess:
     """Which results of a table would be deleted and computed again: of a method, computed since or before a time.
 
-    Raises
-    ------
-    PblError
-        USAGE for an unknown table.
+    Raises `PblError` USAGE for an unknown table.
     """
     one = table_named(table)
     rows = one()

@@ -7,16 +7,3 @@ from .cases import METHOD, Case, Data, fit_cases
 from .detect import detect_text, run_detect
 from .run import Programs, Row, run_cases
 from .table import fit_text
-
-__all__ = [
-    "METHOD",
-    "Case",
-    "Data",
-    "Programs",
-    "Row",
-    "detect_text",
-    "fit_cases",
-    "fit_text",
-    "run_cases",
-    "run_detect",
-]

@@ -35,7 +35,6 @@ def joint_errors_deg(
 
 
 def mean_over(errors: dict[str, float], joints: Sequence[str]) -> float:
-    """Mean over `joints`."""
     return float(np.mean([errors[n] for n in joints]))
 
 

@@ -71,7 +71,6 @@ def sessions(folder: Path) -> list[Path]:
 
 
 def read_keypoints(session: Path) -> list[Keypoints]:
-    """Read the keypoints of a session's trials."""
     from pbl_pipeline.keypoints import Keypoints
 
     return [Keypoints.load(trial / "keypoints.npz") for trial in sorted(session.glob("trial*"))]

@@ -40,10 +40,7 @@ def run_cases(
     Stage "cold" is a new process with an empty cache of compiled programs, which stage "warm" finds. `note` is called
     with what is done next.
 
-    Raises
-    ------
-    PblError
-        INTERNAL: the data could not be made.
+    Raises `PblError` INTERNAL: the data could not be made.
     """
     with new_folder() as root:
         for number, case in enumerate(cases):

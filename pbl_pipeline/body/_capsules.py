@@ -18,44 +18,27 @@ from pbl_pipeline.body.model import Body
 
 @dataclasses.dataclass(frozen=True)
 class Capsules:
-    """G capsules over T poses: rounded bars from `start` to `end`.
+    """G capsules over T poses: rounded bars from `start` to `end`."""
 
-    Attributes
-    ----------
-    names, body_names
-        G names (the shape, numbered where it takes several capsules) and the body each belongs to.
-    start, end : (T, G, 3)
-        World, metres; NaN where qpos is NaN.
-    radius_m : (G,)
-        Metres.
-    """
-
+    #: G names (the shape, numbered where it takes several capsules) and the body each belongs to.
     names: tuple[str, ...]
     body_names: tuple[str, ...]
+    #: (T, G, 3) world, metres; NaN where qpos is NaN.
     start: np.ndarray
     end: np.ndarray
-    radius_m: np.ndarray
+    radius_m: np.ndarray  # (G,) metres
 
 
 @dataclasses.dataclass(frozen=True)
 class CapsuleShapes:
-    """G capsules in the frames of their bodies.
-
-    Attributes
-    ----------
-    names : G names
-    body : (G,)
-        Index of the body that a capsule moves with, in `Body.body_names`.
-    start, end : (G, 3)
-        In that body's frame, metres.
-    radius_m : (G,)
-    """
+    """G capsules in the frames of their bodies."""
 
     names: tuple[str, ...]
-    body: np.ndarray
+    body: np.ndarray  # (G,) index of the body that a capsule moves with, in `Body.body_names`
+    #: (G, 3) in that body's frame, metres.
     start: np.ndarray
     end: np.ndarray
-    radius_m: np.ndarray
+    radius_m: np.ndarray  # (G,)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,7 +82,6 @@ def _chain_of(body: Body) -> _Chain:
 
 
 def _forward(body: Body, chain: _Chain, qpos: Array, body_pos: Array) -> Frames:
-    """The frames of one pose."""
     dtype, parent, owner = qpos.dtype, body.parent_index, body.joint_body
     axis = jnp.asarray(chain.axis, dtype)
     turned = jax.lax.optimization_barrier(jnp.concatenate([_rodrigues(axis, qpos), jnp.eye(3, dtype=dtype)[None]]))

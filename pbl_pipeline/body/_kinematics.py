@@ -57,8 +57,6 @@ def body_poses(
 
     Parameters
     ----------
-    body
-        From `load_body`.
     qpos : (..., Q)
         Joint values in the order of `body.joint_names`, radians and metres.
     scale : (S,)
@@ -92,10 +90,6 @@ def marker_positions(
 
     Parameters
     ----------
-    body, qpos, scale
-        As in `body_poses`.
-    markers
-        J points on the body.
     site_offset_m : (J, 3)
         Added to each marker's position in its body's frame before scaling, metres.
     forward

@@ -26,28 +26,17 @@ MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for 
 
 @dataclasses.dataclass(frozen=True)
 class MarkerSet:
-    """J named points fixed to bodies.
+    """J named points fixed to bodies."""
 
-    Attributes
-    ----------
-    name
-        "blazepose_33" and so on; the stem of the file for a lab's own table.
-    names, body_names
-        J marker names (all different) and the body each is fixed to.
-    body_index : (J,) int
-        Index into `Body.body_names`.
-    position_m : (J, 3) float64
-        Position on the unscaled body, in the body's frame (x forward, y up, z right), metres.
-    weight_3d : (J,) float64
-        How far the detector's 3D position of the point may be taken for the place on the body, 0 (not at all: only its
-        pixels count) to 1. A property of the detector; 1 unless the table has a column `weight_3d`.
-    """
-
-    name: str
+    name: str  # "blazepose_33" and so on; the stem of the file for a lab's own table
+    #: J marker names (all different) and the body each is fixed to.
     names: tuple[str, ...]
     body_names: tuple[str, ...]
-    body_index: np.ndarray
+    body_index: np.ndarray  # (J,) int index into `Body.body_names`
+    #: (J, 3) position on the unscaled body, in the body's frame (x forward, y up, z right), metres.
     position_m: np.ndarray
+    #: (J,) how far the detector's 3D position of the point may be taken for the place on the body, 0 (not at all: only
+    #: its pixels count) to 1. A property of the detector; 1 unless the table has a column `weight_3d`.
     weight_3d: np.ndarray
 
     def __len__(self) -> int:
@@ -89,10 +78,8 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     The column `weight_3d` may be there too (`MarkerSet`); an empty cell means 1. Lines that start with `#` are
     comments, further columns are ignored. `name` is the file's stem unless given.
 
-    Raises
-    ------
-    PblError
-        FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model lacks, no rows.
+    Raises `PblError` FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model
+    lacks, no rows.
     """
     path = Path(path)
     known = load_body().body_names

@@ -31,45 +31,26 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 class Body:
     """A tree of B bodies with Q degrees of freedom (the shipped one: 21 and 40) and S scale groups (8). Index 0 is the
     root, the pelvis: MuJoCo's world is left out.
-
-    Attributes
-    ----------
-    mj_model, mjx_model, mjx_data
-        The model for C MuJoCo and for MJX, and an empty state of the latter to start kinematics from.
-    joint_names : Q names
-        OpenSim's, in the order of `qpos`. The slides are pelvis_tx (forward), pelvis_tz (right), pelvis_ty (up).
-    joint_body, is_hinge, is_slide : (Q,)
-        Index of the body that a joint belongs to, and its kind.
-    joint_range_rad : (Q, 2)
-        Limits, radians (metres for slides); -inf, inf where unlimited.
-    body_names : B names
-    parent_index : (B,)
-        Index of the parent in `body_names`; -1 for the root.
-    path : (B, B)
-        1 where the second body is the first one or an ancestor of it.
-    moves : (B, Q)
-        1 where a joint moves a body.
-    scale_names : S names
-    scale_index : (B,)
-        Which of `scale_names` scales the body.
-    sha256, name, version
-        Hash of the MJCF's bytes, and what the MJCF calls itself.
     """
 
+    #: The model for C MuJoCo and for MJX, and an empty state of the latter to start kinematics from.
     mj_model: mujoco.MjModel
     mjx_model: mjx.Model
     mjx_data: mjx.Data
+    #: OpenSim's, in the order of `qpos`. The slides are pelvis_tx (forward), pelvis_tz (right), pelvis_ty (up).
     joint_names: tuple[str, ...]
-    joint_range_rad: np.ndarray
+    joint_range_rad: np.ndarray  # (Q, 2) limits, radians (metres for slides); -inf, inf where unlimited
+    #: (Q,) index of the body that a joint belongs to, and its kind.
     joint_body: np.ndarray
     is_hinge: np.ndarray
     is_slide: np.ndarray
     body_names: tuple[str, ...]
-    parent_index: np.ndarray
-    path: np.ndarray
-    moves: np.ndarray
+    parent_index: np.ndarray  # (B,) index of the parent in `body_names`; -1 for the root
+    path: np.ndarray  # (B, B) 1 where the second body is the first one or an ancestor of it
+    moves: np.ndarray  # (B, Q) 1 where a joint moves a body
     scale_names: tuple[str, ...]
-    scale_index: np.ndarray
+    scale_index: np.ndarray  # (B,) which of `scale_names` scales the body
+    #: Hash of the MJCF's bytes, and what the MJCF calls itself.
     sha256: str
     name: str
     version: str

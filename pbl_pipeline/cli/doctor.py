@@ -205,7 +205,6 @@ def _onnx() -> Finding:
 
 
 def _models() -> Iterator[Finding]:
-    """The registered keypoint models, with their licences."""
     from pbl_pipeline import models
 
     for model in models.registered():

@@ -18,27 +18,3 @@ from .video_copy import (
     sidecar_of,
     to_show,
 )
-
-__all__ = [
-    "HOW",
-    "KEEP",
-    "REASONS",
-    "SOURCES",
-    "SPREAD_S",
-    "STATUSES",
-    "Deidentified",
-    "FaceDetector",
-    "Head",
-    "HeadParams",
-    "Heads",
-    "check_call",
-    "cover",
-    "covered_picture",
-    "deidentify",
-    "find_heads",
-    "nothing_covered",
-    "outline",
-    "ranges",
-    "sidecar_of",
-    "to_show",
-]

@@ -119,21 +119,17 @@ def deidentify(
     as it is, and its status says so. Memory does not grow with the length of the video but by a circle per head and
     frame.
 
+    Raises `PblError` USAGE, FILE_UNWRITABLE (`check_call`); VIDEO_* for a file that cannot be read; VIDEO_CHANGED;
+    ASSET_*.
+
     Parameters
     ----------
     video, out
         The recording, and an .mp4 file.
     how
         "blur", "pixelate", or "skeleton": the bodies' keypoints on black.
-    overwrite
-        Replace files of these names.
     params, info, heads
         How heads are found; what `video.probe` said; heads that were found before.
-
-    Raises
-    ------
-    PblError
-        USAGE, FILE_UNWRITABLE (`check_call`); VIDEO_* for a file that cannot be read; VIDEO_CHANGED; ASSET_*.
     """
     video, out = Path(video), Path(out)
     check_call(video, out, how, keep, overwrite)

@@ -3,14 +3,3 @@
 from pbl_pipeline.export.bids import Labels
 from pbl_pipeline.export.writer import FORMATS, GAIT_FORMATS, ExportOptions, check_export, write_export
 from pbl_pipeline.fit.angles_file import angles_table, write_angles_csv
-
-__all__ = [
-    "FORMATS",
-    "GAIT_FORMATS",
-    "ExportOptions",
-    "Labels",
-    "angles_table",
-    "check_export",
-    "write_angles_csv",
-    "write_export",
-]

@@ -61,12 +61,8 @@ def bids_files(
 
     Parameters
     ----------
-    trials
-        Of one visit.
     origins
         By the name of a trial, how it was made (`provenance.origin_of`).
-    labels
-        Of the visit.
     participants
         Labels that the data set has.
     """

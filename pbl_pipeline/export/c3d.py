@@ -31,10 +31,7 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     The axes are those of our world: z up. A C3D has one rate: frames at uneven times are interpolated to their median
     rate, and the parameter PBL:TIMES says so. Points and poses that are not known have residual -1 and NaN.
 
-    Raises
-    ------
-    PblError
-        PACKAGE_MISSING without ezc3d; EXPORT_INPUT for a trial with more than 65,535 frames.
+    Raises `PblError` PACKAGE_MISSING without ezc3d; EXPORT_INPUT for a trial with more than 65,535 frames.
     """
     ezc3d: Any = needed("ezc3d.ezc3d", "export", "writing C3D files")
     check_frames(trial)

@@ -146,7 +146,6 @@ def _stacked(pieces: Sequence[np.ndarray | Labels | None], lengths: Sequence[int
 
 
 def _cells(kind: str, columns: Sequence[Column]) -> list[np.ndarray]:
-    """Blocks of cells of columns of one kind."""
     if kind in ("number", "integer"):
         return [number_cells(np.stack([np.asarray(c.values) for c in columns], axis=1), 6 if kind == "number" else 0)]
     found = []

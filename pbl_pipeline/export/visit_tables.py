@@ -3,7 +3,9 @@ stand in a column `unit` beside the values."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
@@ -18,49 +20,11 @@ from pbl_pipeline.words import KINETICS, unit_of
 from .columns import Column, Labels, Table, joined
 from .trial import ExportTrial
 
+_MEANINGS = json.loads(resources.files("pbl_pipeline.export").joinpath("meanings.json").read_text(encoding="utf-8"))
 #: The direction in which a joint value grows, by the joint's name without its side.
-JOINT_SIGNS: dict[str, str] = {
-    "pelvis_tilt": "about the ground's z: the front rises",
-    "pelvis_list": "about x, after the tilt: the right side sinks",
-    "pelvis_rotation": "about y, after tilt and list: turned to the left",
-    "pelvis_tx": "along the ground's x, from the body's place in the MJCF",
-    "pelvis_ty": "up, from the body's place in the MJCF",
-    "pelvis_tz": "along the ground's z, from the body's place in the MJCF",
-    "hip_flexion": "flexion",
-    "hip_adduction": "adduction",
-    "hip_rotation": "internal rotation",
-    "knee_angle": "extension: flexion is negative, as in OpenSim",
-    "knee_flexion": "flexion: knee_angle with the sign turned",
-    "ankle_angle": "dorsiflexion",
-    "subtalar_angle": "inversion",
-    "mtp_angle": "extension of the toes",
-    "lumbar_extension": "extension: backwards",
-    "lumbar_bending": "bending to the right",
-    "lumbar_rotation": "turned to the left",
-    "neck_extension": "extension: backwards",
-    "neck_bending": "bending to the right",
-    "neck_rotation": "turned to the left",
-    "arm_flex": "flexion",
-    "arm_add": "adduction",
-    "arm_rot": "internal rotation",
-    "elbow_flex": "flexion",
-    "pro_sup": "pronation",
-    "wrist_flex": "flexion",
-    "wrist_dev": "ulnar deviation",
-}
+JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
 _SIDES = {"r": "right", "l": "left"}
-_STATISTICS = {
-    "mean": "mean over both sides",
-    "left": "mean of the left side",
-    "right": "mean of the right side",
-    "sd": "standard deviation over both sides (n - 1)",
-    "n": "number of values",
-    "variability": "standard deviation within a side",
-    "cv_percent": "variability in percent of the mean",
-    "asymmetry_percent": "100 (right - left) / mean of both",
-    "error_sd": "standard deviation of the error of the mean",
-    "minimal_change": "minimal detectable change (90 %) between two visits filmed alike",
-}
+_STATISTICS: dict[str, str] = _MEANINGS["statistics"]
 _TRIAL = "name of the trial"
 
 
@@ -141,7 +105,6 @@ def joint_sign(joint: str) -> str:
 
 
 def _repeated(texts: Sequence[str], n: int) -> Labels:
-    """Each text n times."""
     one = Labels.of(texts)
     return Labels(np.repeat(one.codes, n), one.texts)
 

@@ -115,12 +115,9 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
 
     `<recording>/<recording>.trc` and so on for each, the tables with their data dictionary and `export.json` above.
 
-    Raises
-    ------
-    PblError
-        USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without one pose, of
-        another body, measures whose events or cycles are missing, or names that a format cannot hold;
-        MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
+    Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without
+    one pose, of another body, measures whose events or cycles are missing, or names that a format cannot hold;
+    MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
     """
     options = options or ExportOptions()
     formats = [f for f in FORMATS if f in formats] + [f for f in formats if f not in FORMATS]

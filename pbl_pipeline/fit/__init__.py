@@ -18,26 +18,3 @@ from .session_fit import (
     fit_session,
     fit_sessions,
 )
-
-__all__ = [
-    "LEVEL_CAMERA_R_NC",
-    "METHODS",
-    "CostParams",
-    "GaussNewtonParams",
-    "ImplicitAdamParams",
-    "MarkerFile",
-    "Params",
-    "Points",
-    "SessionFit",
-    "SessionInput",
-    "Trial",
-    "TrialFit",
-    "ViewParams",
-    "check_trial",
-    "default_fit",
-    "fit_session",
-    "fit_sessions",
-    "points_of",
-    "read_markers",
-    "unsuited",
-]

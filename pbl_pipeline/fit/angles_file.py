@@ -20,10 +20,7 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
     Angles in degrees, `pelvis_tx/ty/tz` in metres (world frame, origin at the camera). OpenSim's knee is negative in
     flexion; `knee_flexion_r/_l`, positive, stands beside `knee_angle_r/_l`. NaN where the person is out of view.
 
-    Raises
-    ------
-    PblError
-        FILE_FORMAT when times, joint names and `qpos` do not belong together.
+    Raises `PblError` FILE_FORMAT when times, joint names and `qpos` do not belong together.
     """
     qpos = np.asarray(fit.qpos, float)
     wanted = (len(fit.time_s), len(fit.joint_names))

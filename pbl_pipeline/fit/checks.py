@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import SLIDES, stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
-from pbl_pipeline.qc import FAIL, PASS, WARN, Check
+from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
 
 from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
@@ -136,13 +136,8 @@ def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
 
 def _in_view(session: Session) -> Check:
     value = float(np.min(session.in_view_share))
-    return Check(
-        "share_of_frames_with_whole_person",
-        WARN if value < IN_VIEW_WARN else PASS,
-        value,
-        IN_VIEW_WARN,
-        "keep head and feet in the picture; frames without them are not used",
-    )
+    advice = "keep head and feet in the picture; frames without them are not used"
+    return warn_if(value < IN_VIEW_WARN, "share_of_frames_with_whole_person", value, IN_VIEW_WARN, advice)
 
 
 def _scale(scale: np.ndarray) -> Check:
@@ -193,34 +188,19 @@ def _limits(session: Session, trials: Sequence[TrialFit]) -> Check:
     qpos = np.concatenate([t.qpos[np.isfinite(t.qpos[:, 0])] for t in trials])
     share = np.mean((qpos < low + LIMIT_MARGIN_RAD) | (qpos > high - LIMIT_MARGIN_RAD), axis=0)
     names = [n for n, s in zip(session.body.joint_names, share, strict=True) if s > LIMIT_SHARE]
-    return Check(
-        "joints_at_their_limit",
-        WARN if names else PASS,
-        float(len(names)),
-        0.0,
-        f"held at a limit in over {LIMIT_SHARE:.0%} of the frames: {', '.join(names)}",
-    )
+    advice = f"held at a limit in over {LIMIT_SHARE:.0%} of the frames: {', '.join(names)}"
+    return warn_if(names, "joints_at_their_limit", float(len(names)), 0.0, advice)
 
 
 def _converged(solution: Solution) -> Check:
     if solution.qpos_sd is not None:
-        return Check(
-            "iterations",
-            PASS if solution.converged else WARN,
-            float(solution.iterations),
-            None,
-            "the solver stopped at its bound on steps, not at a minimum: look at the overlay, raise max_iterations",
-        )
+        advice = "the solver stopped at its bound on steps, not at a minimum: look at the overlay, raise max_iterations"
+        return warn_if(not solution.converged, "iterations", float(solution.iterations), None, advice)
     loss = solution.loss_trace[:, 1]
     enough = len(loss) >= TRACE_NEEDED
     fall = float(loss[len(loss) // 2 - 1] / loss[-1] - 1) if enough else None
-    return Check(
-        "loss_fall_over_second_half",
-        PASS if fall is not None and fall < FALL_WARN else WARN,
-        fall,
-        FALL_WARN,
-        "the optimisation was still moving: use a paramset with more steps",
-    )
+    advice = "the optimisation was still moving: use a paramset with more steps"
+    return warn_if(not (fall is not None and fall < FALL_WARN), "loss_fall_over_second_half", fall, FALL_WARN, advice)
 
 
 def _intrinsics(trials: Sequence[TrialFit]) -> Check:
@@ -234,7 +214,7 @@ def _intrinsics(trials: Sequence[TrialFit]) -> Check:
         else "the calibration of the camera leaves the focal length uncertain: calibrate again (docs/camera.md)"
     )
     # The value is the standard deviation of the focal length as a share of it.
-    return Check("camera_intrinsics_measured", WARN if sources or unsure else PASS, worst, FOCAL_SD_WARN, advice)
+    return warn_if(sources or unsure, "camera_intrinsics_measured", worst, FOCAL_SD_WARN, advice)
 
 
 def _assumed(session: Session) -> list[Check]:
@@ -262,7 +242,7 @@ def _orientation(trials: Sequence[TrialFit]) -> Check:
             "the vertical is taken from the walk, on a level floor by a person who does not lean to a side: a lean of "
             "the trunk to a side is lost; pass the phone's log with --attitude"
         )
-    return Check("camera_orientation_known", WARN if sources & {LEVEL, GAIT} else PASS, None, None, advice)
+    return warn_if(sources & {LEVEL, GAIT}, "camera_orientation_known", None, None, advice)
 
 
 def _observed(trials: Sequence[TrialFit]) -> Check:
@@ -271,22 +251,12 @@ def _observed(trials: Sequence[TrialFit]) -> Check:
     known = [np.isfinite(t.qpos_sd).all(axis=1) for t in trials]
     sd = np.rad2deg(np.max([np.median(t.qpos_sd[k], axis=0) for t, k in zip(trials, known, strict=True)], axis=0))
     unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
-    return Check(
-        "joints_not_observed",
-        WARN if unseen else PASS,
-        float(len(unseen)),
-        0.0,
-        f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}",
-    )
+    advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}"
+    return warn_if(unseen, "joints_not_observed", float(len(unseen)), 0.0, advice)
 
 
 def _clock(trials: Sequence[TrialFit]) -> Check:
     offsets = np.array([t.phone_clock_offset_s for t in trials])
     worst = float(offsets[np.nanargmax(np.abs(offsets))])
-    return Check(
-        "phone_clock_offset_s",
-        WARN if abs(worst) > CLOCK_WARN_S else PASS,
-        worst,
-        CLOCK_WARN_S,
-        "the phone's clock and the video's are far apart: the log may belong to another recording",
-    )
+    advice = "the phone's clock and the video's are far apart: the log may belong to another recording"
+    return warn_if(abs(worst) > CLOCK_WARN_S, "phone_clock_offset_s", worst, CLOCK_WARN_S, advice)

@@ -106,10 +106,7 @@ def solve_sessions(
 def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
     """Fit all trials of a session.
 
-    Raises
-    ------
-    PblError
-        FIT_INPUT: the paramset has a prior of no joint. FIT_DIVERGED: the loss is not finite.
+    Raises `PblError` FIT_INPUT: the paramset has a prior of no joint. FIT_DIVERGED: the loss is not finite.
     """
     begin = time.perf_counter()
     data, unknowns = initialise(session, params)

@@ -39,10 +39,8 @@ def read_markers(path: Path, table: MarkerSet | None = None, up: str = "y") -> M
 
     `table` says where the markers sit; None takes the shipped set that an `.npz` names. Markers are looked up by name.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, FILE_FORMAT; USAGE for a `.trc` without a table; MARKER_SET_UNKNOWN where no name is the set's.
+    Raises `PblError` FILE_MISSING, FILE_FORMAT; USAGE for a `.trc` without a table; MARKER_SET_UNKNOWN where no name is
+    the set's.
     """
     if path.suffix.lower() == ".trc":
         if table is None:

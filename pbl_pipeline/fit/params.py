@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from importlib import resources
 
 from pbl_pipeline.paramset import later
+
+#: By joint, or the beginning of the names of several: what stands at the constants below.
+_TABLES = json.loads(resources.files("pbl_pipeline.fit").joinpath("data/joint_sds.json").read_text(encoding="utf-8"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,93 +93,20 @@ class ImplicitAdamParams:
 #: differ in their standing pose. Hip and knee flexion, ankle, shoulders and elbows are seen well and have none, but for
 #: the turn of the upper arm, which a straight elbow hides. Forearm: 90 deg turns the palms to the body, as they hang.
 #: Lumbar spine: the mean of two walks fitted from a laboratory's markers (-7 and -5 deg; nimblephysics' OpenSim data).
-POSE_PRIOR_DEG = (
-    ("lumbar_extension", -7.0, 15.0),
-    ("lumbar_bending", 0.0, 10.0),
-    ("lumbar_rotation", 0.0, 10.0),
-    ("neck_extension", 0.0, 20.0),
-    ("neck_bending", 0.0, 15.0),
-    ("neck_rotation", 0.0, 20.0),
-    ("hip_adduction", 0.0, 10.0),
-    ("hip_rotation", 0.0, 10.0),
-    ("subtalar_angle", 0.0, 10.0),
-    ("mtp_angle", 0.0, 15.0),
-    ("arm_rot", 0.0, 40.0),
-    ("pro_sup", 90.0, 30.0),
-    ("wrist_flex", 0.0, 20.0),
-    ("wrist_dev", 0.0, 10.0),
-)
+POSE_PRIOR_DEG: tuple[tuple[str, float, float], ...] = tuple((n, *v) for n, v in _TABLES["pose_prior_deg"].items())
 
 #: What `qpos_sd` is multiplied by, per group of joints, unless a paramset says otherwise: such that 90 % intervals of
 #: `gauss-newton` 1 held the truth in 90 % of the samples of the synthetic walker, whose pixels erred without a memory.
-SD_FACTOR: tuple[tuple[str, float], ...] = (
-    ("pelvis_t", 1.32),
-    ("pelvis_ty", 0.92),
-    ("pelvis_tilt", 1.24),
-    ("pelvis_list", 1.21),
-    ("pelvis_rotation", 1.26),
-    ("hip", 1.23),
-    ("knee", 1.27),
-    ("ankle", 1.56),
-    ("subtalar", 1.25),
-    ("mtp", 1.59),
-    ("lumbar", 1.26),
-    ("neck", 1.26),
-    ("arm", 1.18),
-    ("arm_rot", 1.23),
-    ("elbow", 1.42),
-    ("pro_sup", 1.26),
-    ("wrist", 1.47),
-)
+SD_FACTOR: tuple[tuple[str, float], ...] = tuple(_TABLES["sd_factor"].items())
 #: The same of `gauss-newton`, of pixels that err with a memory (`python -m research.benchmarks.uncertainty` prints them
 #: and checks them on other walks).
-SD_FACTOR_METRABS: tuple[tuple[str, float], ...] = (
-    ("pelvis_t", 1.76),
-    ("pelvis_ty", 1.02),
-    ("pelvis_tilt", 1.49),
-    ("pelvis_list", 1.52),
-    ("pelvis_rotation", 1.45),
-    ("hip_flexion", 1.53),
-    ("hip_adduction", 1.44),
-    ("hip_rotation", 1.54),
-    ("knee", 1.4),
-    ("ankle", 1.69),
-    ("subtalar", 1.67),
-    ("mtp", 2.05),
-    ("lumbar", 1.53),
-    ("neck", 1.55),
-    ("arm", 1.42),
-    ("arm_rot", 1.8),
-    ("elbow", 1.72),
-    ("pro_sup", 1.93),
-    ("wrist", 2.13),
-)
+SD_FACTOR_METRABS: tuple[tuple[str, float], ...] = tuple(_TABLES["sd_factor_metrabs"].items())
 #: Least standard deviations of `blazepose` (deg, slides cm): a detector that leans a person, or marks another place
 #: than the model, does so in every frame, and no residual shows it. Such that 90 % intervals hold 90 % of the samples
 #: of walks seen with the detector's errors: hip, knee and ankle of the tuning persons of `research.corpus --quick`;
 #: pelvis, trunk and arms of twelve recorded walks of nine persons, each with a pose prior learned without them; slides,
 #: neck, mtp, forearm and wrist of the synthetic walker.
-SD_FLOOR_BLAZEPOSE: tuple[tuple[str, float], ...] = (
-    ("pelvis_t", 11.1),
-    ("pelvis_ty", 16.1),
-    ("pelvis_tilt", 6.0),
-    ("pelvis_list", 5.3),
-    ("pelvis_rotation", 9.2),
-    ("hip_flexion", 7.3),
-    ("hip_adduction", 4.2),
-    ("hip_rotation", 7.5),
-    ("knee", 8.4),
-    ("ankle", 5.6),
-    ("subtalar", 6.5),
-    ("mtp", 11.3),
-    ("lumbar", 7.6),
-    ("neck", 5.7),
-    ("arm", 9.2),
-    ("arm_rot", 16.7),
-    ("elbow", 13.8),
-    ("pro_sup", 14.2),
-    ("wrist", 8.0),
-)
+SD_FLOOR_BLAZEPOSE: tuple[tuple[str, float], ...] = tuple(_TABLES["sd_floor_blazepose"].items())
 
 
 @dataclasses.dataclass(frozen=True)

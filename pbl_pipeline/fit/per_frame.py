@@ -66,10 +66,7 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     the floor or a pelvis as the marker augmenter has it, a first solution tells when each foot stands and what the
     augmenter sees, and a second one uses it.
 
-    Raises
-    ------
-    PblError
-        FIT_INPUT: the paramset has a prior of no joint.
+    Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
     begin, compiled = time.perf_counter(), compile_seconds()
     twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0

@@ -26,10 +26,7 @@ def pose_prior(
     and `_l`); the later entry wins. `learned`: a mixture of `data/`, whose normal distributions with their full
     covariance take the place of the independent ones of their joints.
 
-    Raises
-    ------
-    PblError
-        FIT_INPUT: no such joint or prior, or a standard deviation that is not positive.
+    Raises `PblError` FIT_INPUT: no such joint or prior, or a standard deviation that is not positive.
     """
     neutral, precision = np.zeros(len(joint_names)), np.zeros((len(joint_names),) * 2)
     for name, mean_deg, sd_deg in pose_prior_deg:
@@ -70,10 +67,7 @@ def learned_poses(name: str) -> dict[str, Any]:
     """A mixture that was learned from people: `joints`, and `components` with `weight`, `mean_deg` and
     `covariance_deg2` of these joints.
 
-    Raises
-    ------
-    PblError
-        FIT_INPUT: there is no such prior.
+    Raises `PblError` FIT_INPUT: there is no such prior.
     """
     path = DATA / f"{name}.json"
     if not path.is_file():

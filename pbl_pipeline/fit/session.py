@@ -70,12 +70,9 @@ def make_session(
 ) -> Session:
     """Validate the trials of one session and pack them, in the units of the paramset.
 
-    Raises
-    ------
-    PblError
-        FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not finite where
-        confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE,
-        MARKER_SET_UNKNOWN, PHONE_LOG.
+    Raises `PblError` FIT_INPUT (no trial, too few frames in view, time stamps out of order, nothing seen, values not
+    finite where confidence is positive, trials of different kinds, a paramset in unknown units), VIEWS_DISAGREE,
+    MARKER_SET_UNKNOWN, PHONE_LOG.
     """
     cost: CostParams = getattr(params, "cost", CostParams())  # a laboratory's own solver may have none
     check_units(cost)

@@ -58,6 +58,8 @@ def fit_session(
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
+
     Parameters
     ----------
     trials, names
@@ -75,11 +77,6 @@ def fit_session(
     height_m
         The person's measured body height (m): lengths of a fit to one camera then are those of a person so tall, where
         they otherwise are the detector's guess (`known_height`). Angles do not depend on it.
-
-    Raises
-    ------
-    PblError
-        FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN, PHONE_LOG, SOLVER_UNKNOWN, FIT_DIVERGED.
     """
     result = fit_sessions([SessionInput(trials, names, camera_motion, markers, height_m)], paramset)[0]
     if isinstance(result, PblError):
@@ -97,10 +94,7 @@ def fit_sessions(
     A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once, padded to a
     power of 2 (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
 
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN.
+    Raises `PblError` SOLVER_UNKNOWN.
     """
     method = METHODS.find(paramset)
     paramset = method.paramset

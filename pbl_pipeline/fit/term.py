@@ -118,7 +118,6 @@ class Term:
     by_hand: Callable[[At], tuple[Array, Array]] | None = None
 
     def value(self, at: At) -> Float[Array, ""]:
-        """Return the weighted cost."""
         if self.empty(at):
             return jnp.zeros(())
         cost = self._robust(at, square(self.residual(at, self.variables(at))))
@@ -167,10 +166,8 @@ class SharedTerm:
     unknowns: Unknowns = Unknowns.SHARED
 
     def value(self, at: At) -> Float[Array, ""]:
-        """Return the weighted cost."""
         return weight_of(self, at) * self.cost(at)
 
 
 def weight_of(term: Term | SharedTerm, at: At) -> Array | float:
-    """Return the weight of a term."""
     return at.weights[term.weight] if term.weight else 1.0

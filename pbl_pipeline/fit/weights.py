@@ -48,10 +48,7 @@ class Weights:
     def of(cls, body: Body, params: GaussNewtonParams | ImplicitAdamParams, size_unseen: bool = False) -> Weights:
         """Return those of a paramset. `size_unseen`: nothing seen tells the person's size, so a prior does.
 
-        Raises
-        ------
-        PblError
-            FIT_INPUT: the paramset has a prior of no joint.
+        Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
         """
         cost = params.cost
         # The paper's solver evaluates the paper's terms and priors alone, which need no other number of these.

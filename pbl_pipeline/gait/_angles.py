@@ -44,7 +44,6 @@ class AngleSeries:
     sd: dict[str, dict[str, np.ndarray]] = dataclasses.field(default_factory=dict)
 
     def of_side(self, side: str) -> dict[str, np.ndarray]:
-        """The angles of "left" or "right"."""
         return self.right if side == RIGHT else self.left
 
 
@@ -110,17 +109,14 @@ def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray
     the walking direction (forward, up, right) and decomposed there in the same order (tilt, obliquity, rotation,
     body-fixed), so that the result does not depend on where the person walks.
 
+    Returns (T, 3): tilt, anterior positive; obliquity, right side up positive; rotation, right side ahead positive.
+
     Parameters
     ----------
     R_world_pelvis
         (T, 3, 3), columns forward, up, right of the pelvis in a z-up world.
     forward
         (T, 3) unit horizontal heading.
-
-    Returns
-    -------
-    (T, 3)
-        tilt, anterior positive; obliquity, right side up positive; rotation, right side ahead positive.
     """
     up = np.broadcast_to([0.0, 0.0, 1.0], forward.shape)
     heading = np.stack([forward, up, np.cross(forward, up)], axis=-1)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
-from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 
 from ._condition import ANY_PACE, SELF_SELECTED
 from ._profile import MovementProfile, movement_profile, variable_scores
@@ -196,6 +196,9 @@ def score_gdi(
     `GdiCycle.explained` says how much was. Where the fit knows how sure its angles are, what their errors lengthen is
     taken back from the distance (`GdiParams.lengthening`; docs/measures.md).
 
+    Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another
+    model; ANGLE_UNITS for curves that are not in degrees.
+
     Parameters
     ----------
     cycles
@@ -207,12 +210,6 @@ def score_gdi(
     model, version
         A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
         the norm's angles decide; a norm of other angles than the two indices have gives an index of its own name.
-
-    Raises
-    ------
-    PblError
-        NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another model;
-        ANGLE_UNITS for curves that are not in degrees.
     """
     method = GDI_METHODS.find(model)
     basis = norm_of(norm, params or method.params)
@@ -396,7 +393,6 @@ def _changes(
 
 
 def _of_mean(values: np.ndarray) -> float:
-    """Variance of the mean of values."""
     return float(np.var(values, ddof=min(1, len(values) - 1))) / len(values)
 
 
@@ -486,26 +482,14 @@ def _checks(
 ) -> tuple[Check, ...]:
     if reason:
         return (Check("gdi_cycles", EMPTY, float(len(scored)), float(2 * params.min_cycles_per_side), reason),)
-    few = len(scored) < params.advised_cycles
+    n, advised, least = len(scored), params.advised_cycles, params.min_explained
     fraction = float(np.mean([c.explained for c in scored]))
+    few = "few cycles: record more passes and give them as trials of one session"
+    unlike = "most of the deviation is of a kind that healthy walking does not show: the index understates it"
     return (
         _convention(angle_models, norm),
-        Check(
-            "gdi_cycles",
-            WARN if few else PASS,
-            float(len(scored)),
-            float(params.advised_cycles),
-            "few cycles: record more passes and give them as trials of one session" if few else "",
-        ),
-        Check(
-            "gdi_explained",
-            PASS if fraction >= params.min_explained else WARN,
-            round(fraction, 3),
-            params.min_explained,
-            ""
-            if fraction >= params.min_explained
-            else "most of the deviation is of a kind that healthy walking does not show: the index understates it",
-        ),
+        warn_if(n < advised, "gdi_cycles", float(n), float(advised), few),
+        warn_if(not fraction >= least, "gdi_explained", round(fraction, 3), least, unlike),
     )
 
 
@@ -527,4 +511,4 @@ def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
             "constant; what else differs (hip joint centres, age, a person's own pelvis) is in the index. Changes "
             "between sessions hold better than a single value against 100"
         )
-    return Check("norm_convention", WARN if advice else PASS, None, None, advice)
+    return warn_if(advice, "norm_convention", None, None, advice)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import PASS, WARN, Check
+from pbl_pipeline.qc import Check, warn_if
 
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
@@ -33,6 +33,9 @@ def norm_from_cycles(
 ) -> tuple[NormativeSet, tuple[Check, ...]]:
     """The set that the used cycles of healthy people make, and checks of it.
 
+    Raises `PblError` NORM_INVALID: fewer than 30 usable cycles, no more cycles than components, angles of several
+    definitions, or other angles than an index has. ANGLE_UNITS.
+
     Parameters
     ----------
     cycles, people
@@ -41,12 +44,6 @@ def norm_from_cycles(
         Angles of the index: three (curves at 0, 2, ..., 98 %, as the paper's) or nine (0, 2, ..., 100 %).
     variance, n_components, pooled
         As in `fit_norm`; `pooled` are cycles of patients that the components are fitted to as well.
-
-    Raises
-    ------
-    PblError
-        NORM_INVALID: fewer than 30 usable cycles, no more cycles than components, angles of several definitions, or
-        other angles than an index has. ANGLE_UNITS.
     """
     variables = tuple(variables)
     if variables not in MODEL_ANGLES.values():
@@ -78,22 +75,12 @@ def norm_from_cycles(
         pooled=np.array([_vector(c, variables, at) for c in others]) if others else None,
         angle_model=model,
     )
-    few, most = len(counts) < ADVISED_PEOPLE, max(counts.values()) / len(known)
+    n, most = len(counts), max(counts.values()) / len(known)
+    few = "few people: the set says how these walk, not how healthy people do"
+    leans = "one person has a large part of the cycles: the set leans towards that gait"
     return norm, (
-        Check(
-            "norm_people",
-            WARN if few else PASS,
-            float(len(counts)),
-            float(ADVISED_PEOPLE),
-            "few people: the set says how these walk, not how healthy people do" if few else "",
-        ),
-        Check(
-            "norm_share_of_one_person",
-            WARN if most > MAX_SHARE else PASS,
-            round(most, 3),
-            MAX_SHARE,
-            "one person has a large part of the cycles: the set leans towards that gait" if most > MAX_SHARE else "",
-        ),
+        warn_if(n < ADVISED_PEOPLE, "norm_people", float(n), float(ADVISED_PEOPLE), few),
+        warn_if(most > MAX_SHARE, "norm_share_of_one_person", round(most, 3), MAX_SHARE, leans),
     )
 
 

@@ -121,7 +121,6 @@ class Spatiotemporal:
         return {name: m for name, m in self.measures.items() if name not in MEASURES}
 
     def with_task(self, measures: Mapping[str, Measure | None], reasons: Mapping[str, str]) -> Spatiotemporal:
-        """Return the same with the measures of a task (`task_measures`)."""
         both = {**self.measures, **measures}, {**self.reasons, **reasons}
         return dataclasses.replace(self, measures=both[0], reasons=both[1])
 

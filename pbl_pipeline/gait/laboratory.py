@@ -74,11 +74,8 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
     `method` (`detect_events`). Whosever the events are, there are none where the markers show somebody who lies or
     walks backwards, or a world whose vertical is not z. A sample that the file marks as invalid is NaN.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT (neither labels
-        nor foot markers; markers upside down or mirrored).
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT
+    (neither labels nor foot markers; markers upside down or mirrored).
     """
     path = Path(path)
     angle_points = [s + p for p, _ in PLUG_IN_GAIT_POINTS.values() for s in "LR"]
@@ -102,10 +99,7 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
 def read_lab_feet(path: str | Path) -> FootTrajectories:
     """Feet and legs from the markers of a C3D file (also gzipped), metres; needs neither angles nor labels.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing).
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing).
     """
     path = Path(path)
     points, labels, time, table = _read(path, [*_FOOT_MARKERS, *_LEG_MARKERS])

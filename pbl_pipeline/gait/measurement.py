@@ -69,44 +69,25 @@ class MeasureError(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class MeasurementModel:
-    """A measured model.
+    """A measured model."""
 
-    Attributes
-    ----------
-    name, norm
-        Its own and that of the normative set whose components the scores belong to.
-    fits
-        Hashes of the fit parameters that it was measured with.
-    mean, spread
-        Mean (2K,) and covariance (2K, 2K) of people's true scores.
-    person
-        Covariance (2K, 2K) of the error that all passes of a person share.
-    views
-        By `GaitCycle.far_leg`: "left", "right", or "" where neither leg is behind the other (front, back).
-    cycle, n_cycles
-        Covariance (K, K) of a cycle's scores about the mean of its side, and how many cycles of a side the passes had.
-    widening
-        Factor of the index's standard deviation with which 90 % intervals of persons left out held 90 %.
-    events
-        Hash of the event method that the gait measures were found with.
-    pass_cycles
-        Cycles of both sides of one pass, of which the gait measures are means.
-    measures
-        Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
-    """
-
+    #: Its own and that of the normative set whose components the scores belong to.
     name: str
     norm: str
-    fits: Sequence[str]
+    fits: Sequence[str]  # hashes of the fit parameters that it was measured with
+    #: Mean (2K,) and covariance (2K, 2K) of people's true scores.
     mean: np.ndarray
     spread: np.ndarray
-    person: np.ndarray
+    person: np.ndarray  # covariance (2K, 2K) of the error that all passes of a person share
+    #: By `GaitCycle.far_leg`: "left", "right", or "" where neither leg is behind the other (front, back).
     views: dict[str, View]
+    #: Covariance (K, K) of a cycle's scores about the mean of its side, and how many cycles of a side the passes had.
     cycle: np.ndarray
     n_cycles: float
-    widening: float
-    events: str
-    pass_cycles: float
+    widening: float  # factor of the index's standard deviation with which 90 % intervals of persons left out held 90 %
+    events: str  # hash of the event method that the gait measures were found with
+    pass_cycles: float  # cycles of both sides of one pass, of which the gait measures are means
+    #: Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
     measures: Mapping[str, Mapping[str, MeasureError]]
 
 
@@ -231,7 +212,6 @@ def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
 
 
 def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
-    """(..., 2) of scores (..., 2K)."""
     return norm.index_of_scores(scores.reshape(*scores.shape[:-1], 2, -1))
 
 

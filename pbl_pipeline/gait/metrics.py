@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, WARN, Check, in_session, worst
+from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
 from ._condition import Condition
 from ._cycles import find_cycles
@@ -223,6 +223,8 @@ def pool_trials(
 ) -> SessionMetrics:
     """Measures and index of a session over all used cycles of its pooled trials.
 
+    Returns EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
+
     Parameters
     ----------
     trials
@@ -231,11 +233,6 @@ def pool_trials(
         Norm and method of the index (`score_gdi`); `params.events` only enters `params_hash`.
     conditions
         What is done in each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
-
-    Returns
-    -------
-    SessionMetrics
-        EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
     """
     given = [Condition()] * len(trials) if conditions is None else conditions
     pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
@@ -327,78 +324,36 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
     """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`,
     `cycles_of_odd_curves`, `legs_seen_alike`, `cadence_plausible`, `lengths_scale`."""
     odd = sum(c.odd_length for c in cycles)
-    lengths = Check(
-        "cycles_of_odd_length",
-        WARN if odd else PASS,
-        float(odd),
-        0.0,
-        _odd_lengths(cycles) if odd else "",
-    )
+    lengths = warn_if(odd, "cycles_of_odd_length", float(odd), 0.0, _odd_lengths(cycles))
     unlike = sum(c.odd_curves for c in cycles)
-    curves = Check(
-        "cycles_of_odd_curves",
-        WARN if unlike else PASS,
-        float(unlike),
-        0.0,
-        "their angles are far from those of the other cycles: left out of the measures, see the overlay"
-        if unlike
-        else "",
-    )
+    far_off = "their angles are far from those of the other cycles: left out of the measures, see the overlay"
+    curves = warn_if(unlike, "cycles_of_odd_curves", float(unlike), 0.0, far_off)
     if measures.status == EMPTY:
         return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()))
-    few = measures.n_cycles_used < 4
-    checks = [
-        Check(
-            "cycles_used",
-            WARN if few else PASS,
-            float(measures.n_cycles_used),
-            4.0,
-            "few cycles: film a longer stretch, or several passes" if few else "",
-        ),
-        lengths,
-        curves,
-    ]
+    n = measures.n_cycles_used
+    few = "few cycles: film a longer stretch, or several passes"
+    checks = [warn_if(n < 4, "cycles_used", float(n), 4.0, few), lengths, curves]
     if any(c.used for c in cycles):
         far = far_leg_of(cycles)
         near = "left" if far == "right" else "right"
-        checks.append(
-            Check(
-                "legs_seen_alike",
-                WARN if far else PASS,
-                None,
-                None,
-                f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
-                "not to be compared. Film a pass in each direction"
-                if far
-                else "",
-            )
+        advice = (
+            f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
+            "not to be compared. Film a pass in each direction"
         )
+        checks.append(warn_if(far, "legs_seen_alike", None, None, advice))
     cadence = measures["cadence_steps_per_min"]
     if cadence is not None:
-        plausible = 60.0 <= cadence.mean <= 150.0
-        checks.append(
-            Check(
-                "cadence_plausible",
-                PASS if plausible else WARN,
-                round(cadence.mean, 2),
-                60.0 if cadence.mean < 60.0 else 150.0,
-                "" if plausible else "unusual for walking: count the steps in the overlay",
-            )
-        )
+        odd_one = not 60.0 <= cadence.mean <= 150.0
+        bound = 60.0 if cadence.mean < 60.0 else 150.0
+        advice = "unusual for walking: count the steps in the overlay"
+        checks.append(warn_if(odd_one, "cadence_plausible", round(cadence.mean, 2), bound, advice))
     if measures["stride_length_m"] is not None:
         guessed = any(c.used and c.lengths.stride_length_m is not None and not c.lengths.metric for c in cycles)
-        checks.append(
-            Check(
-                "lengths_scale",
-                WARN if guessed else PASS,
-                None,
-                None,
-                "lengths and speed are scaled by an assumed body size (one camera sees no scale): state the measured "
-                "body height (--height-m), or compare visits of one person, not people"
-                if guessed
-                else "",
-            )
+        advice = (
+            "lengths and speed are scaled by an assumed body size (one camera sees no scale): state the measured "
+            "body height (--height-m), or compare visits of one person, not people"
         )
+        checks.append(warn_if(guessed, "lengths_scale", None, None, advice))
     return tuple(checks)
 
 

@@ -68,26 +68,15 @@ BRIDGED_S = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class TaskMotion:
-    """Signals in which the events of tasks are found; NaN in frames without the person.
+    """Signals in which the events of tasks are found; NaN in frames without the person."""
 
-    Attributes
-    ----------
-    time_s : (T,)
-    lowered : (T,)
-        1 - height of the hips over the lower ankle / length of the leg: about 0 standing, 0.5 sitting.
-    lean_deg : (T,)
-        Inclination of the line from the middle of the hips to the middle of the shoulders from the vertical.
-    knee_deg : (T,)
-        Angle between thigh and shank, mean of both: knee flexion.
-    heading_deg : (T,)
-        Direction that the pelvis faces on the floor, without jumps of 360.
-    """
-
-    time_s: Float[np.ndarray, " T"]
+    time_s: Float[np.ndarray, " T"]  # (T,)
+    #: (T,) 1 - height of the hips over the lower ankle / length of the leg: about 0 standing, 0.5 sitting.
     lowered: Float[np.ndarray, " T"]
+    #: (T,) inclination of the line from the middle of the hips to the middle of the shoulders from the vertical.
     lean_deg: Float[np.ndarray, " T"]
-    knee_deg: Float[np.ndarray, " T"]
-    heading_deg: Float[np.ndarray, " T"]
+    knee_deg: Float[np.ndarray, " T"]  # (T,) angle between thigh and shank, mean of both: knee flexion
+    heading_deg: Float[np.ndarray, " T"]  # (T,) direction that the pelvis faces on the floor, without jumps of 360
 
     @classmethod
     def of_points(
@@ -328,7 +317,6 @@ def _gap(motion: TaskMotion, begin_s: float, end_s: float) -> str:
 
 
 def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angle between vectors (..., 3) in degrees."""
     cosine = (a * b).sum(axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 

@@ -174,7 +174,6 @@ class BlazePoseLandmarks:
 
 
 def _with_margin(roi_px: np.ndarray) -> np.ndarray:
-    """The region that the network sees."""
     return np.array([roi_px[0], roi_px[1], roi_px[2] * CROP_MARGIN, roi_px[3]], np.float64)
 
 

@@ -141,7 +141,6 @@ def _close(time_s: np.ndarray, most_s: float) -> bool:
 
 
 def _in_view(video_path: str | Path, rows: np.ndarray) -> Iterator[Frame]:
-    """The frames `rows` of the video, in order."""
     wanted = set(rows.tolist())
     for frame in read_frames(video_path, start=int(rows[0]), stop=int(rows[-1]) + 1):
         if frame.index in wanted:

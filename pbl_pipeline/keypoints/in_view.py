@@ -39,26 +39,13 @@ class Gap:
 
 @dataclasses.dataclass(frozen=True)
 class Visibility:
-    """Frames in which the person is in view.
+    """Frames in which the person is in view."""
 
-    Attributes
-    ----------
-    time_s : (T,)
-    seen : (T,) bool
-        Most points of the person were found.
-    whole : (T,) bool
-        The whole person is in view (`whole_person_in_view`).
-    counts : (T,) bool
-        The frames that a fit uses: whole, or in a bridged gap.
-    gaps
-        Between the first and the last frame with the whole person.
-    """
-
-    time_s: np.ndarray
-    seen: np.ndarray
-    whole: np.ndarray
-    counts: np.ndarray
-    gaps: tuple[Gap, ...]
+    time_s: np.ndarray  # (T,)
+    seen: np.ndarray  # (T,) bool most points of the person were found
+    whole: np.ndarray  # (T,) bool the whole person is in view (`whole_person_in_view`)
+    counts: np.ndarray  # (T,) bool the frames that a fit uses: whole, or in a bridged gap
+    gaps: tuple[Gap, ...]  # between the first and the last frame with the whole person
 
     @property
     def whole_share(self) -> float:

@@ -120,6 +120,9 @@ class MarkerAugmenter:
     ) -> AnatomicalMarkers:
         """The markers of one person.
 
+        Raises `PblError` AUGMENTER_INPUT: other shapes, a point that is never known (a foot out of view), too short a
+        stretch, a height that no person has (another unit), or a body upside down (another axis up).
+
         Parameters
         ----------
         time_s : (T,)
@@ -131,12 +134,6 @@ class MarkerAugmenter:
             the mean body mass index of the network's people; `assumed` says so. Give the height only with positions
             of the person's own size: one camera hardly knows it, and each centimetre by which height and positions
             disagree tips the pelvis by 0.2 to 0.5 deg (docs/models.md).
-
-        Raises
-        ------
-        PblError
-            AUGMENTER_INPUT: other shapes, a point that is never known (a foot out of view), too short a stretch, a
-            height that no person has (another unit), or a body upside down (another axis up).
         """
         points = np.asarray(points_world_m, float)
         time_s = np.asarray(time_s, float)

@@ -22,25 +22,14 @@ SAME_TIME_S = 1e-3
 class MultiView:
     """Keypoints of the same moments from at least two cameras that stand still.
 
-    Attributes
-    ----------
-    views
-        Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
-    poses
-        Where each camera stands, in the same order; one world for all.
-    cameras
-        What each is called, for messages; empty where they have no names.
-
-    Raises
-    ------
-    PblError
-        FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another number of
-        poses.
+    Raises `PblError` FIT_INPUT: fewer than two views, or views that differ in names or times. CAMERA_INVALID: another
+    number of poses.
     """
 
+    #: Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
     views: tuple[Keypoints, ...]
-    poses: tuple[CameraPose, ...]
-    cameras: tuple[str, ...] = ()
+    poses: tuple[CameraPose, ...]  # where each camera stands, in the same order; one world for all
+    cameras: tuple[str, ...] = ()  # what each is called, for messages; empty where they have no names
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -85,10 +74,7 @@ class MultiView:
         `cameras` names each view's camera in the file; None: the views are in the file's order and number. The lens of
         the calibration replaces that of the keypoints.
 
-        Raises
-        ------
-        PblError
-            FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
+        Raises `PblError` FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
         """
         poses = load_camera_poses(calibration)
         names = list(poses if cameras is None else cameras)

@@ -93,10 +93,8 @@ class OnnxKeypoints:
     confidence from their spread (`sd_confidence`), their mean is `presence`. A model without: 3D is NaN, confidence is
     the mean of the model's own scores.
 
-    Raises
-    ------
-    PblError
-        MODEL_CHECKSUM where the registered model is not the one that the parameters name; what `OnnxModel` raises.
+    Raises `PblError` MODEL_CHECKSUM where the registered model is not the one that the parameters name; what
+    `OnnxModel` raises.
     """
 
     name = "onnx"

@@ -30,20 +30,11 @@ _LEAST_PX = 8
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """Measures of P frames.
+    """Measures of P frames."""
 
-    Attributes
-    ----------
-    time_s : (P,)
-        The frames' time stamps.
-    luma : (P, 3)
-        5th, 50th and 95th percentile of the brightness (0..255) where the person is.
-    detail : (P,)
-        Length of the finest detail as a fraction of the person's size, `detail_of`. Blur makes it longer.
-    """
-
-    time_s: np.ndarray
-    luma: np.ndarray
+    time_s: np.ndarray  # (P,) the frames' time stamps
+    luma: np.ndarray  # (P, 3) 5th, 50th and 95th percentile of the brightness (0..255) where the person is
+    #: (P,) length of the finest detail as a fraction of the person's size, `detail_of`. Blur makes it longer.
     detail: np.ndarray
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -128,7 +128,6 @@ def _cut(keypoints: Keypoints) -> list[Check | None]:
 
 
 def _picture(keypoints: Keypoints) -> list[Check | None]:
-    """Light and sharpness."""
     picture = keypoints.picture
     if picture is None or not len(picture.time_s):
         return []

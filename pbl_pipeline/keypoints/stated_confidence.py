@@ -30,33 +30,17 @@ _DATA = "data/confidence_curves.json"
 
 @dataclasses.dataclass(frozen=True)
 class ConfidenceCurve:
-    """A monotone map from stated confidence to probability.
+    """A monotone map from stated confidence to probability."""
 
-    Attributes
-    ----------
-    name
-        "blazepose-v1": detector and version.
-    detector
-        Name of the detector.
-    bound_trunk
-        The point counts as right within this fraction of the trunk's length.
-    stated, probability : (K,)
-        Knots; linear between them, constant outside.
-    n : int
-        Points that it was fitted to.
-    source
-        The data that it was fitted to, in words.
-    params
-        The parameters of the detection that gave these confidences (`KeypointParams` less `confidence_curve`).
-    """
-
-    name: str
-    detector: str
-    bound_trunk: float
+    name: str  # "blazepose-v1": detector and version
+    detector: str  # name of the detector
+    bound_trunk: float  # the point counts as right within this fraction of the trunk's length
+    #: (K,) knots; linear between them, constant outside.
     stated: np.ndarray
     probability: np.ndarray
-    n: int
-    source: str
+    n: int  # points that it was fitted to
+    source: str  # the data that it was fitted to, in words
+    #: The parameters of the detection that gave these confidences (`KeypointParams` less `confidence_curve`).
     params: dict
 
     def __call__(self, confidence: np.ndarray) -> np.ndarray:

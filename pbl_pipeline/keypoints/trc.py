@@ -33,12 +33,9 @@ class Trc:
 def read_trc(path: str | Path) -> Trc:
     """Read a TRC file.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such file. FILE_FORMAT: no TRC, other counts of frames or markers than its header says, a row
-        with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit other
-        than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
+    Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: no TRC, other counts of frames or markers than its header
+    says, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
+    other than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
     """
     try:
         # Only names matter: a path in the first line may be in any encoding.
@@ -87,7 +84,6 @@ def _count(path: str | Path, header: dict[str, str], name: str) -> int:
 
 
 def _numbers(path: str | Path, number: int, line: str, n_cells: int) -> np.ndarray:
-    """One row; empty cells are NaN."""
     cells = _cells(line)
     if len(cells) < n_cells or any(cells[n_cells:]):
         raise _damaged(path, f"line {number}: {len(cells)} cells", f"{n_cells} cells between tabs")

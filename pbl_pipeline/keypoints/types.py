@@ -51,64 +51,37 @@ class PersonKeypoints:
 class Keypoints:
     """One trial. Missing values are NaN with confidence 0.
 
-    Attributes
-    ----------
-    time_s : (T,) float64
-        The container's time stamps.
-    names : tuple of J str
-    marker_set
-        Name of a marker set of the body.
-    xy_px : (T, J, 2)
-        Pixels of the upright, still distorted image.
-    xyz_cam_m : (T, J, 3)
-        Camera frame (x right, y down, z forward), root-relative if `root_relative`.
-    confidence : (T, J)
-        0..1, as stated by the detector.
-    confidence_curve
-        Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
-    image_size_px : (width, height)
-    box_px : (T, 4)
-        x0, y0, x1, y1 of the person.
-    crop_px : (T,) or None
-        Longer side of the crop that the detector saw, in pixels of the picture. NaN where nothing was seen; None where
-        it was not stated.
-    phone_time_s, phone_quat_wxyz : (P,), (P, 4) or None
-        Phone orientation, camera to world, at its own stamps: both or neither. Brought to unit length, without jumps
-        of sign, when made (`check_attitude`); how much of the recording it covers is for the fit to judge.
-    origin
-        Which detector and model made them, under which licence and on what; empty where it is not stated.
-    sides_changed : (T, 3) bool or None
-        Frames in which left and right of the legs, and of the rest of the body, are not as the detector said but were
-        exchanged, and those in which its body has no width, so that the sides cannot be told; None: not checked.
-    assumed
-        Fields that the file did not have, for which a default stands (`load`).
-    picture
-        How light and sharp the picture of the person is, or None where no video was seen.
-
-    Raises
-    ------
-    PblError
-        FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
+    Raises `PblError` FILE_FORMAT (shapes, confidence), CAMERA_INVALID, PHONE_LOG.
     """
 
-    time_s: np.ndarray
+    time_s: np.ndarray  # (T,) the container's time stamps
     names: tuple[str, ...]
-    marker_set: str
-    xy_px: np.ndarray
-    xyz_cam_m: np.ndarray
+    marker_set: str  # name of a marker set of the body
+    xy_px: np.ndarray  # (T, J, 2) pixels of the upright, still distorted image
+    xyz_cam_m: np.ndarray  # (T, J, 3) camera frame (x right, y down, z forward), root-relative if `root_relative`
     root_relative: bool
-    confidence: np.ndarray
-    image_size_px: tuple[int, int]
+    confidence: np.ndarray  # (T, J) 0..1, as stated by the detector
+    image_size_px: tuple[int, int]  # (width, height)
     camera: Camera
-    box_px: np.ndarray
+    box_px: np.ndarray  # (T, 4) x0, y0, x1, y1 of the person
+    #: (P,), (P, 4) or None: phone orientation, camera to world, at its own stamps: both or neither. Brought to unit
+    #: length, without jumps of sign, when made (`check_attitude`); how much of the recording it covers is for the fit
+    #: to judge.
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
+    #: Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
     confidence_curve: str = ""
-    picture: Picture | None = None
+    picture: Picture | None = None  # how light and sharp the picture of the person is, or None where no video was seen
+    #: Which detector and model made them, under which licence and on what; empty where it is not stated.
     origin: str = ""
+    #: (T, 3) bool or None: frames in which left and right of the legs, and of the rest of the body, are not as the
+    #: detector said but were exchanged, and those in which its body has no width, so that the sides cannot be told;
+    #: None: not checked.
     sides_changed: np.ndarray | None = None
+    #: (T,) or None: longer side of the crop that the detector saw, in pixels of the picture. NaN where nothing was
+    #: seen; None where it was not stated.
     crop_px: np.ndarray | None = None
-    assumed: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()  # fields that the file did not have, for which a default stands (`load`)
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)

@@ -50,10 +50,7 @@ def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
 def check_views_agree(trial: MultiView, name: str) -> float:
     """The largest of `ray_miss_m` (m), NaN where no two cameras see the person in one frame.
 
-    Raises
-    ------
-    PblError
-        VIEWS_DISAGREE: more than `MOST_MISS_M`.
+    Raises `PblError` VIEWS_DISAGREE: more than `MOST_MISS_M`.
     """
     miss = ray_miss_m(trial)
     most = float(np.max(miss, initial=-np.inf, where=np.isfinite(miss)))

@@ -22,31 +22,15 @@ _FIELDS = ("time_s", "names", "marker_set", "xyz_world_m", "confidence")
 class WorldMarkers:
     """One trial of optical markers. A marker that was not seen is NaN with confidence 0.
 
-    Attributes
-    ----------
-    time_s : (T,) float64
-        Time stamps, finite.
-    names : tuple of J str
-        All different.
-    marker_set
-        Name of the marker set; for a laboratory's own, the stem of its table.
-    xyz_world_m : (T, J, 3) float64
-        World: right-handed, z up, metres; origin and heading are the laboratory's.
-    confidence : (T, J) float64
-        0..1.
-
-    Raises
-    ------
-    PblError
-        FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with a confidence
-        above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
+    Raises `PblError` FILE_FORMAT: shapes, types, names that repeat, confidence outside 0..1, infinite values, NaN with
+    a confidence above 0. The order of the stamps is checked where they are used (FIT_INPUT, GAIT_INPUT).
     """
 
-    time_s: np.ndarray
-    names: tuple[str, ...]
-    marker_set: str
-    xyz_world_m: np.ndarray
-    confidence: np.ndarray
+    time_s: np.ndarray  # (T,) time stamps, finite
+    names: tuple[str, ...]  # all different
+    marker_set: str  # name of the marker set; for a laboratory's own, the stem of its table
+    xyz_world_m: np.ndarray  # (T, J, 3) world: right-handed, z up, metres; origin and heading are the laboratory's
+    confidence: np.ndarray  # (T, J) 0..1
 
     def __post_init__(self) -> None:
         for field in ("time_s", "xyz_world_m", "confidence"):
@@ -115,10 +99,7 @@ class WorldMarkers:
         x stays (OpenSim's forward) and the frame stays right-handed. "z": taken as it is. Empty cells, NaN and three
         zeros, which some programs write into gaps, are missing: NaN with confidence 0; all else has confidence 1.
 
-        Raises
-        ------
-        PblError
-            FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
+        Raises `PblError` FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
         """
         if up not in ("y", "z"):
             raise PblError(

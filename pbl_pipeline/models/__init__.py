@@ -8,33 +8,3 @@ from .registry import ModelStatus, add, find, is_registered, registered, remove,
 from .spec import KINDS, ModelInput, ModelSpec, load_spec, mirror_pairs, model_invalid, parse_spec
 from .ssd import SsdLayout, SsdModel, box_iou, suppress
 from .tflite import LiteModel
-
-__all__ = [
-    "DEVICES",
-    "KINDS",
-    "LiteModel",
-    "ModelInput",
-    "ModelSpec",
-    "ModelStatus",
-    "Network",
-    "OnnxModel",
-    "SsdLayout",
-    "SsdModel",
-    "add",
-    "asked_device",
-    "available_devices",
-    "box_iou",
-    "check_frozen",
-    "find",
-    "gpu_visible",
-    "is_registered",
-    "load_spec",
-    "mirror_pairs",
-    "model_invalid",
-    "parse_spec",
-    "providers_for",
-    "registered",
-    "remove",
-    "suppress",
-    "verify",
-]

@@ -36,10 +36,8 @@ def available_devices() -> tuple[str, ...]:
 def providers_for(device: str | None = None) -> list[str]:
     """Execution providers to ask a session for.
 
-    Raises
-    ------
-    PblError
-        DEVICE_UNAVAILABLE: CUDA was asked for and the installed onnxruntime has none. USAGE: an unknown device.
+    Raises `PblError` DEVICE_UNAVAILABLE: CUDA was asked for and the installed onnxruntime has none. USAGE: an unknown
+    device.
     """
     asked, there = asked_device(device), available_devices()
     if asked == "auto":
@@ -55,7 +53,6 @@ def device_of(providers: Sequence[str]) -> str:
 
 
 def unavailable(found: str) -> PblError:
-    """DEVICE_UNAVAILABLE about CUDA."""
     return PblError(
         "DEVICE_UNAVAILABLE",
         found=found,

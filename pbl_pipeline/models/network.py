@@ -50,6 +50,9 @@ class Network:
 
     On the GPU several threads may call it at once, and `side_by_side` of them fill it; by LiteRT one at a time.
 
+    Raises `PblError` ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for, a GPU is
+    visible, and it does not compute this network. USAGE: an unknown device.
+
     Attributes
     ----------
     sha256
@@ -58,12 +61,6 @@ class Network:
         Name of the GPU that computes, or "" for LiteRT on the CPU.
     note
         Why LiteRT computes although a GPU is visible; "" where there is nothing to say.
-
-    Raises
-    ------
-    PblError
-        ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for, a GPU is visible,
-        and it does not compute this network. USAGE: an unknown device.
     """
 
     def __init__(

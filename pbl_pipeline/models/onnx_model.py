@@ -20,6 +20,10 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 class OnnxModel:
     """A model's folder, loaded. Not to be shared by threads.
 
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID (also an opset or operator that the runtime does not know, another
+    name or shape of an input or output, another number of points), MODEL_CHECKSUM, MARKER_SET_UNKNOWN,
+    DEVICE_UNAVAILABLE, USAGE.
+
     Attributes
     ----------
     spec
@@ -28,12 +32,6 @@ class OnnxModel:
         "cpu" or "cuda": where it computes.
     note
         Why it is not the device one would expect; "" where there is nothing to say.
-
-    Raises
-    ------
-    PblError
-        MODEL_MISSING, MODEL_INVALID (also an opset or operator that the runtime does not know, another name or shape
-        of an input or output, another number of points), MODEL_CHECKSUM, MARKER_SET_UNKNOWN, DEVICE_UNAVAILABLE, USAGE.
     """
 
     def __init__(self, folder: str | Path, device: str | None = None) -> None:

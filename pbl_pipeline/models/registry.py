@@ -69,12 +69,9 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
     `sha256` is that of the archive, and must be given for an address. The model is loaded and run once on the CPU
     before anything is kept. Registering the same bytes again changes nothing.
 
-    Raises
-    ------
-    PblError
-        MODEL_MISSING (also where nothing can be fetched), MODEL_INVALID, MODEL_CHECKSUM, MARKER_SET_UNKNOWN; USAGE
-        where another model has the name and `replace` is not set, or an address comes without `sha256`;
-        FILE_UNWRITABLE.
+    Raises `PblError` MODEL_MISSING (also where nothing can be fetched), MODEL_INVALID, MODEL_CHECKSUM,
+    MARKER_SET_UNKNOWN; USAGE where another model has the name and `replace` is not set, or an address comes without
+    `sha256`; FILE_UNWRITABLE.
     """
     with unpacked(source, sha256) as folder:
         model = OnnxModel(folder, "cpu")

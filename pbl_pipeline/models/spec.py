@@ -54,54 +54,33 @@ class ModelInput:
 
 @dataclasses.dataclass(frozen=True)
 class ModelSpec:
-    """One model.
-
-    Attributes
-    ----------
-    kind
-        "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera
-        (x right, y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y`
-        likewise.
-        "heatmap": `heatmap` (N, J, h, w). "person_detector": `boxes` (N, cells, 5 + classes), YOLOX's rows; it has
-        no marker set and no joint names.
-    sha256
-        Of `model.onnx`.
-    outputs
-        Role (above) -> name in the graph.
-    mirror : (J,) ints
-        For each point of a mirrored picture, whose it is.
-    pixel_origin
-        Where coordinates of the crop count from: "centre" of the first pixel, or its "edge".
-    box_margin
-        How much larger than the person's box (the region of interest) the crop is to be.
-    spec_sha256
-        Over all that changes a result, without names and licences.
-    """
+    """One model."""
 
     name: str
+    #: "crop3d": `coords2d` (N, J, 2) px of the crop and `coords3d` (N, J, 3) mm in the axes of the crop's camera (x
+    #: right, y down, z forward), up to one common shift. "simcc": `simcc_x` (N, J, width * split), `simcc_y` likewise.
+    #: "heatmap": `heatmap` (N, J, h, w). "person_detector": `boxes` (N, cells, 5 + classes), YOLOX's rows; it has no
+    #: marker set and no joint names.
     kind: str
-    sha256: str
+    sha256: str  # of `model.onnx`
     licence: str
     source: str
     input: ModelInput
-    outputs: Mapping[str, str]
+    outputs: Mapping[str, str]  # role (above) -> name in the graph
     marker_set: str
     joint_names: tuple[str, ...]
-    mirror: tuple[int, ...]
-    pixel_origin: str
-    box_margin: float
+    mirror: tuple[int, ...]  # (J,) ints for each point of a mirrored picture, whose it is
+    pixel_origin: str  # where coordinates of the crop count from: "centre" of the first pixel, or its "edge"
+    box_margin: float  # how much larger than the person's box (the region of interest) the crop is to be
     simcc_split: float
-    spec_sha256: str
+    spec_sha256: str  # over all that changes a result, without names and licences
 
 
 def load_spec(folder: str | Path) -> ModelSpec:
     """Read `model.json` of a model's folder. Whether `model.onnx` fits it, `OnnxModel` checks.
 
-    Raises
-    ------
-    PblError
-        MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a wrong kind.
-        MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
+    Raises `PblError` MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a
+    wrong kind. MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
     """
     path = Path(folder) / SPEC_FILE
     try:

@@ -28,6 +28,11 @@ class Check:
         return dataclasses.asdict(self)
 
 
+def warn_if(bad: object, check: str, value: float | None, threshold: float | None, advice: str) -> Check:
+    """A check that asks with `advice` for attention where something is `bad`, else passes."""
+    return Check(check, WARN if bad else PASS, value, threshold, advice if bad else "")
+
+
 def worst(checks: Iterable[Check]) -> str:
     """The worst outcome; PASS when there is no check."""
     return max((c.outcome for c in checks), key=OUTCOMES.index, default=PASS)

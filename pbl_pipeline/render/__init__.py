@@ -7,26 +7,3 @@ from pbl_pipeline.render.overlay import overlay_frames, render_overlay, report_i
 from pbl_pipeline.render.projection import NEAR_M, rotation_matrix, scaled_camera, to_camera, to_pixels, turning_radius2
 from pbl_pipeline.render.skeleton import draw_skeleton, skeleton_lines
 from pbl_pipeline.render.strip import stance_spans
-
-__all__ = [
-    "NEAR_M",
-    "SIDE_COLOUR",
-    "BodyTrack",
-    "body_track",
-    "capsule_outline",
-    "draw_body",
-    "draw_keypoints",
-    "draw_skeleton",
-    "overlay_frames",
-    "render_overlay",
-    "report_indices",
-    "rotation_matrix",
-    "scaled_camera",
-    "side_of",
-    "skeleton_lines",
-    "stance_spans",
-    "to_camera",
-    "to_pixels",
-    "turning_radius2",
-    "uncertain_sides",
-]

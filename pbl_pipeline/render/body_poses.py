@@ -22,38 +22,23 @@ _LEG = ("hip", "knee", "ankle", "heel", "foot_index")
 
 @dataclasses.dataclass(frozen=True)
 class BodyTrack:
-    """B bodies over T frames in the world of the fit (z up, origin at the camera).
+    """B bodies over T frames in the world of the fit (z up, origin at the camera)."""
 
-    Attributes
-    ----------
-    names, sides
-        Of the bodies; the side is "left", "right" or "middle".
-    leg : (B,)
-        True for the bodies of the two legs, from the thigh on.
-    parent : (B,)
-        Index of the parent; -1 for the root, which comes first.
-    offset_m : (B, 3)
-        Origin of a body in its parent's frame, the same in every pose: the joints turn bodies about their origins. 0
-        for the root.
-    root_m : (T, 3)
-        Origin of the root in the world; NaN where the pose is unknown.
-    quat_wxyz : (T, B, 4)
-        Body to world, unit quaternions without changes of sign between known frames; NaN where the pose is unknown.
-    shapes
-        The capsules in the bodies' frames.
-    floor_m
-        Height of the floor: the median over the frames of the body's lowest point, because a foot is on the floor in
-        most frames of a walk. NaN where no pose is known.
-    """
-
+    #: Of the bodies; the side is "left", "right" or "middle".
     names: tuple[str, ...]
     sides: tuple[str, ...]
-    leg: np.ndarray
-    parent: np.ndarray
+    leg: np.ndarray  # (B,) true for the bodies of the two legs, from the thigh on
+    parent: np.ndarray  # (B,) index of the parent; -1 for the root, which comes first
+    #: (B, 3) origin of a body in its parent's frame, the same in every pose: the joints turn bodies about their
+    #: origins. 0 for the root.
     offset_m: np.ndarray
-    root_m: np.ndarray
+    root_m: np.ndarray  # (T, 3) origin of the root in the world; NaN where the pose is unknown
+    #: (T, B, 4) body to world, unit quaternions without changes of sign between known frames; NaN where the pose is
+    #: unknown.
     quat_wxyz: np.ndarray
-    shapes: CapsuleShapes
+    shapes: CapsuleShapes  # the capsules in the bodies' frames
+    #: Height of the floor: the median over the frames of the body's lowest point, because a foot is on the floor in
+    #: most frames of a walk. NaN where no pose is known.
     floor_m: float
 
 

@@ -107,28 +107,21 @@ def render_overlay(
     fit is unknown show the bare picture. Below the picture runs a strip with the knee flexion of both sides, the foot
     contacts and the time. Memory does not grow with the length of the video.
 
+    Raises `PblError` VIDEO_* when the video cannot be read; VIDEO_CHANGED when its frames are not those of the fit;
+    FILE_FORMAT when the keypoints are of another video.
+
     Parameters
     ----------
-    video_path
-        The recording the fit was made from.
     fit
         One trial; its frames are those of the video.
     out_path
         An .mp4 file; written beside it first and moved when complete, so that no half file is left under this name.
-    keypoints
-        Detected points, drawn as small dots.
     events
         Foot contacts of this trial, `GaitEvents.events`.
     max_side_px
         The picture is scaled down until its longer side is at most this.
     crf
         x264's quality, 0 (lossless) to 51; 23 is its default.
-
-    Raises
-    ------
-    PblError
-        VIDEO_* when the video cannot be read; VIDEO_CHANGED when its frames are not those of the fit; FILE_FORMAT
-        when the keypoints are of another video.
     """
     out_path = Path(out_path)
     painter = _Painter(fit, keypoints)
@@ -176,10 +169,7 @@ def overlay_frames(
     `crop_to_body` cuts each picture to the drawn person with a margin (4:3 where the frame allows it); a frame whose
     fit is unknown stays whole. The longer side is then scaled down to at most `max_side_px`.
 
-    Raises
-    ------
-    PblError
-        As `render_overlay`; USAGE when a frame does not exist.
+    Raises `PblError` As `render_overlay`; USAGE when a frame does not exist.
     """
     wanted = sorted({int(i) for i in indices})
     if wanted and (wanted[0] < 0 or wanted[-1] >= len(fit.time_s)):

@@ -2,5 +2,3 @@
 
 from pbl_pipeline.report._write import write_report
 from pbl_pipeline.report.types import Picture
-
-__all__ = ["Picture", "write_report"]

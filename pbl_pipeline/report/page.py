@@ -65,10 +65,13 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
         "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
         "key_time": _figures.legend("left", "right", "stance"),
-        "notes": _notes(visit, norm),
+        "event_methods": [] if metrics is None else list(dict.fromkeys(t.events.method for t in metrics.trials)),
+        "scale_assumed": any(
+            r.fit is not None and r.fit.orientation_source != "measured: calibration" for r in visit.fitted
+        ),
+        "norm": norm,
         "origin": _origin(visit, recordings, norm),
-        "footer": f"Made by the PBL pipeline {code_version()}. Research software: not a medical device, "
-        "and no diagnosis. Everything on this page is contained in it; nothing is loaded from elsewhere.",
+        "version": code_version(),
     }
     if metrics is not None and not empty:
         values = metrics.spatiotemporal
@@ -76,15 +79,10 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
         page["measures"] = [_measure_row(k, values[k], values.reasons.get(k, "")) for k in MEASURES]
         page["measures"].append(_gdi_row(metrics.gdi))
-        page["measures_note"] = (
-            f"{plural(values.n_cycles_used, 'gait cycle')} used of {values.n_cycles_found} found: the first and the "
-            "last step of each walk are left out, and cycles unlike the others in length or curves. SD over all values "
-            "of both sides, n counts them; 90 % is half the interval of Both, of its whole error; CV is the spread "
-            "within a side in percent of the mean; asymmetry is right minus left in percent of their mean."
-        )
+        page["cycles_used"], page["cycles_found"] = plural(values.n_cycles_used, "gait cycle"), values.n_cycles_found
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
-        page["cycles_note"] = _cycles_note(bands, far_leg_of(cycles))
+        page["bands"], page["far_leg"] = bands, far_leg_of(cycles)
         shipped = _norm(visit)
         people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
         page["index"] = _index(metrics.gdi, metrics.cycles, people)
@@ -99,7 +97,6 @@ def _norm(visit: Visit) -> NormativeSet | None:
 
 
 def _bands(visit: Visit) -> NormalBands:
-    """Return the normal curves at the person's speed."""
     fit = next((r.fit for r in visit.fitted), None)
     leg = None if fit is None else leg_length_m(fit.scale)
     return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal, leg)
@@ -332,69 +329,6 @@ def _check_row(c: Check) -> dict:
         "threshold": significant(c.threshold),
         "advice": "" if c.outcome == PASS else sentence(c.advice),
     }
-
-
-def _cycles_note(bands: NormalBands, far: str) -> str:
-    far_note = f"The {far} leg, which was behind the other, is less certain and drawn faintly. " if far else ""
-    return far_note + (
-        "0 % is foot down, 100 % the next foot down of the same foot. Left is dashed. Thin lines are the single "
-        f"cycles that count, thick ones their mean. Norm: typically developing children {bands.words()}; mapped to "
-        f"this body's pelvis; {bands.source}."
-    )
-
-
-#: What a reader should know of each method of the gait events.
-_EVENT_NOTES = {
-    "phase-transformer": "Foot contacts come from a neural network that was trained on synthetic people and a Kalman "
-    "smoother over its phases (after Cotton et al. 2022). Against the force plates of a laboratory, on 11 children "
-    "with markers, they scatter by 12 ms and are 7 ms early, foot down and foot up alike, so that stance and double "
-    "support keep their length. Against the eye, on one recording of an adult, foot down is about 20 ms late.",
-    "zeni-2008": "Foot contacts are found from the position of heel and toe relative to the pelvis (Zeni, Richards and "
-    "Higginson 2008, Gait & Posture 27:710-714). On laboratory markers this method sets foot down some hundredths "
-    "of a second early and foot up a little late, so stance and double support come out too long and swing too "
-    "short. Nothing is corrected for it. Cadence, stride time and step time are hardly touched, and changes "
-    "between visits less than single values.",
-    "oconnor-2007": "Foot contacts are found from the vertical speed of the foot (O'Connor, Thorpe, O'Malley and "
-    "Vaughan 2007, Gait & Posture 25:469-474). On laboratory markers it misses steps that come down flat.",
-}
-
-
-def _event_methods(visit: Visit) -> list[str]:
-    """Return the event methods of the trials, each once."""
-    trials = () if visit.measures is None else visit.measures.trials
-    return [m for m in dict.fromkeys(t.events.method for t in trials) if m in _EVENT_NOTES]
-
-
-def _notes(visit: Visit, norm: NormativeSet | None) -> list[str]:
-    notes = [
-        "Angles are those of a model of the body that was fitted to the picture. Flexion, adduction, internal rotation "
-        "and dorsiflexion are positive, on both sides.",
-        *(_EVENT_NOTES[m] for m in _event_methods(visit)),
-        "The GDI of three angles follows Schwartz and Rozumalski 2008 (Gait & Posture 28:351-357) with hip flexion, "
-        "hip adduction and knee flexion only: 100 is the mean of the norm, each 10 points one standard deviation, "
-        "lower is further away. It is not the original index of nine angles.",
-    ]
-    if any(r.fit is not None and r.fit.orientation_source != "measured: calibration" for r in visit.fitted):
-        notes.append(
-            "Speed and lengths are known only where the camera stands still, and are then scaled by an assumed body "
-            "size: one camera sees no scale. On one recording with marker motion capture the speed "
-            "came out 6 % too high."
-        )
-    notes.insert(
-        1,
-        "The grey bands come from a laboratory's marker model, whose pelvis leans 12 degrees further forward. The "
-        "constant is taken out, but a person's own pelvis may differ from it by some degrees, which shows at hip "
-        "flexion and pelvis tilt. Shapes and changes between visits can be compared; a constant offset from the band "
-        "alone is no finding.",
-    )
-    if norm is not None:
-        notes.append(f"The index compares with the set {norm.name} (n = {norm.n}): {norm.convention}.")
-        if norm.mapped_from:
-            notes[-1] += (
-                " What a constant does not map (hip joint centres, age, a person's own pelvis) is in the index: "
-                "changes between visits hold better than a single value against 100."
-            )
-    return notes
 
 
 def _origin(visit: Visit, recordings: Sequence[Recording], norm: NormativeSet | None) -> list[dict]:

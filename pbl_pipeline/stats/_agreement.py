@@ -17,25 +17,14 @@ LIMIT_SD = 1.96
 
 @dataclasses.dataclass(frozen=True)
 class BlandAltman:
-    """Limits of agreement, in the unit of the values.
+    """Limits of agreement, in the unit of the values."""
 
-    Attributes
-    ----------
-    bias
-        Mean of a - b with Student's interval.
-    lower, upper
-        bias - and + 1.96 sd, each with its interval.
-    sd
-        Of the differences (n - 1).
-    n
-        Pairs.
-    """
-
-    bias: Estimate
+    bias: Estimate  # mean of a - b with Student's interval
+    #: bias - and + 1.96 sd, each with its interval.
     lower: Estimate
     upper: Estimate
-    sd: float
-    n: int
+    sd: float  # of the differences (n - 1)
+    n: int  # pairs
 
 
 def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
@@ -44,10 +33,7 @@ def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
     The intervals of the limits are exact for normal differences (noncentral t; Carkeet 2015, Optom Vis Sci 92:e71-80).
     Bland and Altman's own, limit and t sqrt(3 / n) sd, are nearly that from 50 pairs on.
 
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
+    Raises `PblError` STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
     """
     difference = changes(b, a, 3)
     fraction(confidence, "confidence")

@@ -23,49 +23,28 @@ _CHUNK = 2000
 
 @dataclasses.dataclass(frozen=True)
 class Srm(Estimate):
-    """A standardised response mean.
+    """A standardised response mean."""
 
-    Attributes
-    ----------
-    jackknife, standard_error
-        Mean of the pseudo-values (the centre of the interval) and its standard error.
-    t, p
-        Of the mean pseudo-value against 0, with n - 1 degrees of freedom, two-sided.
-    n
-        Persons.
-    """
-
+    #: Mean of the pseudo-values (the centre of the interval) and its standard error.
     jackknife: float
     standard_error: float
+    #: Of the mean pseudo-value against 0, with n - 1 degrees of freedom, two-sided.
     t: float
     p: float
-    n: int
+    n: int  # persons
 
 
 @dataclasses.dataclass(frozen=True)
 class Wilcoxon:
-    """Wilcoxon's signed-rank test.
+    """Wilcoxon's signed-rank test."""
 
-    Attributes
-    ----------
-    statistic
-        Sum of the ranks of the positive changes.
-    p
-        Two-sided; exact for up to 50 persons without equal changes, by `scipy.stats.wilcoxon`.
-    n, zeros
-        Persons in all; those who did not change, whom the test leaves out.
-    effect
-        `effect_size` with its interval.
-    rank_biserial
-        Matched-pairs rank-biserial correlation: (positive - negative) / all ranks (Kerby 2014).
-    """
-
-    statistic: float
-    p: float
+    statistic: float  # sum of the ranks of the positive changes
+    p: float  # Two-sided; exact for up to 50 persons without equal changes, by `scipy.stats.wilcoxon`
+    #: Persons in all; those who did not change, whom the test leaves out.
     n: int
     zeros: int
-    effect: Estimate
-    rank_biserial: float
+    effect: Estimate  # `effect_size` with its interval
+    rank_biserial: float  # Matched-pairs rank-biserial correlation: (positive - negative) / all ranks (Kerby 2014)
 
 
 def srm(pre: Any, post: Any = None, confidence: float = 0.95) -> Srm:
@@ -74,15 +53,12 @@ def srm(pre: Any, post: Any = None, confidence: float = 0.95) -> Srm:
     The paper, Statistics (Liang et al. 1990), with its jackknife: pseudo-values n SRM - (n - 1) SRM without one person,
     the interval by Student's t about their mean (Miller 1974).
 
+    Raises `PblError` STATS_INPUT: fewer than three persons, NaN, all changes the same (or all but one).
+
     Parameters
     ----------
     pre, post : (N,)
         In any unit, the persons in the same order.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three persons, NaN, all changes the same (or all but one).
     """
     change = changes(pre, post, MIN_PERSONS)
     n = len(change)
@@ -128,15 +104,12 @@ def effect_size(
     (expanded percentiles, Hesterberg 2015, Am Stat 69:371-386). NaN where all who changed did so in one direction:
     every resample does, too, and cannot show what other persons would do.
 
+    Raises `PblError` STATS_INPUT: fewer than three persons, NaN, all changes the same.
+
     Parameters
     ----------
     pre, post : (N,)
         In any unit, the persons in the same order.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than three persons, NaN, all changes the same.
     """
     change = changes(pre, post, MIN_PERSONS)
     value = float(_effect(change[None])[0])

@@ -12,24 +12,17 @@ from ._input import differ, refuse
 
 @dataclasses.dataclass(frozen=True)
 class MeanSquares:
-    """Mean squares of a subjects x raters table; with missing ratings those of an equivalent complete one.
+    """Mean squares of a subjects x raters table; with missing ratings those of an equivalent complete one."""
 
-    Attributes
-    ----------
-    subjects, raters, error
-        Mean squares. `error` is that within subjects in the one-way model; `raters` equals it in models 1 and 3.
-    df_subjects, df_raters, df_error
-        Their degrees of freedom.
-    n, k
-        Subjects per rater, ratings per subject: harmonic means where ratings are missing.
-    """
-
+    #: Mean squares. `error` is that within subjects in the one-way model; `raters` equals it in models 1 and 3.
     subjects: float
     raters: float
     error: float
+    #: Their degrees of freedom.
     df_subjects: int
     df_raters: int
     df_error: int
+    #: Subjects per rater, ratings per subject: harmonic means where ratings are missing.
     n: float
     k: float
 

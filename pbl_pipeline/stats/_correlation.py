@@ -16,21 +16,12 @@ CORRELATIONS = ("pearson", "spearman", "repeated")
 
 @dataclasses.dataclass(frozen=True)
 class Correlation(Estimate):
-    """A correlation coefficient.
+    """A correlation coefficient."""
 
-    Attributes
-    ----------
-    kind
-        One of `CORRELATIONS`.
-    p
-        Two-sided, against 0, by Student's t with `df` degrees of freedom.
-    n, persons
-        Pairs of values; persons that they are of (as many, unless "repeated").
-    """
-
-    kind: str
-    p: float
+    kind: str  # one of `CORRELATIONS`
+    p: float  # Two-sided, against 0, by Student's t with `df` degrees of freedom
     df: int
+    #: Pairs of values; persons that they are of (as many, unless "repeated").
     n: int
     persons: int
 
@@ -44,16 +35,13 @@ def correlation(x: Any, y: Any, kind: str = "pearson", persons: Any = None, conf
     Intervals: Fisher's z with standard error 1 / sqrt(df - 1), where df = n - 2, or pairs - persons - 1 ("repeated");
     for Spearman sqrt((1 + r^2 / 2) / (df - 1)) (Bonett & Wright 2000, Psychometrika 65:23-28).
 
+    Raises `PblError` STATS_INPUT: unknown kind, fewer than four pairs, NaN, other lengths, a measure with the same
+    value throughout (for "repeated": within every person), fewer than two persons or too few repeats.
+
     Parameters
     ----------
     persons : (N,)
         Labels, for "repeated" only.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: unknown kind, fewer than four pairs, NaN, other lengths, a measure with the same value throughout
-        (for "repeated": within every person), fewer than two persons or too few repeats.
     """
     one_of(kind, CORRELATIONS, "kind")
     fraction(confidence, "confidence")

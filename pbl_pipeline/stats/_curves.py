@@ -19,64 +19,39 @@ CURVE_METHODS = ("max-t", "cluster")
 
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """A part of the cycle in which the curves differ.
+    """A part of the cycle in which the curves differ."""
 
-    Attributes
-    ----------
-    first, last
-        Its first and last point, in percent of the cycle.
-    sign
-        1 where a is larger than b, else -1.
-    p
-        Corrected for the whole cycle: of the cluster, or ("max-t") the smallest of its points.
-    """
-
+    #: Its first and last point, in percent of the cycle.
     first: float
     last: float
-    sign: int
-    p: float
+    sign: int  # 1 where a is larger than b, else -1
+    p: float  # corrected for the whole cycle: of the cluster, or ("max-t") the smallest of its points
 
 
 @dataclasses.dataclass(frozen=True)
 class CurveTest:
-    """A test of two sets of curves.
+    """A test of two sets of curves."""
 
-    Attributes
-    ----------
-    method, paired, alpha
-        As asked.
-    percent, difference, t, p : (P,)
-        Points of the cycle; mean of a - b over persons, in the unit of the curves; its t; p corrected for the whole
-        cycle ("cluster": that of the cluster a point is in, 1 outside).
-    threshold
-        "max-t": |t| above it is significant. "cluster": |t| above it belongs to a cluster.
-    p_value
-        Of the hypothesis that the curves differ nowhere: the smallest of `p`.
-    phases
-        Where they differ, p <= alpha.
-    n_a, n_b
-        Persons (not curves).
-    permutations, exact
-        How many, the data's own among them; whether these are all there are.
-    smallest_p
-        No smaller p is possible with so few persons and permutations.
-    """
-
+    #: As asked.
     method: str
     paired: bool
     alpha: float
+    #: (P,) points of the cycle; mean of a - b over persons, in the unit of the curves; its t; p corrected for the whole
+    #: cycle ("cluster": that of the cluster a point is in, 1 outside).
     percent: np.ndarray
     difference: np.ndarray
     t: np.ndarray
     p: np.ndarray
-    threshold: float
-    p_value: float
-    phases: tuple[Phase, ...]
+    threshold: float  # "max-t": |t| above it is significant. "cluster": |t| above it belongs to a cluster.
+    p_value: float  # of the hypothesis that the curves differ nowhere: the smallest of `p`
+    phases: tuple[Phase, ...]  # where they differ, p <= alpha
+    #: Persons (not curves).
     n_a: int
     n_b: int
+    #: How many, the data's own among them; whether these are all there are.
     permutations: int
     exact: bool
-    smallest_p: float
+    smallest_p: float  # no smaller p is possible with so few persons and permutations
 
 
 def curve_test(
@@ -103,6 +78,9 @@ def curve_test(
     over neighbouring points of one sign with |t| above its quantile at `cluster_p` (Maris & Oostenveld 2007, J Neurosci
     Methods 164:177-190): it finds long weak phases and judges no single point.
 
+    Raises `PblError` STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only
+    (paired) or in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
+
     Parameters
     ----------
     a, b : (N, P), (M, P)
@@ -111,12 +89,6 @@ def curve_test(
         Whose curve each is. Without them each row is a person of its own ("paired": the same in both, in order).
     n_permutations
         At most; all there are where these are no more.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only (paired) or
-        in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
     """
     one_of(method, CURVE_METHODS, "method")
     for value, name in ((alpha, "alpha"), (cluster_p, "cluster_p")):

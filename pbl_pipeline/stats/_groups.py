@@ -24,15 +24,9 @@ class Test:
 
 @dataclasses.dataclass(frozen=True)
 class MannWhitney(Test):
-    """A Mann-Whitney U test. `statistic` is U of the first group.
+    """A Mann-Whitney U test. `statistic` is U of the first group."""
 
-    Attributes
-    ----------
-    rank_biserial
-        2 U / (n_a n_b) - 1: P(a > b) - P(a < b).
-    """
-
-    rank_biserial: Estimate
+    rank_biserial: Estimate  # 2 U / (n_a n_b) - 1: P(a > b) - P(a < b)
 
 
 def shapiro_wilk(values: Any) -> Test:

@@ -24,26 +24,16 @@ _ROUNDING = 1e-12
 
 @dataclasses.dataclass(frozen=True)
 class Icc(Estimate):
-    """An intraclass correlation.
+    """An intraclass correlation."""
 
-    Attributes
-    ----------
-    kind
-        One of `ICC_KINDS`.
-    n, k
-        Subjects; ratings per subject, of which "1,k" to "3,k" are the mean: their harmonic mean where some are missing.
-    missing
-        How many ratings were NaN: with any, the variances are by REML.
-    sem
-        Standard error of measurement of one rating ("x,1") or of the mean of k ("x,k"), in the unit of the ratings: the
-        square root of the variance that is not the subjects', so sd sqrt(1 - ICC) (Weir 2005, J Strength Cond Res
-        19:231-240). Kinds 2 count the variance of the raters with it, kinds 3 do not.
-    """
-
-    kind: str
+    kind: str  # one of `ICC_KINDS`
+    #: Subjects; ratings per subject, of which "1,k" to "3,k" are the mean: their harmonic mean where some are missing.
     n: int
     k: float
-    missing: int
+    missing: int  # how many ratings were NaN: with any, the variances are by REML
+    #: Standard error of measurement of one rating ("x,1") or of the mean of k ("x,k"), in the unit of the ratings: the
+    #: square root of the variance that is not the subjects', so sd sqrt(1 - ICC) (Weir 2005, J Strength Cond Res
+    #: 19:231-240). Kinds 2 count the variance of the raters with it, kinds 3 do not.
     sem: float
 
     @property
@@ -91,6 +81,14 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     McGraw & Wong 1996 (Psychol Methods 1:30-46): exact for kinds 1 and 3, Satterthwaite's approximation for kinds 2.
     The paper's ICC2 and ICC2k (Clinical Construct Validity; Table 2) are "2,1" and "2,k" over steps of one day.
 
+    Raises `PblError` STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all
+    ratings equal, a subject or rater without any rating, no subject with two ratings; no variance of which subjects
+    could have a share; for the mean of k ratings also means of the subjects that differ so little that it is not
+    defined.
+
+    Returns `Icc`, with low <= value <= high <= 1. A value is negative where subjects differ less than error alone would
+    make them; `low` of a mean of k is -inf where the ratings put no lower bound on it.
+
     Parameters
     ----------
     ratings : (n, k)
@@ -105,19 +103,6 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
         "f" as above. "generalized": from draws of the mean squares, with `seed` (Weerahandi 1993, J Am Stat Assoc
         88:899-905; compared by Ionan et al. 2014, BMC Med Res Methodol 14:121). For kinds 2 with few raters whose means
         differ: there "f" holds the truth in as few as 80 % of studies (docs/statistics.md).
-
-    Returns
-    -------
-    Icc
-        With low <= value <= high <= 1. A value is negative where subjects differ less than error alone would make them;
-        `low` of a mean of k is -inf where the ratings put no lower bound on it.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all ratings equal,
-        a subject or rater without any rating, no subject with two ratings; no variance of which subjects could have a
-        share; for the mean of k ratings also means of the subjects that differ so little that it is not defined.
     """
     one_of(kind, ICC_KINDS, "kind")
     one_of(interval, ICC_INTERVALS, "interval")

@@ -14,7 +14,6 @@ _LARGEST = 1e100
 
 
 def refuse(found: str, expected: str, next_step: str) -> PblError:
-    """A `PblError` STATS_INPUT."""
     return PblError("STATS_INPUT", found=found, expected=expected, next_step=next_step)
 
 

@@ -28,15 +28,12 @@ def niqr(values: Any) -> float:
 def median_of_medians(errors: Sequence[Any]) -> tuple[float, float]:
     """Median absolute error: the median within each trial, then over the trials; and the nIQR over the trials.
 
+    Raises `PblError` STATS_INPUT: a trial without errors, NaN, fewer than two trials.
+
     Parameters
     ----------
     errors
         Of each trial its errors, signed or not, (N_i,) in any unit. Two trials at least.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: a trial without errors, NaN, fewer than two trials.
     """
     medians = []
     for i, trial in enumerate(errors):

@@ -17,27 +17,13 @@ _MOST = 1_000_000
 
 @dataclasses.dataclass(frozen=True)
 class SampleSize:
-    """What a study needs.
+    """What a study needs."""
 
-    Attributes
-    ----------
-    n
-        Persons who complete it: in all ("paired") or in each of two groups.
-    recruited
-        Persons to recruit (in each group) so that `n` are left after the drop-outs.
-    power
-        Reached with `n`.
-    effect
-        The change in units of `sd`.
-    sd
-        Standard deviation of what is compared: of the change, or of the values ("parallel").
-    """
-
-    n: int
-    recruited: int
-    power: float
-    effect: float
-    sd: float
+    n: int  # persons who complete it: in all ("paired") or in each of two groups
+    recruited: int  # persons to recruit (in each group) so that `n` are left after the drop-outs
+    power: float  # reached with `n`
+    effect: float  # the change in units of `sd`
+    sd: float  # standard deviation of what is compared: of the change, or of the values ("parallel")
 
 
 def sample_size(
@@ -51,6 +37,9 @@ def sample_size(
     change_sd: float = 0.0,
 ) -> SampleSize:
     """Persons whom a two-sided t test needs to find a true mean `change` (Cohen 1988; power from the noncentral t).
+
+    Raises `PblError` STATS_INPUT: a number outside its range, no `icc` where one is needed, more than a million
+    persons.
 
     Parameters
     ----------
@@ -67,11 +56,6 @@ def sample_size(
     change_sd
         By how much persons differ in their true change (same unit); adds to the above in squares. 0 presumes that
         everybody changes alike, which gives the smallest study.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: a number outside its range, no `icc` where one is needed, more than a million persons.
     """
     one_of(design, DESIGNS, "design")
     for value, name in ((power, "power"), (alpha, "alpha")):

@@ -15,20 +15,13 @@ _LARGEST_T = 1e4
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A statistic with its confidence interval.
+    """A statistic with its confidence interval."""
 
-    Attributes
-    ----------
-    value, low, high
-        The statistic and the limits of its interval, in the unit of the statistic.
-    confidence
-        Of the interval, 0.95 unless asked otherwise.
-    """
-
+    #: The statistic and the limits of its interval, in the unit of the statistic.
     value: float
     low: float
     high: float
-    confidence: float
+    confidence: float  # of the interval, 0.95 unless asked otherwise
 
 
 def fisher_z(r: float, standard_error: float, confidence: float) -> Estimate:

@@ -4,22 +4,3 @@ from .frame_columns import CURVE_PERCENT, CURVE_POINTS, FRAMES, KEYS, SIDES, Col
 from .study_folder import content_hash, data_dictionary, read_study, write_study
 from .subject_codes import deidentified
 from .types import FIRST_ROLES, StudyData, StudyDescription, classes_of, minimal_change_at
-
-__all__ = [
-    "CURVE_PERCENT",
-    "CURVE_POINTS",
-    "FIRST_ROLES",
-    "FRAMES",
-    "KEYS",
-    "SIDES",
-    "Column",
-    "StudyData",
-    "StudyDescription",
-    "classes_of",
-    "content_hash",
-    "data_dictionary",
-    "deidentified",
-    "minimal_change_at",
-    "read_study",
-    "write_study",
-]

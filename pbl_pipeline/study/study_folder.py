@@ -35,10 +35,7 @@ def write_study(study: StudyData, folder: str | Path) -> list[Path]:
 
     Numbers have 8 digits, curves 6. The folder is made; files of these names in it are replaced.
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE.
+    Raises `PblError` FILE_UNWRITABLE.
     """
     folder = Path(folder)
     check_out_folder(folder)
@@ -64,12 +61,9 @@ def write_study(study: StudyData, folder: str | Path) -> list[Path]:
 def read_study(folder: str | Path) -> StudyData:
     """Read the folder of `write_study`.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such folder, no `study.json` or a file that it names. FILE_FORMAT: a file that cannot be read,
-        is too large, or is not the one whose SHA-256 `study.json` names (without the key `files` none is compared).
-        STUDY_INVALID: as `StudyData`, and where numbers of persons or visits differ from those of `study.json`.
+    Raises `PblError` FILE_MISSING: no such folder, no `study.json` or a file that it names. FILE_FORMAT: a file that
+    cannot be read, is too large, or is not the one whose SHA-256 `study.json` names (without the key `files` none is
+    compared). STUDY_INVALID: as `StudyData`, and where numbers of persons or visits differ from those of `study.json`.
     """
     folder = Path(folder)
     about = _about(folder / _ABOUT)

@@ -21,34 +21,21 @@ _LONGEST = 200
 
 @dataclasses.dataclass(frozen=True)
 class StudyDescription:
-    """What a study is and how it was made.
+    """What a study is and how it was made."""
 
-    Attributes
-    ----------
-    name, hash
-        Of the frozen slice; the hash covers its rows. "" where there is no slice.
-    methods
-        Stage -> method, such as {"fit": "blazepose-2"}.
-    code_version
-        Of the code that made the values.
-    event
-        What the days of the visits count from, such as "surgery".
-    change_from, change_to, change_group
-        Roles between which change is judged, and the group that is expected to change. "": the first and the last role
-        by their days, and the group with the most persons who have both.
-    note
-        Shown on the report.
-    """
-
+    #: Of the frozen slice; the hash covers its rows. "" where there is no slice.
     name: str = ""
     hash: str = ""
+    #: Stage -> method, such as {"fit": "blazepose-2"}.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    code_version: str = ""
-    event: str = ""
+    code_version: str = ""  # of the code that made the values
+    event: str = ""  # what the days of the visits count from, such as "surgery"
+    #: Roles between which change is judged, and the group that is expected to change. "": the first and the last role
+    #: by their days, and the group with the most persons who have both.
     change_from: str = ""
     change_to: str = ""
     change_group: str = ""
-    note: str = ""
+    note: str = ""  # shown on the report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,37 +44,23 @@ class StudyData:
 
     Columns are put in order and given their types when it is made; an absent frame is an empty one. Persons are codes.
 
-    Attributes
-    ----------
-    visits
-        One row per visit, also those that do not count (`included` false, with `reason`).
-    measures
-        Long: one row per visit, side and gait measure.
-    scores, instruments
-        Long: one row per visit and clinical score; range and direction of each score.
-    cycles
-        Long: one row per gait cycle and measure, for the repeatability of cycles. May be empty.
-    curves
-        One row per visit, side and joint angle: the mean curve at 0, 1, ..., 100 % of the cycle. May hold NaN.
-    description
-        Of the study.
-
-    Raises
-    ------
-    PblError
-        STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice, a row of a
-        visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
-        excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two
-        units, an unknown score or one outside its range.
+    Raises `PblError` STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice,
+    a row of a visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
+    excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two units, an
+    unknown score or one outside its range.
     """
 
-    visits: pd.DataFrame
+    visits: pd.DataFrame  # one row per visit, also those that do not count (`included` false, with `reason`)
+    #: Long: one row per visit, side and gait measure.
     measures: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    #: Long: one row per visit and clinical score; range and direction of each score.
     scores: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
     instruments: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    #: Long: one row per gait cycle and measure, for the repeatability of cycles. May be empty.
     cycles: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
+    #: One row per visit, side and joint angle: the mean curve at 0, 1, ..., 100 % of the cycle. May hold NaN.
     curves: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
-    description: StudyDescription = dataclasses.field(default_factory=StudyDescription)
+    description: StudyDescription = dataclasses.field(default_factory=StudyDescription)  # of the study
 
     def __post_init__(self) -> None:
         for name in FRAMES:
@@ -256,17 +229,14 @@ def classes_of(text: str) -> list[tuple[float, str]]:
 def minimal_change_at(before: float, change: float | None, classes: str) -> float | None:
     """Minimal important change of a score that was `before`, in its unit; None where none is taken over.
 
+    Raises `PblError` STUDY_INVALID: `classes` that are not positive numbers by values in order.
+
     Parameters
     ----------
     change
         The one of all values, where there is one.
     classes
         Changes by the lowest value before, such as "0 3; 12 2; 15 1", which then hold instead of `change`; or "".
-
-    Raises
-    ------
-    PblError
-        STUDY_INVALID: `classes` that are not positive numbers by values in order.
     """
     for lowest, text in classes_of(classes):
         try:
@@ -286,5 +256,4 @@ def _row(frame: Any, where: Any, key: tuple[str, ...]) -> str:
 
 
 def invalid(frame: str, found: str, expected: str, next_step: str) -> PblError:
-    """A `PblError` STUDY_INVALID about a frame."""
     return PblError("STUDY_INVALID", found=found, expected=expected, next_step=next_step, key=frame)

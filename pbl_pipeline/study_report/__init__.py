@@ -5,19 +5,3 @@ from .page import study_figures, write_study_report
 from .page_tables import PageTable, all_tables
 from .results import CurveResult, StudyResults, study_results
 from .visit_values import Plan, mean_curves, pairs, plan, visit_table
-
-__all__ = [
-    "CurveResult",
-    "Figure",
-    "PageTable",
-    "Plan",
-    "StudyResults",
-    "all_tables",
-    "mean_curves",
-    "pairs",
-    "plan",
-    "study_figures",
-    "study_results",
-    "visit_table",
-    "write_study_report",
-]

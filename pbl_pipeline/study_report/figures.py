@@ -74,7 +74,6 @@ class Figure:
         return self._saved("pdf", [self.title, self.note, *footer])
 
     def _repr_svg_(self) -> str:
-        """Show it in a notebook."""
         return self.svg()
 
     def _saved(self, kind: str, words: Sequence[str] = ()) -> bytes:
@@ -205,13 +204,11 @@ def _drawing(axes: Axes) -> Drawing:
 
 
 def _categories(axes: Axes, names: Sequence[str]) -> None:
-    """Names along x, at 0, 1, ..."""
     shown = ["\n".join(textwrap.fill(line, 14) for line in n.replace("_", " ").splitlines()) for n in names]
     axes.set_xticks(range(len(names)), shown)
     axes.set_xlim(-0.5, len(names) - 0.5)
 
 
 def _intervals(axes: Axes, at: Any, rows: pd.DataFrame, colour: str, style: str) -> None:
-    """Means with their intervals, where these are known."""
     mean, low, high = (rows[c].to_numpy(float) for c in ("mean", "low", "high"))
     axes.errorbar(at, mean, [mean - low, high - mean], fmt=style, color=colour, lw=1.4, ms=5)

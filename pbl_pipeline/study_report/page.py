@@ -51,10 +51,7 @@ def write_study_report(
     the CSV tables have its code as well. `change_from`, `change_to` (roles) and `change_group` take precedence over
     those of the study's description. Without `pdf` the figures are SVG alone, in a third of the time.
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
+    Raises `PblError` FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
     """
     folder = Path(folder)
     check_out_folder(folder)
@@ -87,7 +84,6 @@ def write_study_report(
 
 
 def _head(study: StudyData, results: StudyResults) -> dict[str, str]:
-    """Return what the report says about its data."""
     given, counted = study.description, results.table
     return {
         "name": given.name or "Study",
@@ -126,7 +122,6 @@ def _render(
 
 
 def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
-    """The long tables as they are written."""
     rows = []
     for c in results.curves:
         if isinstance(c.test, CurveTest):
@@ -153,7 +148,6 @@ def study_figures(study: StudyData, results: StudyResults) -> dict[str, Figure]:
 
 
 def _sections(study: StudyData, results: StudyResults) -> dict[str, list[Figure]]:
-    """Figures by section of the page."""
     return {
         "paper": sorted(_paper_figures(study, results), key=lambda f: f.title[0]),
         "srm": list(_srm_figure(results)),
@@ -199,7 +193,6 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
 
 
 def _correlations(results: StudyResults, measure: str, score: str) -> str:
-    """The correlations of a measure with a score, in words."""
     frame: Any = results.validity
     words = []
     for r in frame[(frame["name"] == measure) & (frame["score"] == score)].to_dict("records"):
@@ -210,7 +203,6 @@ def _correlations(results: StudyResults, measure: str, score: str) -> str:
 
 
 def _tests(results: StudyResults, measure: str, by: str) -> str:
-    """The tests of a measure between groups, in words."""
     frame: Any = results.groups
     rows = frame[(frame["name"] == measure) & (frame["by"] == by)].to_dict("records")
     words = [f"{r['a']} and {r['b']}: " + (r["message"] or f"{r['test']}, p = {p_text(r['p'])}") for r in rows]
@@ -293,5 +285,4 @@ def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> 
 
 
 def _file(prefix: str, name: str) -> str:
-    """A stem for a file."""
     return f"{prefix}_" + "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "-" for c in name)

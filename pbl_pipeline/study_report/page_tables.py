@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,25 +27,14 @@ _HOLM = "p, Holm: corrected for those"
 
 @dataclasses.dataclass(frozen=True)
 class PageTable:
-    """A table as it is shown.
+    """A table as it is shown."""
 
-    Attributes
-    ----------
-    name
-        Stem of its files.
-    title, note
-        What it shows; how to read it.
-    body
-        Texts; its columns may have two levels.
-    messages
-        Why cells without a number have none: (mark of the cells, text).
-    """
-
-    name: str
+    name: str  # stem of its files
+    #: What it shows; how to read it.
     title: str
     note: str
-    body: pd.DataFrame
-    messages: tuple[tuple[str, str], ...] = ()
+    body: pd.DataFrame  # texts; its columns may have two levels
+    messages: tuple[tuple[str, str], ...] = ()  # why cells without a number have none: (mark of the cells, text)
 
     def head(self) -> list[list[tuple[str, int]]]:
         """Rows of the head: (text, columns that it spans)."""
@@ -169,24 +159,30 @@ def all_tables(study: StudyData, results: StudyResults) -> dict[str, PageTable]:
     return {t.name: t for t in made}
 
 
+#: Head of a column -> the text of its cell in a row of results.
+_Columns = dict[str, Callable[[dict[Any, Any]], str]]
+
+
+def _table(name: str, title: str, note: str, frame: pd.DataFrame, columns: _Columns, marks: _Marks) -> PageTable:
+    rows = [{head: text(r) for head, text in columns.items()} for r in frame.to_dict("records")]
+    return PageTable(name, title, note, pd.DataFrame(rows, columns=list(columns)), marks.messages())
+
+
 def flow(results: StudyResults) -> PageTable:
     """Who is in and out."""
-    rows = [
-        {
-            "Group": r["group"],
-            "Visit": r["role"],
-            "Persons of the group": r["persons"],
-            "No visit": r["persons"] - r["took_place"],
-            "Took place": r["took_place"],
-            "Left out": r["excluded"],
-            "Count": r["counted"],
-            "Of them without index": r["without_index"],
-            "Why left out": r["reasons"],
-        }
-        for r in results.flow.to_dict("records")
-    ]
-    body = pd.DataFrame(rows).astype(str)
-    return PageTable("flow", "Who is in and out", "Visits by group; what is left out is in no number below.", body)
+    columns: _Columns = {
+        "Group": lambda r: str(r["group"]),
+        "Visit": lambda r: str(r["role"]),
+        "Persons of the group": lambda r: str(r["persons"]),
+        "No visit": lambda r: str(r["persons"] - r["took_place"]),
+        "Took place": lambda r: str(r["took_place"]),
+        "Left out": lambda r: str(r["excluded"]),
+        "Count": lambda r: str(r["counted"]),
+        "Of them without index": lambda r: str(r["without_index"]),
+        "Why left out": lambda r: str(r["reasons"]),
+    }
+    note = "Visits by group; what is left out is in no number below."
+    return _table("flow", "Who is in and out", note, results.flow, columns, _Marks())
 
 
 def table2(results: StudyResults) -> PageTable:
@@ -260,11 +256,8 @@ def by_visit(study: StudyData, results: StudyResults) -> PageTable:
         own = frame[frame["name"] == name]
         digits = digits_of(own["mean"])
         for i, r in enumerate(own.to_dict("records")):
-            interval = (
-                f"{number(r['low'], digits)} to {number(r['high'], digits)}"
-                if math.isfinite(r["low"])
-                else "one person: none"
-            )
+            limits = f"{number(r['low'], digits)} to {number(r['high'], digits)}"
+            interval = limits if math.isfinite(r["low"]) else "one person: none"
             rows.append(
                 {
                     "Measure": "" if i else title_of(study, name),
@@ -285,88 +278,65 @@ def by_visit(study: StudyData, results: StudyResults) -> PageTable:
 
 def repeatability(study: StudyData, results: StudyResults) -> PageTable:
     """ICC, SEM, MDC."""
-    marks, rows = _Marks(), []
-    for r in results.repeatability.to_dict("records"):
-        digits = digits_of([r["sem"]])
-        rows.append(
-            {
-                "Measure": title_of(study, r["name"]),
-                "Of": r["of"],
-                "Group": r["group"],
-                "Kind": r["kind"],
-                "ICC": estimate(r, marks),
-                "SEM": number(r["sem"], digits),
-                "MDC90": number(r["mdc90"], digits),
-                "MDC95": number(r["mdc95"], digits),
-                "n": "" if r["code"] else f"{r['n']:.0f}",
-                "k": "" if r["code"] else f"{r['k']:.1f}",
-            }
-        )
-    columns = ["Measure", "Of", "Group", "Kind", "ICC", "SEM", "MDC90", "MDC95", "n", "k"]
+    marks = _Marks()
     note = (
         "SEM and minimal detectable change in the unit of the measure; n persons with k cycles or visits (harmonic "
         "mean). Visits: 2,1 counts a shift of all persons as error (generalized interval), 3,1 does not. Where persons "
         "change differently between visits, that counts as error."
     )
-    return PageTable("repeatability", "Repeatability", note, pd.DataFrame(rows, columns=columns), marks.messages())
+    columns: _Columns = {
+        "Measure": lambda r: title_of(study, r["name"]),
+        "Of": lambda r: r["of"],
+        "Group": lambda r: r["group"],
+        "Kind": lambda r: r["kind"],
+        "ICC": lambda r: estimate(r, marks),
+        "SEM": lambda r: number(r["sem"], digits_of([r["sem"]])),
+        "MDC90": lambda r: number(r["mdc90"], digits_of([r["sem"]])),
+        "MDC95": lambda r: number(r["mdc95"], digits_of([r["sem"]])),
+        "n": lambda r: "" if r["code"] else f"{r['n']:.0f}",
+        "k": lambda r: "" if r["code"] else f"{r['k']:.1f}",
+    }
+    return _table("repeatability", "Repeatability", note, results.repeatability, columns, marks)
 
 
 def validity(results: StudyResults) -> PageTable:
     """Correlations."""
-    marks, rows = _Marks(), []
-    for r in results.validity.to_dict("records"):
-        rows.append(
-            {
-                "Measure": short_of(r["name"]),
-                "Score": short_of(r["score"]),
-                "Persons": r["persons"],
-                "Kind": r["kind"].capitalize(),
-                "r": estimate(r, marks, star=True),
-                "p": p_text(r["p"]),
-                "p, Holm": p_text(r["p_holm"]),
-                "n": str(r["n"]),
-            }
-        )
-    columns = ["Measure", "Score", "Persons", "Kind", "r", "p", "p, Holm", "n"]
+    marks = _Marks()
     note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
-    return PageTable(
-        "validity", "Correlation with clinical scores", note, pd.DataFrame(rows, columns=columns), marks.messages()
-    )
+    columns: _Columns = {
+        "Measure": lambda r: short_of(r["name"]),
+        "Score": lambda r: short_of(r["score"]),
+        "Persons": lambda r: r["persons"],
+        "Kind": lambda r: r["kind"].capitalize(),
+        "r": lambda r: estimate(r, marks, star=True),
+        "p": lambda r: p_text(r["p"]),
+        "p, Holm": lambda r: p_text(r["p_holm"]),
+        "n": lambda r: str(r["n"]),
+    }
+    return _table("validity", "Correlation with clinical scores", note, results.validity, columns, marks)
 
 
 def groups(results: StudyResults) -> PageTable:
     """Differences between groups."""
-    marks, rows = _Marks(), []
-    for r in results.groups.to_dict("records"):
-        size = {
-            "value": r["g"],
-            "low": r["g_low"],
-            "high": r["g_high"],
-            "p": r["p"],
-            "code": r["code"],
-            "message": r["message"],
-        }
-        rows.append(
-            {
-                "Measure": short_of(r["name"]),
-                "By": r["by"],
-                "A": r["a"],
-                "B": r["b"],
-                "Test": r["test"],
-                "Hedges' g (a - b)": estimate(size, marks, star=True),
-                "p": p_text(r["p"]),
-                "p, Holm": p_text(r["p_holm"]),
-                "n": f"{r['n_a']}, {r['n_b']}",
-            }
-        )
-    columns = ["Measure", "By", "A", "B", "Test", "Hedges' g (a - b)", "p", "p, Holm", "n"]
+    marks = _Marks()
     note = (
         f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
         f"Mann-Whitney U. {_STARS}; {_HOLM} with the same By."
     )
-    return PageTable(
-        "groups", "Differences between groups", note, pd.DataFrame(rows, columns=columns), marks.messages()
-    )
+    columns: _Columns = {
+        "Measure": lambda r: short_of(r["name"]),
+        "By": lambda r: r["by"],
+        "A": lambda r: r["a"],
+        "B": lambda r: r["b"],
+        "Test": lambda r: r["test"],
+        "Hedges' g (a - b)": lambda r: estimate(
+            {**r, "value": r["g"], "low": r["g_low"], "high": r["g_high"]}, marks, star=True
+        ),
+        "p": lambda r: p_text(r["p"]),
+        "p, Holm": lambda r: p_text(r["p_holm"]),
+        "n": lambda r: f"{r['n_a']}, {r['n_b']}",
+    }
+    return _table("groups", "Differences between groups", note, results.groups, columns, marks)
 
 
 def phases(results: StudyResults) -> PageTable:
@@ -417,7 +387,6 @@ def comparison_of(result: Any) -> str:
 
 
 def _one(frame: pd.DataFrame, **values: str) -> dict[str, Any] | None:
-    """The row with these values."""
     found: Any = frame
     for column, value in values.items():
         found = found[found[column] == value]

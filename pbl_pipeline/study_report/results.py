@@ -45,29 +45,17 @@ COLUMNS = {
 
 @dataclasses.dataclass(frozen=True)
 class CurveResult:
-    """A comparison of mean curves of an angle.
+    """A comparison of mean curves of an angle."""
 
-    Attributes
-    ----------
-    angle, comparison
-        What and between whom; "change" or two names.
-    test
-        The test, or why there is none.
-    left_out
-        Persons whose curves have unknown points.
-    a, b : (N, 101), (M, 101)
-        Curves of the persons tested; of "change" a is after and b before.
-    names
-        Of a and b.
-    """
-
+    #: What and between whom; "change" or two names.
     angle: str
     comparison: str
-    test: CurveTest | PblError
-    left_out: int
+    test: CurveTest | PblError  # the test, or why there is none
+    left_out: int  # persons whose curves have unknown points
+    #: (N, 101), (M, 101) curves of the persons tested; of "change" a is after and b before.
     a: np.ndarray
     b: np.ndarray
-    names: tuple[str, str]
+    names: tuple[str, str]  # of a and b
 
 
 @dataclasses.dataclass(frozen=True)

@@ -147,7 +147,6 @@ def _errors(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]
 
 
 def _spread(values: Any, unit: str) -> str:
-    """Median and range of numbers."""
     if values is None or not len(values):
         return _NOT_STATED
     digits = 0 if (np.asarray(values) % 1 == 0).all() else 1

@@ -18,23 +18,16 @@ _KEY = ["subject", "visit"]
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What is compared.
+    """What is compared."""
 
-    Attributes
-    ----------
-    roles, groups
-        In order: by the days of the visits; the group that changes first, then by name.
-    measures, scores, angles
-        Names of gait measures (the index first), clinical scores and joint angles.
-    change_from, change_to, change_group
-        As `StudyDescription`, resolved. `change_to` is "" in a study of one role.
-    """
-
+    #: In order: by the days of the visits; the group that changes first, then by name.
     roles: tuple[str, ...]
     groups: tuple[str, ...]
+    #: Names of gait measures (the index first), clinical scores and joint angles.
     measures: tuple[str, ...]
     scores: tuple[str, ...]
     angles: tuple[str, ...]
+    #: As `StudyDescription`, resolved. `change_to` is "" in a study of one role.
     change_from: str
     change_to: str
     change_group: str

@@ -16,36 +16,3 @@ from .scene import VIEWS_DEG
 from .solve import SOLE_POINTS, sole_points
 from .synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
 from .walk import plain_walk
-
-__all__ = [
-    "CORRELATED_NOISE",
-    "IMPAIRMENTS",
-    "LEVEL_R_NC",
-    "NO_NOISE",
-    "PHONE_CAMERA",
-    "PHONE_SIZE_PX",
-    "SOLE_POINTS",
-    "TASKS",
-    "VIEWS_DEG",
-    "Disturbance",
-    "Impairment",
-    "Noise",
-    "PhoneSensor",
-    "Seen",
-    "SynthSpec",
-    "Synthetic",
-    "Truth",
-    "correlated",
-    "film",
-    "hide",
-    "lens",
-    "pelvis_positions",
-    "physique",
-    "picture_px",
-    "plain_walk",
-    "seen_by",
-    "sole_points",
-    "speed_of_group",
-    "synthesise",
-    "true_markers",
-]

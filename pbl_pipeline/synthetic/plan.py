@@ -52,30 +52,18 @@ FLAT_AFTER, HEEL_OFF_BEFORE, BALL_OFF_BEFORE = 0.13, 0.42, 0.08
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """A motion on a grid of N times.
+    """A motion on a grid of N times."""
 
-    Attributes
-    ----------
-    grid_s : (N,)
-    xy_m, heading_rad : (N, 2), (N,)
-        Way of the pelvis' origin on the floor and where the person faces.
-    on_path : (N,)
-        1 where the pelvis follows `xy_m`, 0 where it goes where the standing feet and the posture put it.
-    speed_m_per_s : (N,)
-        Along the way, which sets how much of a walk the legs and arms do.
-    steps
-        All stances, in order of foot down.
-    posture_deg
-        angle -> (N,) of both sides where nobody walks: hip_flexion, knee_flexion, ankle_angle, tilt, lumbar_extension,
-        arm_flex, elbow_flex; missing ones are those of standing.
-    """
-
-    grid_s: Float[np.ndarray, " N"]
+    grid_s: Float[np.ndarray, " N"]  # (N,)
+    #: (N, 2), (N,) way of the pelvis' origin on the floor and where the person faces.
     xy_m: Float[np.ndarray, "N 2"]
     heading_rad: Float[np.ndarray, " N"]
+    #: (N,) 1 where the pelvis follows `xy_m`, 0 where it goes where the standing feet and the posture put it.
     on_path: Float[np.ndarray, " N"]
-    speed_m_per_s: Float[np.ndarray, " N"]
-    steps: tuple[Step, ...]
+    speed_m_per_s: Float[np.ndarray, " N"]  # (N,) along the way, which sets how much of a walk the legs and arms do
+    steps: tuple[Step, ...]  # all stances, in order of foot down
+    #: angle -> (N,) of both sides where nobody walks: hip_flexion, knee_flexion, ankle_angle, tilt, lumbar_extension,
+    #: arm_flex, elbow_flex; missing ones are those of standing.
     posture_deg: dict[str, np.ndarray]
 
     def moved(self, yaw_rad: float, to_m: tuple[float, float]) -> Plan:

@@ -136,7 +136,6 @@ class _Problem:
     high: np.ndarray
 
     def cost(self, q: np.ndarray, loose: float) -> float:
-        """Half of the sum of squares."""
         x = self.soles.points(q)
         off = (self.contacts.weight / loose) * (self.contacts.target_m - x)
         deep = np.clip(self.contacts.floor_m - x[..., 2], 0, None) / (DEPTH_M * loose)
@@ -247,7 +246,6 @@ class _Soles:
         return body == other
 
     def points(self, q: np.ndarray) -> np.ndarray:
-        """Points (N, P, 3)."""
         return self._points(*self._placed(q, "xpos", "xmat"))
 
     def with_jacobian(self, q: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -132,54 +132,33 @@ class SynthSpec:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true of a synthetic trial. World: z up, metres, its origin at the phone, frame by frame.
+    """What is true of a synthetic trial. World: z up, metres, its origin at the phone, frame by frame."""
 
-    Attributes
-    ----------
-    time_s, joint_names, qpos : (T,), (40,), (T, 40)
-        Joint values (m, rad). Where the phone is carried, the pelvis' place is against the phone of that frame.
-    events
-        All foot downs and foot ups within the time, with probability 1.
-    scale, site_offset_m : (8,), (J, 3)
-        The person.
-    R_nc : (T, 3, 3)
-        Camera to world.
-    phone_position_m : (T, 3)
-        The phone's own way from its first place, in the axes of the world: add it to what is against the phone to get
-        the place in the room. Zeros but for view "follow". It is not observed.
-    pelvis_m, markers_world_m : (T, 3), (T, J, 3)
-        Against the phone, as `qpos`.
-    floor_height_m : (T,)
-        Of the floor against the phone.
-    heel_on_floor, ball_on_floor : (T, 2)
-        Whether heel and ball of the foot are on the floor, [left, right].
-    belt_m_per_s
-        (2,) velocity of the floor, zeros but on a treadmill: feet in stance move with it.
-    clock_offset_s
-        The phone's clock against the video's, NaN without a log.
-    outlier : (T, J)
-        Points that were thrown far off.
-    spec
-        Options that the trial was made with.
-    """
-
+    #: (T,), (40,), (T, 40) joint values (m, rad). Where the phone is carried, the pelvis' place is against the phone of
+    #: that frame.
     time_s: Float[np.ndarray, " T"]
     joint_names: tuple[str, ...]
     qpos: Float[np.ndarray, "T 40"]
-    events: tuple[GaitEvent, ...]
+    events: tuple[GaitEvent, ...]  # all foot downs and foot ups within the time, with probability 1
+    #: (8,), (J, 3) the person.
     scale: Float[np.ndarray, " 8"]
     site_offset_m: Float[np.ndarray, "J 3"]
-    R_nc: Float[np.ndarray, "T 3 3"]
+    R_nc: Float[np.ndarray, "T 3 3"]  # (T, 3, 3) camera to world
+    #: (T, 3) the phone's own way from its first place, in the axes of the world: add it to what is against the phone to
+    #: get the place in the room. Zeros but for view "follow". It is not observed.
     phone_position_m: Float[np.ndarray, "T 3"]
+    #: (T, 3), (T, J, 3) against the phone, as `qpos`.
     pelvis_m: Float[np.ndarray, "T 3"]
     markers_world_m: Float[np.ndarray, "T J 3"]
-    floor_height_m: Float[np.ndarray, " T"]
+    floor_height_m: Float[np.ndarray, " T"]  # (T,) of the floor against the phone
+    #: (T, 2) whether heel and ball of the foot are on the floor, [left, right].
     heel_on_floor: Bool[np.ndarray, "T 2"]
     ball_on_floor: Bool[np.ndarray, "T 2"]
+    #: (2,) velocity of the floor, zeros but on a treadmill: feet in stance move with it.
     belt_m_per_s: Float[np.ndarray, " 2"]
-    clock_offset_s: float
-    outlier: np.ndarray
-    spec: SynthSpec
+    clock_offset_s: float  # the phone's clock against the video's, NaN without a log
+    outlier: np.ndarray  # (T, J) points that were thrown far off
+    spec: SynthSpec  # options that the trial was made with
 
     def save(self, path: str | Path) -> None:
         """Write `truth.npz` (docs/files.md)."""
@@ -278,10 +257,7 @@ def synthesise(spec: SynthSpec) -> Synthetic:
     Normal curves by speed (Schwartz et al. 2008) and impairments give the angles that the motion aims at; footprints
     and the pelvis' way are planned; the least-squares solution keeps the standing feet where they stand.
 
-    Raises
-    ------
-    PblError
-        USAGE: more seconds than the task lasts, or a walk that leaves the picture of a static camera.
+    Raises `PblError` USAGE: more seconds than the task lasts, or a walk that leaves the picture of a static camera.
     """
     markers = marker_set(spec.marker_set)
     style = style_of(spec.impairments)

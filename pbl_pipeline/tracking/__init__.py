@@ -18,38 +18,3 @@ from .transfer_choice import carried_choice, same_person
 from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
 from .walker_score import SubjectParams, step_s, time_in_view_s
 from .yolox import YoloxDetector
-
-__all__ = [
-    "FILM_THE_WHOLE_BODY",
-    "METHODS",
-    "SUBJECT_METHODS",
-    "AssociationParams",
-    "BlazePoseDetector",
-    "Detection",
-    "JoinParams",
-    "PersonDetector",
-    "PersonTrack",
-    "SubjectChoice",
-    "SubjectParams",
-    "Tracking",
-    "TrackingParams",
-    "UncrossParams",
-    "WatchParams",
-    "YoloxDetector",
-    "appearance_of",
-    "appearance_similarity",
-    "body_box",
-    "carried_choice",
-    "choose_subject",
-    "circle_roi",
-    "contact_sheet",
-    "contact_sheet_jpeg",
-    "detector_params",
-    "require_subject",
-    "same_person",
-    "save_contact_sheet",
-    "step_s",
-    "tiles",
-    "time_in_view_s",
-    "track_people",
-]

@@ -91,7 +91,6 @@ def _exchange_fits(a: Trail, b: Trail, begin: float, end: float, params: Uncross
 
 
 def _part(trail: Trail, low: float, high: float) -> Trail:
-    """The sightings of a trail between two times."""
     rows = slice(int(np.searchsorted(trail.times, low, "right")), int(np.searchsorted(trail.times, high)))
     return Trail(trail.frames[rows], trail.times[rows], trail.detections[rows], trail.velocity)
 

@@ -115,7 +115,6 @@ def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
 
 
 def _whole(*parts: Trail) -> Trail:
-    """One trail of parts that follow one another."""
     return Trail(
         [f for p in parts for f in p.frames],
         [t for p in parts for t in p.times],

@@ -234,7 +234,6 @@ def _size(person: _Person, tracking: Tracking, tallest_px: float, params: Subjec
 
 
 def _size_part(person: _Person, tracking: Tracking, tallest_px: float, params: SubjectParams) -> float:
-    """What the size adds to the person's score."""
     return params.weight_size * _size(person, tracking, tallest_px, params) / _weights(params).sum()
 
 

@@ -55,10 +55,8 @@ class YoloxDetector:
 
     `min_iou`: of two boxes that overlap more, the less sure one is dropped (OpenCV's non-maximum suppression).
 
-    Raises
-    ------
-    PblError
-        What `OnnxModel` raises; MODEL_INVALID when the model is of another kind, or its output has another shape.
+    Raises `PblError` What `OnnxModel` raises; MODEL_INVALID when the model is of another kind, or its output has
+    another shape.
     """
 
     def __init__(self, model: OnnxModel, min_score: float = 0.3, min_iou: float = 0.5) -> None:

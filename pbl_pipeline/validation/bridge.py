@@ -45,17 +45,7 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
     """Fit and measure the recordings of `BRIDGE_SET` by the default methods but one, and write each visit into a
     separate folder below `folder`, which another version can then be compared with.
 
-    Parameters
-    ----------
-    name
-        Of a method of the fit, the events or the index.
-    done
-        Called after each recording.
-
-    Raises
-    ------
-    PblError
-        SOLVER_UNKNOWN for a name that no method has, and what fitting and measuring raise.
+    Raises `PblError` SOLVER_UNKNOWN for a name that no method has, and what fitting and measuring raise.
     """
     from pbl_pipeline.fit import METHODS, default_fit, fit_session
 
@@ -77,7 +67,6 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
 
 
 def _method(name: str, stages: Mapping[str, Stage[Any]]) -> tuple[str, Method[Any]]:
-    """The stage and the method of a name or key."""
     for stage, methods in stages.items():
         for method in methods.values():
             if name in (method.name, method.key):
@@ -162,18 +151,15 @@ def _shifts(pairs: pd.DataFrame) -> Iterator[tuple[str, int, np.ndarray]]:
 def touched(visits: pd.DataFrame) -> pd.DataFrame:
     """Return the pairs of successive visits of a person that a change of method touches.
 
+    Returns `subject, before, visit, what`: "across" where the one has only a result by the old and the other only one
+    by the new, which cannot be compared; "old" where both have only old ones, which compare with each other but not
+    with later visits.
+
     Parameters
     ----------
     visits
         One row per visit with a result by either, in the order of their days: `subject`, `visit`, and whether it has
         one by `old` and by `new`.
-
-    Returns
-    -------
-    frame
-        `subject, before, visit, what`: "across" where the one has only a result by the old and the other only one by
-        the new, which cannot be compared; "old" where both have only old ones, which compare with each other but not
-        with later visits.
     """
     rows = []
     for subject, own in visits.groupby("subject", sort=False):

@@ -45,42 +45,25 @@ class JointError:
 
 @dataclasses.dataclass(frozen=True)
 class KinematicErrors:
-    """Errors of one trial against its reference.
+    """Errors of one trial against its reference."""
 
-    Attributes
-    ----------
-    lag_s
-        Of the video behind the reference (positive: the video is later).
-    n
-        Frames in which at least one joint could be compared.
-    joints
-        One entry per joint that both know, in the order of the reference.
-    median_abs_deg
-        Median of |error| over all frames and all joints of `JOINTS_PAPER` that are known: the paper's error of a trial.
-    rte_m
-        Mean distance of the pelvis path to the reference's, NaN where one is not known.
-    view
-        "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
-    residual_2d_px, residual_3d_cm
-        Medians of the fit's residuals over frames and markers.
-    trial, reference, source, convention
-        Names of fit and reference, and of what kind the reference is.
-    max_lag_s
-        The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
-    """
-
-    lag_s: float
-    n: int
-    joints: tuple[JointError, ...]
+    lag_s: float  # of the video behind the reference (positive: the video is later)
+    n: int  # frames in which at least one joint could be compared
+    joints: tuple[JointError, ...]  # one entry per joint that both know, in the order of the reference
+    #: Median of |error| over all frames and all joints of `JOINTS_PAPER` that are known: the paper's error of a trial.
     median_abs_deg: float
-    rte_m: float
+    rte_m: float  # mean distance of the pelvis path to the reference's, NaN where one is not known
+    #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
     view: Mapping[str, str]
+    #: Medians of the fit's residuals over frames and markers.
     residual_2d_px: float
     residual_3d_cm: float
+    #: Names of fit and reference, and of what kind the reference is.
     trial: str = ""
     reference: str = ""
     source: str = ""
     convention: str = ""
+    #: The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
     max_lag_s: float = float("nan")
 
     @property
@@ -112,10 +95,8 @@ def compare(
     the vertical by the one angle that fits the reference best before its angles are compared, and the pelvis' path is
     turned about the vertical and shifted (`align_path`).
 
-    Raises
-    ------
-    PblError
-        REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames. GAIT_INPUT: a fit without frames.
+    Raises `PblError` REFERENCE_INPUT: no common joint, no common time, fewer than 10 common frames. GAIT_INPUT: a fit
+    without frames.
     """
     poses = trial_poses(fit)
     result = compare_angles(

@@ -34,17 +34,14 @@ def cycle_curves(
     without side. Cubic splines through the samples; a cycle in which fit or reference lacks a joint for longer than
     0.1 s has no pair for that joint. Angles of the pelvis against the world are left out: the worlds differ.
 
+    Raises `PblError` REFERENCE_INPUT, GAIT_INPUT as `compare`.
+
     Parameters
     ----------
     cycles
         Of `pbl_pipeline.gait.find_cycles`; only those with `used`.
     errors
         Of `compare(fit, reference)`, for its lag; computed where absent.
-
-    Raises
-    ------
-    PblError
-        REFERENCE_INPUT, GAIT_INPUT as `compare`.
     """
     lag = (errors or compare(fit, reference)).lag_s
     ours = fit_angles(fit, reference.convention)

@@ -24,15 +24,12 @@ _ROW = "GDI of one camera against several"
 def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
     """Visits that have an index of one camera and one of several, each against a norm of its own kind, as pairs.
 
+    Raises `PblError` USAGE: a visit has several such indices of one kind, by several methods or norms.
+
     Parameters
     ----------
     indices
         Rows with `INDEX_COLUMNS`. An index against a norm of another kind, or against one that ships, does not count.
-
-    Raises
-    ------
-    PblError
-        USAGE: a visit has several such indices of one kind, by several methods or norms.
     """
     own: Any = indices[(indices["kind"] == indices["norm_kind"]) & indices["index"].notna()]
     twice = own[own.duplicated(["session_id", "kind"], keep=False)]
@@ -54,15 +51,7 @@ def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
 def index_agreement(pairs: pd.DataFrame) -> Table:
     """Pearson's r, bias and limits of agreement of the index of one camera and of several.
 
-    Parameters
-    ----------
-    pairs
-        One row per visit, with `PAIR_COLUMNS`; both indices known.
-
-    Raises
-    ------
-    PblError
-        STATS_INPUT: fewer than four visits, or indices that are all the same.
+    Raises `PblError` STATS_INPUT: fewer than four visits, or indices that are all the same.
     """
     one, several = (pairs[k].to_numpy(float) for k in ("single", "rig"))
     r, agreement, n = correlation(one, several), bland_altman(one, several), len(pairs)

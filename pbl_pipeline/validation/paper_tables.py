@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -27,25 +29,12 @@ KNOWN, TRIALS = "Joints compared", "All"
 _POPULATIONS = ("control", "neurological", "LLPU", "pediatric")
 _ACTIVITIES = ("FSST", "standing", "TUG", "tandem", "walking")
 _DATASETS = ("MMMC handheld", "MMMC static", "BML-MoVi static")
-#: Other names of the paper's populations and activities, small letters.
-_ALIASES = {
-    "healthy": "control",
-    "controls": "control",
-    "neurologic": "neurological",
-    "lower limb prosthesis user": "LLPU",
-    "paediatric": "pediatric",
-    "four square step test": "FSST",
-    "four-square steps": "FSST",
-    "stand": "standing",
-    "timed up and go": "TUG",
-    "tandem gait": "tandem",
-    "walk": "walking",
-    "gait": "walking",
-}
+#: Titles, notes and decimals of the tables, and other names of the paper's populations and activities, small letters.
+_TEXTS = json.loads(
+    resources.files("pbl_pipeline.validation").joinpath("data/table_texts.json").read_text(encoding="utf-8")
+)
 _OPENCAP = [split_side(j)[0] for j in JOINTS_OPENCAP]
 _PAPER_JOINTS = [split_side(j)[0] for j in JOINTS_PAPER]
-_POOLED = "Median Absolute Error: of a trial, over all frames and all of the paper's 22 joints that it knows."
-_MEAN = "Mean Absolute Error: of a trial, over OpenCap's joints that it knows (pelvis, hips, knees, ankles, lumbar)."
 
 
 def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
@@ -70,10 +59,10 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
     trials = _trials(rows)
     made = [
         _summary(trials),
-        _joints("joints_by_dataset", "by dataset and camera", rows, trials, "recording", _DATASETS),
-        _joints("joints_by_population", "by population", rows, trials, "population", _POPULATIONS),
-        _groups("by_population", "by population", trials, "population", _POPULATIONS),
-        _groups("by_activity", "by activity", trials, "activity", _ACTIVITIES),
+        _joints("joints_by_dataset", rows, trials, "recording", _DATASETS),
+        _joints("joints_by_population", rows, trials, "population", _POPULATIONS),
+        _groups("by_population", trials, "population", _POPULATIONS),
+        _groups("by_activity", trials, "activity", _ACTIVITIES),
         _by_view(rows),
         _view_tests(rows[rows["n"] > 0]),
         _residuals(trials),
@@ -86,7 +75,7 @@ def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
 
 def _prepared(frame: pd.DataFrame) -> Any:
     """Return the rows with the paper's names, their comparison, and dataset and camera in one word."""
-    paper = {name.lower(): name for name in (*_POPULATIONS, *_ACTIVITIES)} | _ALIASES
+    paper = {name.lower(): name for name in (*_POPULATIONS, *_ACTIVITIES)} | _TEXTS["aliases"]
     rows = frame.copy()
     for column in ("population", "activity"):
         rows[column] = [paper.get(str(v).lower(), str(v)) for v in rows[column]]
@@ -115,52 +104,27 @@ def _trials(rows: Any) -> Any:
 
 def _summary(trials: Any) -> Table:
     rows = {MEDIAN: _over("median_deg"), MEAN: _over("mean_deg"), RTE: _over("rte_cm"), KNOWN: _over("joints")}
-    return _table(
-        "summary",
-        "Errors by dataset and camera, median over trials (nIQR)",
-        _cells(rows, _parts(trials, "recording", _DATASETS)),
-        f"{_POOLED} {_MEAN} RTE: mean distance of the pelvis' path after alignment; the phone's own way is not "
-        f"observed, so it says little of a phone that is carried along. {KNOWN}: of the 22; an error over fewer of "
-        "them is another measure.",
-        {KNOWN: 0},
-    )
+    return _table("summary", _cells(rows, _parts(trials, "recording", _DATASETS)))
 
 
-def _joints(name: str, by: str, rows: Any, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
+def _joints(name: str, rows: Any, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
     of_joints = _cells(_OF_JOINTS, _parts(rows, column, paper_columns))
     of_trials = _cells({TRIALS: _over("median_deg")}, _parts(trials, column, paper_columns))
-    return _table(
-        name,
-        f"Median absolute error of each joint {by} (deg), median over trials (nIQR)",
-        of_joints | of_trials,
-        f"Left and right of a trial count as two values of one trial. Row {TRIALS} is the {_POOLED}",
-    )
+    return _table(name, of_joints | of_trials)
 
 
-def _groups(name: str, by: str, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
+def _groups(name: str, trials: Any, column: str, paper_columns: Sequence[str]) -> Table:
     rows = {MEDIAN: _over("median_deg"), MEAN: _mean_over}
     if column == "population":
         rows[f"{MEAN.removesuffix(' (deg)')}, walking (deg)"] = lambda part: _mean_over(
             part[part["activity"] == "walking"]
         )
-    return _table(
-        name,
-        f"Errors {by}: median over trials of the median absolute error, mean over trials of the mean absolute error "
-        "(each with nIQR)",
-        _cells(rows, _parts(trials, column, paper_columns) | {TRIALS: trials}),
-        f"{_POOLED} {_MEAN} The paper quotes 4.1 deg for OpenCap, healthy walking.",
-    )
+    return _table(name, _cells(rows, _parts(trials, column, paper_columns) | {TRIALS: trials}))
 
 
 def _by_view(rows: Any) -> Table:
     views = (FRONT, BACK, IPSILATERAL, CONTRALATERAL, LATERAL, MIXED)
-    return _table(
-        "by_view",
-        "Median absolute error of each joint by the camera's view (deg), median over trials (nIQR)",
-        _cells(_OF_JOINTS, _parts(rows[rows["view"] != ""], "view", views)),
-        "ipsilateral: the camera is on the side of the joint. lateral: a joint of the middle seen from a side. The "
-        "paper shows these errors only as a figure (Fig. 4 C).",
-    )
+    return _table("by_view", _cells(_OF_JOINTS, _parts(rows[rows["view"] != ""], "view", views)))
 
 
 def _view_tests(measured: Any) -> Table:
@@ -180,14 +144,7 @@ def _view_tests(measured: Any) -> Table:
         test: Any = stats.mannwhitneyu(a, b, alternative="less") if min(len(a), len(b)) > 1 else None
         p = math.nan if test is None else float(test.pvalue)
         cells[row, "difference (deg)"], cells[row, "p"] = Cell(difference, n=n), Cell(p, n=n)
-    return _table(
-        "view_tests",
-        "Is an angle better in the view of its plane? Difference of the medians (deg) and one-sided Mann-Whitney U",
-        cells,
-        "Positive: the first kind of view has the smaller error. Sides of one trial are not independent, so p is too "
-        "small where there are few trials.",
-        {"p": 4},
-    )
+    return _table("view_tests", cells)
 
 
 def _residuals(trials: Any) -> Table:
@@ -200,13 +157,7 @@ def _residuals(trials: Any) -> Table:
         r, p = map(float, test)
         cells[label, "median"] = _over(column)(trials)
         cells[label, "Pearson r"], cells[label, "p"] = Cell(r, n=len(x)), Cell(p, n=len(x))
-    return _table(
-        "residuals",
-        "Residuals of the fit, median over trials (nIQR), and their correlation with the median absolute error",
-        cells,
-        "Two continuous variables: Pearson. n: trials; fewer than three give no correlation.",
-        {"p": 4},
-    )
+    return _table("residuals", cells)
 
 
 def _normality(measured: Any, trials: Any) -> Table:
@@ -220,15 +171,7 @@ def _normality(measured: Any, trials: Any) -> Table:
         cells[label, across] = Cell(normality_p(part["median_abs_deg"]), n=part["comparison"].nunique())
     medians = trials["median_deg"].dropna()
     cells[TRIALS, within], cells[TRIALS, across] = Cell(), Cell(normality_p(medians), n=len(medians))
-    return _table(
-        "normality",
-        "Are the errors normally distributed? Shapiro-Wilk within trials and between trials",
-        cells,
-        "Within: of the errors of the frames of a trial, the share of the trials (and sides) in which p is below 0.05. "
-        "Between: of the median absolute errors of the trials (and sides). The paper finds neither normal (Accuracy "
-        "Evaluation), hence medians. Neighbouring frames are alike, so p within a trial is too small.",
-        {across: 4},
-    )
+    return _table("normality", cells)
 
 
 def _measures(rows: Any) -> Table:
@@ -240,23 +183,15 @@ def _measures(rows: Any) -> Table:
         "correlation": "correlation",
         "inside 90 %": "within_90",
     }
-    return _table(
-        "joint_measures",
-        "All measures of each joint, median over trials (nIQR)",
-        {(r, c): _over(field, joint)(rows) for r, joint in ROWS_PAPER.items() for c, field in columns.items()},
-        "bias: fit - reference. inside 90 %: share of the frames inside the fit's 90 % interval. All datasets.",
-    )
+    cells = {(r, c): _over(field, joint)(rows) for r, joint in ROWS_PAPER.items() for c, field in columns.items()}
+    return _table("joint_measures", cells)
 
 
 def _by_method(trials: Any) -> Table:
     parts = {method: trials[trials["method"] == method] for method in dict.fromkeys(trials["method"])}
     columns = {MEDIAN: _over("median_deg"), MEAN: _over("mean_deg"), RTE: _over("rte_cm")}
-    return _table(
-        "by_method",
-        "Errors by detector and solver, median over trials (nIQR)",
-        {(method, column): cell(part) for method, part in parts.items() for column, cell in columns.items()},
-        "The other tables hold all methods together: select rows of one method before making them.",
-    )
+    cells = {(method, column): cell(part) for method, part in parts.items() for column, cell in columns.items()}
+    return _table("by_method", cells)
 
 
 def _parts(frame: Any, column: str, paper: Sequence[str]) -> dict[str, Any]:
@@ -270,7 +205,6 @@ _Cell = Callable[[Any], Cell]
 
 
 def _cells(rows: Mapping[str, _Cell], columns: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """Return the cell of each row of each part of a frame."""
     return {(row, name): cell(part) for row, cell in rows.items() for name, part in columns.items()}
 
 
@@ -292,13 +226,10 @@ def _mean_over(trials: Any) -> Cell:
 _OF_JOINTS = {label: _over("median_abs_deg", joint) for label, joint in ROWS_PAPER.items()}
 
 
-def _table(
-    name: str, title: str, cells: Mapping[tuple[str, str], Cell], note: str, digits: dict[str, int] | None = None
-) -> Table:
-    """Return a table with the paper's figures put in."""
+def _table(name: str, cells: Mapping[tuple[str, str], Cell]) -> Table:
     paper = paper_cells(name)
     filled = {}
     for (row, column), cell in cells.items():
         n = cell.n if math.isfinite(cell.value) else 0
         filled[row, column] = Cell(cell.value, cell.spread, n, paper.get(row, {}).get(column, ""))
-    return Table(name, title, filled, note, digits or {})
+    return Table(name, cells=filled, **_TEXTS["tables"][name])

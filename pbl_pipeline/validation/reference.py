@@ -23,34 +23,19 @@ _FIELDS = ("time_s", "names", "angles_deg", "pelvis_m", "name", "source", "conve
 class Reference:
     """Reference kinematics of one recording.
 
-    Attributes
-    ----------
-    name
-        Of the recording.
-    source
-        Where the angles come from: "optical markers", "several cameras", "synthetic", ...
-    convention
-        "qpos": the joints of our body. "body_rotations": hip, knee and ankle from relative body rotations as ZXY.
-    time_s
-        (T,) increasing, on the reference's own clock.
-    angles_deg
-        Joint -> (T,) degrees under OpenSim's names, the knee as `knee_flexion_r/_l`, positive in flexion. Joints that
-        are not known are absent; NaN where a joint is not known at that time.
-    pelvis_m
-        (T, 3) origin of the pelvis in the reference's own z-up world, or None.
-
-    Raises
-    ------
-    PblError
-        REFERENCE_INPUT: time stamps out of order, shapes that do not belong together, an unknown convention.
+    Raises `PblError` REFERENCE_INPUT: time stamps out of order, shapes that do not belong together, an unknown
+    convention.
     """
 
-    name: str
-    source: str
+    name: str  # of the recording
+    source: str  # where the angles come from: "optical markers", "several cameras", "synthetic",
+    #: "qpos": the joints of our body. "body_rotations": hip, knee and ankle from relative body rotations as ZXY.
     convention: str
-    time_s: np.ndarray
+    time_s: np.ndarray  # (T,) increasing, on the reference's own clock
+    #: Joint -> (T,) degrees under OpenSim's names, the knee as `knee_flexion_r/_l`, positive in flexion. Joints that
+    #: are not known are absent; NaN where a joint is not known at that time.
     angles_deg: Mapping[str, np.ndarray]
-    pelvis_m: np.ndarray | None = None
+    pelvis_m: np.ndarray | None = None  # (T, 3) origin of the pelvis in the reference's own z-up world, or None
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time_s, float)

@@ -49,7 +49,6 @@ class Table:
         return paper_where(self.name)
 
     def cell(self, row: str, column: str) -> Cell:
-        """Return the cell of a row and a column."""
         return self.cells[row, column]
 
     def ours(self, row: str, column: str) -> str:

@@ -34,21 +34,13 @@ _VERTICAL_DEG = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Attitude:
-    """The phone's orientation over one recording. Validated and brought to unit length when made.
+    """The phone's orientation over one recording. Validated and brought to unit length when made."""
 
-    Attributes
-    ----------
-    time_s : (P,) float64
-        Seconds, 0 at about the video's first frame (the fit finds the small offset left); strictly increasing.
-    quat_wxyz : (P, 4) float64
-        R_nc, camera to world, as unit quaternions (w, x, y, z); neighbours have the same sign.
-    source
-        Where it comes from, and how its clock was brought to the video's.
-    """
-
+    #: (P,) seconds, 0 at about the video's first frame (the fit finds the small offset left); strictly increasing.
     time_s: np.ndarray
+    #: (P, 4) R_nc, camera to world, as unit quaternions (w, x, y, z); neighbours have the same sign.
     quat_wxyz: np.ndarray
-    source: str = ""
+    source: str = ""  # where it comes from, and how its clock was brought to the video's
 
     def __post_init__(self) -> None:
         time_s, quat_wxyz = check_attitude(self.time_s, self.quat_wxyz, self.source or None)
@@ -59,11 +51,8 @@ class Attitude:
 def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tuple[np.ndarray, np.ndarray]:
     """(P,) times and (P, 4) unit quaternions without a jump from q to -q, or an error.
 
-    Raises
-    ------
-    PblError
-        PHONE_LOG: other shapes, fewer than two samples, values that are not finite, stamps that repeat or run
-        backwards, a quaternion of length (nearly) zero.
+    Raises `PblError` PHONE_LOG: other shapes, fewer than two samples, values that are not finite, stamps that repeat or
+    run backwards, a quaternion of length (nearly) zero.
     """
     try:
         time, quat = np.asarray(time_s, np.float64), np.asarray(quat_wxyz, np.float64)

@@ -21,12 +21,9 @@ def load_attitude(path: str | Path, video: VideoInfo | None = None) -> Attitude:
     clock is brought to the video's (`align_clock`, which may read the pictures). Without it, the phone was held in
     portrait, and time 0 of the log is the first frame.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, PHONE_LOG: see `read_phone_log`; a log by which the upright picture would lie on its side or stand
-        on its head (a wrong `frame` or `rotation_deg`, or quaternions that turn the other way); a log of another time
-        than the video's; a video of the front camera.
+    Raises `PblError` FILE_MISSING, PHONE_LOG: see `read_phone_log`; a log by which the upright picture would lie on its
+    side or stand on its head (a wrong `frame` or `rotation_deg`, or quaternions that turn the other way); a log of
+    another time than the video's; a video of the front camera.
     """
     path = Path(path)
     return attitude_of(read_phone_log(path), path, video)

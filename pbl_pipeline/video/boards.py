@@ -27,10 +27,7 @@ class Board:
     quarters of a square), dictionary the markers' family by OpenCV's name, legacy the pattern that OpenCV before 4.6
     printed for an even number of rows.
 
-    Raises
-    ------
-    PblError
-        USAGE: an unknown kind or dictionary, a board too small, sizes that are not positive.
+    Raises `PblError` USAGE: an unknown kind or dictionary, a board too small, sizes that are not positive.
     """
 
     kind: str

@@ -97,10 +97,7 @@ class Calibration:
 def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = None) -> Calibration:
     """The lens of the camera that filmed `board`. Reads the video twice; memory does not grow with its length.
 
-    Raises
-    ------
-    PblError
-        The VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
+    Raises `PblError` The VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
     """
     info = info or probe(path)
     candidates = sharpest_frames(path, info)
@@ -141,10 +138,7 @@ def calibrate(
 ) -> Calibration:
     """The lens from views of the board in upright pictures of one size (width, height).
 
-    Raises
-    ------
-    PblError
-        CALIBRATION_FEW_VIEWS, CALIBRATION_POOR (coverage, tilt, residual, uncertainty).
+    Raises `PblError` CALIBRATION_FEW_VIEWS, CALIBRATION_POOR (coverage, tilt, residual, uncertainty).
     """
     n_found, n_tried = len(views), len(views) if n_tried is None else n_tried
     _check_number(n_found, n_tried, key)

@@ -71,11 +71,8 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several. The JSON may state the
     standard deviation of the focal length, `focal_sd_px` (`pbl calibrate` does).
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: the file cannot be read, a field is missing or not usable, the model is a fisheye, several
-        cameras and none chosen, or the shape of the picture differs (a crop or a turn, which no factor describes).
+    Raises `PblError` CAMERA_INVALID: the file cannot be read, a field is missing or not usable, the model is a fisheye,
+    several cameras and none chosen, or the shape of the picture differs (a crop or a turn, which no factor describes).
     """
     path = Path(path)
     label, fields = _read(path, name)
@@ -170,12 +167,9 @@ def scaled_matrix(matrix: np.ndarray, factor: float) -> np.ndarray:
 def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:
     """Refuse a lens that no camera has: `matrix` (3, 3) px and `distortion` (5,) of an upright picture (width, height).
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's longer side
-        (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a distortion that
-        folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
+    Raises `PblError` CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's
+    longer side (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a
+    distortion that folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
     """
     m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
     plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1

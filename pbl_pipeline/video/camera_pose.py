@@ -21,21 +21,11 @@ _ORTHONORMAL_TOL = 1e-4
 class CameraPose:
     """Extrinsics of one camera, validated when made.
 
-    Attributes
-    ----------
-    R_nc : (3, 3) float64
-        Turns camera vectors (x right, y down, z forward) into world vectors (z up).
-    p_nc : (3,) float64
-        The camera's position in the world, m.
-
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: other shapes, not finite, R not a rotation.
+    Raises `PblError` CAMERA_INVALID: other shapes, not finite, R not a rotation.
     """
 
-    R_nc: np.ndarray
-    p_nc: np.ndarray
+    R_nc: np.ndarray  # (3, 3) turns camera vectors (x right, y down, z forward) into world vectors (z up)
+    p_nc: np.ndarray  # (3,) the camera's position in the world, m
 
     def __post_init__(self) -> None:
         try:
@@ -62,11 +52,8 @@ def load_camera_poses(path: str | Path) -> dict[str, CameraPose]:
     Calib_qualisys.toml the triangulated keypoints are its TRC to 0.1 mm, the TRC's y-up axes being
     (x, y, z)_trc = (y, z, x)_world; the other direction misses by metres.
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: the file cannot be read, holds no camera, a camera without `rotation` or `translation`, or
-        values that are not three finite numbers.
+    Raises `PblError` CAMERA_INVALID: the file cannot be read, holds no camera, a camera without `rotation` or
+    `translation`, or values that are not three finite numbers.
     """
     path = Path(path)
     try:

@@ -26,10 +26,7 @@ def find_camera(video: VideoInfo, file: str | Path | None = None) -> Camera:
     In this order: the calibration `file`; the focal length that the phone wrote into the video; the published
     calibration of a phone of that model; a typical phone's (`guess_camera`).
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID for a calibration that cannot be used (`calibrated_camera`).
+    Raises `PblError` CAMERA_INVALID for a calibration that cannot be used (`calibrated_camera`).
     """
     if file is not None:
         return calibrated_camera(file, video)

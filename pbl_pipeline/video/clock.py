@@ -57,11 +57,8 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
 
     quat_wxyz (P, 4): the log's orientation, camera to world.
 
-    Raises
-    ------
-    PblError
-        PHONE_LOG: the log and the video are of other times (a time zone is named where it explains that), or nothing
-        tells which part of the log is the video's.
+    Raises `PblError` PHONE_LOG: the log and the video are of other times (a time zone is named where it explains that),
+    or nothing tells which part of the log is the video's.
     """
     duration = _duration(video)
     if log.clock == VIDEO_CLOCK:

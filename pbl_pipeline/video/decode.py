@@ -45,10 +45,7 @@ _COPY_AGAIN = "copy the file from the phone or camera again and compare the size
 def check_file(path: str | Path) -> Path:
     """The path, if it is a file with bytes in it.
 
-    Raises
-    ------
-    PblError
-        VIDEO_MISSING, VIDEO_EMPTY.
+    Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY.
     """
     path = Path(path)
     if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
@@ -343,7 +340,6 @@ def _picture_bytes(stream: av.VideoStream) -> int:
 
 
 def _words(error: BaseException) -> str:
-    """What FFmpeg says."""
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 

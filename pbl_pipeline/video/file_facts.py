@@ -24,10 +24,7 @@ from .types import FirstPicture, VideoInfo
 def sha256_of(path: str | Path) -> str:
     """SHA-256 of a video file as 64 hex digits, read in pieces.
 
-    Raises
-    ------
-    PblError
-        VIDEO_MISSING, VIDEO_EMPTY.
+    Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY.
     """
     with check_file(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -39,11 +36,8 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     The whole file is decoded, because only that tells which frames there are: edit lists, damaged ends and announced
     counts differ from it. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
 
-    Raises
-    ------
-    PblError
-        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED, VIDEO_DAMAGED,
-        VIDEO_TIMESTAMPS.
+    Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED,
+    VIDEO_DAMAGED, VIDEO_TIMESTAMPS.
     """
     path = check_file(path)
     sha256 = sha256_of(path)
@@ -92,10 +86,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
 def read_first(path: str | Path) -> FirstPicture:
     """Size and rotation of a video's first picture, and the phone that recorded it. No more is decoded.
 
-    Raises
-    ------
-    PblError
-        As `probe`.
+    Raises `PblError` As `probe`.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
@@ -110,10 +101,7 @@ def packet_times(path: str | Path) -> np.ndarray:
     """(n,) time stamps (s) of a video's pictures as its container states them, the first 0. Nothing is decoded: a file
     with a damaged end or an edit list may decode to other frames (`probe`).
 
-    Raises
-    ------
-    PblError
-        VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TRUNCATED, VIDEO_TOO_LARGE.
+    Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TRUNCATED, VIDEO_TOO_LARGE.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
@@ -124,10 +112,7 @@ def packet_times(path: str | Path) -> np.ndarray:
 def read_metadata(path: str | Path) -> dict[str, str]:
     """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
 
-    Raises
-    ------
-    PblError
-        As `probe`.
+    Raises `PblError` As `probe`.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
@@ -138,10 +123,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 def recorded_utc(path: str | Path) -> str | None:
     """Return when a file says that it was recorded (YYYY-MM-DDTHH:MM:SSZ); None where it does not. Nothing is decoded.
 
-    Raises
-    ------
-    PblError
-        As `probe`.
+    Raises `PblError` As `probe`.
     """
     return _recorded_utc(read_metadata(path))
 

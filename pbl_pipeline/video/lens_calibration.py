@@ -95,11 +95,8 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
     The phone stands in a file of `pbl calibrate`; of another file it is that of the recording `like`, whose upright
     picture the calibration then must be of.
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: what `load_camera` refuses, and a file or recording that does not name the phone's model. The
-        VIDEO_ codes.
+    Raises `PblError` CAMERA_INVALID: what `load_camera` refuses, and a file or recording that does not name the phone's
+    model. The VIDEO_ codes.
     """
     path = Path(path)
     if like is not None:
@@ -119,11 +116,8 @@ def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Came
     Where the file says how the phone was held (`pbl calibrate` does) and the video is of the other format, they are
     turned by the difference of the two rotation flags. What does not fit without being turned is else refused.
 
-    Raises
-    ------
-    PblError
-        CAMERA_INVALID: as `load_camera`, and a calibration of another phone, lens or zoom than the video's; what one of
-        them does not say is no difference.
+    Raises `PblError` CAMERA_INVALID: as `load_camera`, and a calibration of another phone, lens or zoom than the
+    video's; what one of them does not say is no difference.
     """
     content = _content(Path(file))
     _check_same_phone(content, video)

@@ -24,11 +24,8 @@ _GRAVITY, _MOST_TILT_DEG = (8.8, 10.8), 25.0
 def read_phone_log(path: str | Path) -> PhoneLog:
     """Read a log in one of the forms of docs/phone_capture.md; what it is follows from its content.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING: no such file. PHONE_LOG: none of the forms, a field missing, what `check_attitude` refuses, an
-        unknown frame, sensors whose gravity contradicts the orientation.
+    Raises `PblError` FILE_MISSING: no such file. PHONE_LOG: none of the forms, a field missing, what `check_attitude`
+    refuses, an unknown frame, sensors whose gravity contradicts the orientation.
     """
     path = Path(path)
     log = read_sensor_logger(path) if is_sensor_logger(path) else read_own_form(path)

@@ -22,26 +22,3 @@ from .files import (
     visit_of_fits,
 )
 from .types import Held, Recording, Solution, Visit, stage_checks
-
-__all__ = [
-    "FIT",
-    "KINETICS",
-    "METRICS",
-    "OVERLAY",
-    "REPORT",
-    "SESSION",
-    "Held",
-    "Recording",
-    "Solution",
-    "Visit",
-    "load_kinetics",
-    "load_visit",
-    "name_of_fit",
-    "recording_facts",
-    "save_beside",
-    "save_kinetics",
-    "save_visit",
-    "stage_checks",
-    "visit_facts",
-    "visit_of_fits",
-]

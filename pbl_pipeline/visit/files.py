@@ -205,7 +205,6 @@ def save_beside(measured: Sequence[TrialMetrics], fits: Sequence[Path], metrics:
 
 
 def _save_measured(measured: TrialMetrics, folder: Path, name: str) -> list[str]:
-    """Write events and cycles of a recording and return the files' endings."""
     measured.events.save(_file(folder, name, EVENTS))
     save_curves(measured.cycles, _file(folder, name, CYCLES))
     return [EVENTS, CYCLES]

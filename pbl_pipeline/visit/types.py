@@ -37,46 +37,23 @@ class Held(Generic[T]):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """One recording of a visit. Results of stages that did not run are None; `problem` says why there is no fit.
+    """One recording of a visit. Results of stages that did not run are None; `problem` says why there is no fit."""
 
-    Parameters
-    ----------
-    name
-        Of its files: the video's name without its ending, distinct within the visit.
-    path
-        The video; None where it is not known (results alone, markers of a laboratory).
-    video, choice
-        Facts of the video; the choice of the person who is measured.
-    condition
-        Activity and pace.
-    events, cycles
-        Gait events and cycles; those of `measured` where there is one.
-    measured
-        All of the gait: events, cycles, measures and index.
-    problem
-        Why there is no fit, in a sentence; empty where there is one.
-    shown
-        The recording whose pictures may be shown: `path`, or a copy with hidden heads.
-    markers
-        The marker table of the fit, where the lab has its own.
-    number
-        In the tables the `video_id`.
-    load_keypoints, load_fit, load_log
-        Load the arrays when they are asked for; None where there are none.
-    """
-
-    name: str
-    path: Path | None = None
+    name: str  # of its files: the video's name without its ending, distinct within the visit
+    path: Path | None = None  # the video; None where it is not known (results alone, markers of a laboratory)
+    #: Facts of the video; the choice of the person who is measured.
     video: VideoInfo | None = None
     choice: SubjectChoice | None = None
-    condition: Condition = dataclasses.field(default_factory=Condition)
+    condition: Condition = dataclasses.field(default_factory=Condition)  # activity and pace
+    #: Gait events and cycles; those of `measured` where there is one.
     events: GaitEvents | None = None
     cycles: tuple[GaitCycle, ...] = ()
-    measured: TrialMetrics | None = None
-    problem: str = ""
-    shown: Path | None = None
-    markers: MarkerSet | None = None
-    number: int | None = None
+    measured: TrialMetrics | None = None  # all of the gait: events, cycles, measures and index
+    problem: str = ""  # why there is no fit, in a sentence; empty where there is one
+    shown: Path | None = None  # the recording whose pictures may be shown: `path`, or a copy with hidden heads
+    markers: MarkerSet | None = None  # the marker table of the fit, where the lab has its own
+    number: int | None = None  # in the tables the `video_id`
+    #: Load the arrays when they are asked for; None where there are none.
     load_keypoints: Callable[[], Keypoints | None] | None = None
     load_fit: Callable[[], TrialFit] | None = None
     load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None
@@ -155,41 +132,26 @@ class Solution:
 
 @dataclasses.dataclass(frozen=True)
 class Visit:
-    """A visit: whose, when, by which methods, and what was computed.
+    """A visit: whose, when, by which methods, and what was computed."""
 
-    Parameters
-    ----------
-    recordings
-        In the order of the fit, those without a fit after them.
-    solution, fit_checks, measures
-        How the body was fitted and how well; None where the chain ended before. The trials of `measures` are the fitted
-        recordings in their order.
-    subject, label, date
-        Code of the person (never a name), label and day of the visit (YYYY-MM-DD, empty where unknown).
-    kind
-        "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's).
-    methods
-        Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
-    kinetics
-        Forces and joint moments of the fitted recordings, None where they were not computed.
-    lacks
-        What its files lack, in sentences: those of an older version, or of a run that was ended.
-    key
-        In the tables the primary key of its result.
-    """
-
-    recordings: tuple[Recording, ...]
+    recordings: tuple[Recording, ...]  # in the order of the fit, those without a fit after them
+    #: How the body was fitted and how well; None where the chain ended before. The trials of `measures` are the fitted
+    #: recordings in their order.
     solution: Solution | None = None
     fit_checks: tuple[Check, ...] = ()
     measures: GaitMetrics | None = None
+    #: Code of the person (never a name), label and day of the visit (YYYY-MM-DD, empty where unknown).
     subject: str = "-"
     label: str = ""
     date: str = ""
-    kind: str = "single"
+    kind: str = "single"  # "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's)
+    #: Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    #: What its files lack, in sentences: those of an older version, or of a run that was ended.
     lacks: tuple[str, ...] = ()
+    #: Forces and joint moments of the fitted recordings, None where they were not computed.
     kinetics: Kinetics | None = None
-    key: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables the primary key of its result
 
     @property
     def fitted(self) -> tuple[Recording, ...]:

@@ -37,5 +37,4 @@ def why(video_id: int, as_json: bool) -> None:
 
 
 def _about(step: Step) -> str:
-    """Method of a step, and the video where several cameras filmed the trial."""
     return ", ".join(filter(None, (step.method, f"video_id {step.camera}" if step.camera is not None else "")))

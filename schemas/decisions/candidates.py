@@ -34,10 +34,7 @@ class Candidates:
 def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
     """Return the people who can be chosen in a video, once for each tracking method (or for one of them).
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
+    Raises `PblError` DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
     """
     key, name = _key(video_id, tracking_method), video.registered_video(video_id)["video_name"]
     out, found = [], (tracking.Tracking & key).keys()
@@ -77,10 +74,8 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
 
     It is the stored one where somebody had to choose (JPEG only), else it is drawn from the video.
 
-    Raises
-    ------
-    PblError
-        TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING, VIDEO_CHANGED.
+    Raises `PblError` TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING,
+    VIDEO_CHANGED.
     """
     from pbl_pipeline.tracking import FILM_THE_WHOLE_BODY, save_contact_sheet
 
@@ -124,11 +119,8 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
 def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
     """Key of the one TrackingSelection that is meant.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for a video that is not registered, SOLVER_UNKNOWN; USAGE where several methods track the video and
-        none is named, or another one.
+    Raises `PblError` DB_NOT_FOUND for a video that is not registered, SOLVER_UNKNOWN; USAGE where several methods track
+    the video and none is named, or another one.
     """
     selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
     if len(selections) != 1:

@@ -90,23 +90,17 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
     the last one is withdrawn, as by `take_back`. Cycles, measures and indices that were computed from other
     events of this trial are deleted and pending again.
 
+    Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without
+    events; USAGE where nothing was changed.
+
+    Returns the number of deleted rows by table.
+
     Parameters
     ----------
     events
         Time (s), side and kind of all events that there are now.
     seen
         `Shown.state` of the page on which they were set.
-
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows.
-
-    Raises
-    ------
-    PblError
-        EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without events;
-        USAGE where nothing was changed.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
 
@@ -167,7 +161,6 @@ def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str)
 
 
 def _of_events(key: Mapping[str, Any]) -> dict[str, Any]:
-    """The trial and the method whose events are corrected, of a key of GaitEvents."""
     return {k: key[k] for k in ("video_id", "gait_method")}
 
 
@@ -179,7 +172,6 @@ def _standing(key: Mapping[str, Any]) -> list[Person]:
 
 
 def _insert(key: Mapping[str, Any], person: Person, by: str, **columns: Any) -> dict[str, Any]:
-    """Insert the next correction; returns its key."""
     of_events = _of_events(key)
     number = of_events | {"correction_no": 1 + len(gait.EventCorrection & of_events)}
     gait.EventCorrection.insert1(

@@ -79,24 +79,17 @@ def decide_person(
 
     All in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
 
+    Raises `PblError` DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
+    `selection_of` raises.
+
+    Returns the number of deleted rows by table, which the next populate computes anew.
+
     Parameters
     ----------
     tracking_method
         Tracking in which the person has this number; needed where several methods track the video.
-    by
-        Name of who decides.
     seen
         `person_state` of the page on which it was decided; None where nothing was shown.
-
-    Returns
-    -------
-    dict
-        Table name to number of deleted rows, which the next populate computes anew.
-
-    Raises
-    ------
-    PblError
-        DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what `selection_of` raises.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
@@ -127,20 +120,15 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     and the session is planned without it: exactly what depends on it is pending. Nothing is deleted, so taking it back
     brings back what was computed; frozen slices stay as they are.
 
+    Raises `PblError` USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
+    DECIDED_MEANWHILE where `seen` is another state than the tables'.
+
     Parameters
     ----------
     reason, note
         One of `words.UNUSABLE`, and more in free words (no names), which "other" asks for.
-    by
-        Name of who decides.
     seen
         `usable_state` of the page on which it was decided; None: whatever it is.
-
-    Raises
-    ------
-    PblError
-        USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
-        DECIDED_MEANWHILE where `seen` is another state than the tables'.
     """
     note = " ".join(note.split())[:500]
     if reason not in UNUSABLE or (reason == "other" and not note):
@@ -194,18 +182,15 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
 
     It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
 
+    Raises `PblError` DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without
+    a reason or with one of more than 500 characters.
+
     Parameters
     ----------
     key, number
         Key of SessionQc and `qc_no` of the check.
     by, reason
         Who accepts it, and why (no names).
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without a reason or
-        with one of more than 500 characters.
     """
     reason = " ".join(reason.split())
     if not 0 < len(reason) <= 500:

@@ -17,8 +17,6 @@ def record_viewing(of: str, number: int, what: str, by: str) -> None:
         "video_id" or "session_id", and which.
     what
         Part of it that is viewed, such as "video" or "report".
-    by
-        Name of the viewer.
     """
     table = {"video_id": video.Video, "session_id": session.Session}[of]
     if not table & {of: number}:

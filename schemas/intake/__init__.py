@@ -8,16 +8,3 @@ from .registration import register
 from .rigs import SeveralCameras
 from .sensors import Sensors
 from .videos import OneCamera, ingest
-
-__all__ = [
-    "LaboratoryMarkers",
-    "Methods",
-    "OneCamera",
-    "Recording",
-    "Registered",
-    "Sensors",
-    "SeveralCameras",
-    "VisitRecord",
-    "ingest",
-    "register",
-]

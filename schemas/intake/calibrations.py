@@ -80,10 +80,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
     """Register the calibration in `file` for all videos of its phone's lens, size and rate without another calibration.
     It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
 
-    Raises
-    ------
-    PblError
-        What `pbl_pipeline.video.load_lens_calibration` raises.
+    Raises `PblError` What `pbl_pipeline.video.load_lens_calibration` raises.
     """
     from pbl_pipeline.video import load_lens_calibration
 
@@ -107,10 +104,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
 def remove_calibration(camera_id: int) -> list[Change]:
     """Withdraw a calibration from the devices that it is registered for. Videos that have it as their own keep it.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND: no device has this calibration.
+    Raises `PblError` DB_NOT_FOUND: no device has this calibration.
     """
     rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
     if not rows:
@@ -167,7 +161,6 @@ def calibrations() -> list[dict[str, Any]]:
 
 
 def _device(lens: PhoneLens) -> str:
-    """Short name of a lens's device, which is registered where it is new."""
     columns = lab.device_columns(lens)
     known = (lab.Device & columns).keys()
     if known:

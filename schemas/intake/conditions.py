@@ -14,10 +14,7 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     the next populate computes them anew; likewise the measures of a video that is or was one of a task. Call it inside
     a transaction.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown number; USAGE for labels of more than 32 characters.
+    Raises `PblError` DB_NOT_FOUND for an unknown number; USAGE for labels of more than 32 characters.
     """
     videos = fit.videos_of(fit.trial_of(video_id))
     return list(dict.fromkeys(change for v in videos for change in _set_condition(v, activity, pace)))

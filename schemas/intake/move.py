@@ -48,11 +48,8 @@ class Move:
 def plan_move(video_id: int, subject: str, session_label: str) -> Move:
     """What `carry_out` would do; changes nothing.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for a number that no video has; USAGE for a subject code that could be a name, a label too long,
-        or the visit that the video is in already.
+    Raises `PblError` DB_NOT_FOUND for a number that no video has; USAGE for a subject code that could be a name, a
+    label too long, or the visit that the video is in already.
     """
     check_subject(subject, "pass --to SUBJECT/SESSION with such a code")
     check_label("session", session_label, 64, 1)
@@ -95,11 +92,8 @@ def carry_out(plan: Move) -> None:
     that was computed from them; the rest of the old visit, and the new one, are fitted by the next populate. A
     recording in the archive goes to the folder of its new person, so that `pbl forget` finds it there.
 
-    Raises
-    ------
-    PblError
-        What `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive cannot be
-        moved, or another process is changing the archive. Nothing is changed then.
+    Raises `PblError` What `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
+    cannot be moved, or another process is changing the archive. Nothing is changed then.
     """
     of_these = [{"video_id": v} for v in plan.files]
 

@@ -170,16 +170,13 @@ def begin(phone: Phone, stated: object) -> Sent:
     """Insert a recording of which the phone states its sizes, its sum and what it shows; return it, also where the same
     recording is known.
 
+    Raises `PblError` UPLOAD_REFUSED for a statement that cannot be, a recording that is too long, or too many of them;
+    USAGE for a text with control characters or too long.
+
     Parameters
     ----------
     stated
         "sha256", "video_bytes", "log_bytes", and what `TEXTS` and `NUMBERS` name. Anything may stand there.
-
-    Raises
-    ------
-    PblError
-        UPLOAD_REFUSED for a statement that cannot be, a recording that is too long, or too many of them; USAGE for a
-        text with control characters or too long.
     """
     if not isinstance(stated, dict):
         raise upload_refused("no statement of a recording")
@@ -264,7 +261,6 @@ def refused(number: int, error: PblError) -> None:
 
 
 def upload_refused(found: str, next_step: str = "film again; if it happens again, report it") -> PblError:
-    """Return a `PblError` UPLOAD_REFUSED about what a phone sends."""
     return PblError(
         "UPLOAD_REFUSED",
         found=found,

@@ -117,6 +117,5 @@ def _of_videos(
 
 
 def _keypoint_methods(session_id: int) -> list[str]:
-    """Keys of the keypoint methods that are selected for videos of a session."""
     selected = keypoints.KeypointSelection & (video.Video & {"session_id": session_id})
     return sorted((dj.U("keypoint_method") & selected).to_arrays("keypoint_method"))

@@ -52,11 +52,8 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     Paths are relative to the sheet's folder. A video that is registered already for the same visit is left as it is.
     Every file is read, also in a dry run.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING, SHEET_FORMAT: a sheet that cannot be read, unknown columns, no rows; SOLVER_UNKNOWN, NORM_UNKNOWN.
-        What is wrong with a row is in the result.
+    Raises `PblError` FILE_MISSING, SHEET_FORMAT: a sheet that cannot be read, unknown columns, no rows; SOLVER_UNKNOWN,
+    NORM_UNKNOWN. What is wrong with a row is in the result.
     """
     rows = _rows(sheet)
     chosen = resolve(methods or Methods())

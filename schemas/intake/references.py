@@ -46,17 +46,14 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
     Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), the `truth.npz` of
     `pbl synth`, rotations of bodies (`.json.gz`), OpenSim `.mot`.
 
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (also what the readers raise).
+
     Parameters
     ----------
     source
         Instrument; None takes what the file says. A fit without a camera comes from markers, one with from several.
     shift_s
         Added to its time stamps (s), so that they are on the clock of the video.
-
-    Raises
-    ------
-    PblError
-        FILE_MISSING, FILE_FORMAT (also what the readers raise).
     """
     from pbl_pipeline import validation as lib
 
@@ -125,23 +122,16 @@ def add_reference(
     The same file is registered once; another file of the same source takes its place, and the older row with its
     errors stays, no longer current.
 
+    Raises `PblError` DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long,
+    and what `read_reference` raises.
+
     Parameters
     ----------
     about
         The video: its number, its path, or the name of its file where that is unique.
-    path
-        The reference, see `read_reference`.
     dataset, source, origin
         Collection it is reported with (None: as it was, else "unnamed"), instrument (None: what the file says), where
         it comes from (None: the path).
-    shift_s
-        As in `read_reference`.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long, and what
-        `read_reference` raises.
     """
     from pbl_pipeline.video import sha256_of
 
@@ -190,18 +180,15 @@ def add_trial(
     """`add_reference` with the current fit of another recording as it is in the tables: what several cameras or a
     laboratory's markers say of the movement that a video shows. The reference stays as it is when that fit is redone.
 
+    Raises `PblError` DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several
+    fits; what `add_reference` raises.
+
     Parameters
     ----------
     trial
         Number of the trial of several cameras, or of the marker recording.
     fit_method
         Key of the fit's method, where the trial was fitted by several.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several fits; what
-        `add_reference` raises.
     """
     trial = fit.trial_of(trial)
     current = fit.current().proj() * fit.FitSet.proj("fit_set_kind")

@@ -35,18 +35,12 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     computed with another is deleted: keypoints and after), activity, pace, population, height, mass, and the methods
     that are named, which are added to its selections and the plans of its session.
 
-    Returns
-    -------
-    list of Registered
-        One for each file, in their order. Missing, empty and unreadable files are refused with their error, all videos
-        of a trial of several cameras together; the other recordings are registered.
+    Raises `PblError` USAGE for a subject code that could be a name, a label too long, or a statement that does not
+    apply to the kind of recording; FIT_INPUT for a height or mass; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set;
+    SOLVER_UNKNOWN, NORM_UNKNOWN for unknown methods. Nothing is registered then.
 
-    Raises
-    ------
-    PblError
-        USAGE for a subject code that could be a name, a label too long, or a statement that does not apply to the kind
-        of recording; FIT_INPUT for a height or mass; MARKER_SET_UNKNOWN, FILE_FORMAT for a marker set; SOLVER_UNKNOWN,
-        NORM_UNKNOWN for unknown methods. Nothing is registered then.
+    Returns a `Registered` for each file, in their order. Missing, empty and unreadable files are refused with their
+    error, all videos of a trial of several cameras together; the other recordings are registered.
     """
     recordings, named = list(recordings), methods or Methods()
     for recording in recordings:

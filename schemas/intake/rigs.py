@@ -144,7 +144,6 @@ def check_same_number(session_id: int, n: int, path: Path) -> None:
 
 
 def _lens(calibration: Path, camera: str, path: Path) -> dict[str, Any]:
-    """The lens of a camera as a row of CameraCalibration, for the size of its video's first picture."""
     from pbl_pipeline.video import load_camera, read_first
 
     first = read_first(path)

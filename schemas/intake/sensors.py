@@ -42,10 +42,7 @@ class Sensors:
     def read(self) -> PhoneLog | None:
         """Read the log, if there is one, and check that the other files exist.
 
-        Raises
-        ------
-        PblError
-            FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
+        Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
         """
         from pbl_pipeline.video import read_phone_log
 

@@ -24,8 +24,6 @@ from ..subject_codes import folded
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A row of a sheet."""
-
     where: str  # for errors
     cells: dict[str, str]  # those that are not empty, by column
     error: PblError | None = None  # of the row as a whole
@@ -82,11 +80,8 @@ def read_sheets(path: Path) -> list[Sheet]:
     """The sheets of a CSV file (UTF-8; a comma, semicolon or tab between columns) or a workbook (.xlsx), empty ones
     left out. A date cell is YYYY-MM-DD, a number its shortest text.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, merged cells, formulas, error values,
-        no such file format. Cells beside the header's columns are an error of their row.
+    Raises `PblError` FILE_MISSING; SHEET_FORMAT: no header, a column twice or without a name, merged cells, formulas,
+    error values, no such file format. Cells beside the header's columns are an error of their row.
     """
     if not path.is_file():
         raise PblError(

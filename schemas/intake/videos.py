@@ -119,16 +119,13 @@ def ingest(
     Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
     with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
 
+    Raises `PblError` USAGE for the number of a person with several videos, or sensor files of some of them; what
+    `register` raises. Errors of single files are in the result.
+
     Parameters
     ----------
     files
         Sensor files of each path, in their order; empty for none at all.
-
-    Raises
-    ------
-    PblError
-        USAGE for the number of a person with several videos, or sensor files of some of them; what `register` raises.
-        Errors of single files are in the result.
     """
     if files and len(files) != len(paths):
         raise usage(

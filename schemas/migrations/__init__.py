@@ -13,5 +13,3 @@ applied, when, by which version, with which statements.
 from schemas.tables_version import Applied, applied
 
 from ._run import Migration, Outcome, available, migrate
-
-__all__ = ["Applied", "Migration", "Outcome", "applied", "available", "migrate"]

@@ -34,7 +34,6 @@ class Migration:
 
     @property
     def title(self) -> str:
-        """Number and name."""
         return title(self.number, self.name)
 
 
@@ -58,19 +57,14 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
 
     Needs an account that may create and alter tables. Stop the workers before.
 
+    Raises `PblError` DB_MIGRATION when the plan leaves differences that no migration removes (before anything is done),
+    when the database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
+    account may not alter tables.
+
     Parameters
     ----------
     dry_run
         Change nothing, return what would be done.
-    say
-        Called with each statement before it is executed.
-
-    Raises
-    ------
-    PblError
-        DB_MIGRATION when the plan leaves differences that no migration removes (before anything is done), when the
-        database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
-        account may not alter tables.
     """
     refuse_newer()
     if dry_run:

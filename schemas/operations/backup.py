@@ -65,24 +65,19 @@ def backup(
 ) -> Backup:
     """Save the database and the store into a new folder, where asked for with the recordings.
 
+    Raises `PblError` FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named);
+    STORE_UNAVAILABLE; DB_REFUSED when a table was changed in the middle.
+
     Parameters
     ----------
     folder
         Must not exist, or be empty.
     store
         False leaves the files out, where the object store is saved by other means.
-    say
-        Called with a sentence for each step.
     with_recordings
         Also save the registered videos. One that is gone or changed is left out and named.
     previous
         An earlier backup: recordings that it holds are linked instead of copied.
-
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named); STORE_UNAVAILABLE;
-        DB_REFUSED when a table was changed in the middle.
     """
     _new_folder(folder)
     prefix = connection.prefix()
@@ -142,10 +137,7 @@ def backup(
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     """Compare every byte of a backup with its checksums; return the manifest.
 
-    Raises
-    ------
-    PblError
-        BACKUP_INVALID, which names the missing or changed files.
+    Raises `PblError` BACKUP_INVALID, which names the missing or changed files.
     """
     try:
         manifest = read_json(folder / "manifest.json")
@@ -186,20 +178,13 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
 def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
     """Restore a backup into an empty database and its store. Everything is checked before anything is written.
 
+    Raises `PblError` BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is
+    another one than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
+
     Parameters
     ----------
-    folder
-        A folder that `backup` made.
     again
         After an interrupted restore: remove the tables it left, then start again.
-    say
-        Called with a sentence for each step.
-
-    Raises
-    ------
-    PblError
-        BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is another one
-        than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
     """
     manifest = check(folder, say)
     connection.connect(start=True)  # a new place has no server yet
@@ -250,7 +235,6 @@ def _snapshot(server: pymysql.Connection[Any]) -> str:
 
 
 def _videos(server: pymysql.Connection[Any], prefix: str) -> list[tuple[str, str]]:
-    """Return path and SHA-256 of the registered videos."""
     with server.cursor() as cursor:
         cursor.execute(f"SELECT video_path, video_sha256 FROM {quote(f'{prefix}_video', 'video')}")  # noqa: S608
         return [(str(path), str(sha)) for path, sha in cursor.fetchall()]

@@ -70,10 +70,7 @@ def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: P
 
     Those that an earlier backup holds are linked, which takes no room. A video that is gone or changed is left out.
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE: the backup.
+    Raises `PblError` FILE_UNWRITABLE: the backup.
     """
     done, before = Recordings(), set()
     if previous is not None and (previous / f"{RECORDINGS}.sha256").is_file():
@@ -125,10 +122,7 @@ def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str
 def restore_recordings(folder: Path) -> Recordings:
     """Copy the recordings of a backup back to where they were registered. A file that is there is never changed.
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE.
+    Raises `PblError` FILE_UNWRITABLE.
     """
     done = Recordings()
     if not (folder / f"{RECORDINGS}.sha256").exists():

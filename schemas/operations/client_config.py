@@ -26,18 +26,15 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
     Python in that folder, or below it, then connects with plain `import datajoint` as this process does. `safemode`
     stays on: DataJoint asks before it deletes or drops.
 
+    Raises `PblError` FILE_UNWRITABLE: it exists already, or cannot be written; DB_MIGRATION for tables of another
+    version; what `connection.connect` raises.
+
     Parameters
     ----------
     folder
         Made where it is missing.
     overwrite
         Replace the files of an earlier call; without it they are left.
-
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE: it exists already, or cannot be written; DB_MIGRATION for tables of another version;
-        what `connection.connect` raises.
     """
     connection.connect()
     refuse_other_version()

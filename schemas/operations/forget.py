@@ -77,10 +77,7 @@ def manifest_path(subject: str) -> Path:
 def find(subject: str) -> tuple[Ids, Found]:
     """Return everything there is of a person; change nothing.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
+    Raises `PblError` DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
     """
     ids, earlier = _identities(subject), read_manifest(subject)
     recordings = find_recordings(subject)
@@ -100,21 +97,13 @@ def find(subject: str) -> tuple[Ids, Found]:
 def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> Forgotten:
     """Remove a person. An interrupted run can be repeated: the list of files is written before a row is deleted.
 
+    Raises `PblError` DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken
+    over, or without the right to delete; STORE_UNAVAILABLE.
+
     Parameters
     ----------
-    subject
-        Code of the person.
     videos
         Delete the video files as well, where they still are what was registered.
-    say
-        Called with a sentence for each step.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken over, or without
-        the right to delete;
-        STORE_UNAVAILABLE.
     """
     try:
         with worker.alone(archive.LOCK, connection.connect()) as obtained:

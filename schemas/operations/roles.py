@@ -118,10 +118,7 @@ def _own(name: str) -> str:
 def password_file(folder: Path, account: Account) -> Path:
     """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600).
 
-    Raises
-    ------
-    PblError
-        FILE_UNWRITABLE, FILE_MISSING.
+    Raises `PblError` FILE_UNWRITABLE, FILE_MISSING.
     """
     path = folder / account.user
     try:
@@ -161,10 +158,7 @@ def read_password(path: Path) -> str:
 def apply(accounts: Sequence[tuple[Account, str]], require_tls: bool = False) -> None:
     """Create the accounts or bring them to these passwords and the rights of their roles.
 
-    Raises
-    ------
-    PblError
-        DB_REFUSED when the login (DJ_USER) may not manage accounts; what `connection.connect` raises.
+    Raises `PblError` DB_REFUSED when the login (DJ_USER) may not manage accounts; what `connection.connect` raises.
     """
     _run([s for account, password in accounts for s in statements(account, password, require_tls)])
 

@@ -13,10 +13,7 @@ def secret(name: str) -> str | None:
 
     The file wins, and one line break at its end does not count. The secret appears in no error.
 
-    Raises
-    ------
-    PblError
-        FILE_MISSING when the file cannot be read; USAGE when it is empty.
+    Raises `PblError` FILE_MISSING when the file cannot be read; USAGE when it is empty.
     """
     file = os.environ.get(f"{name}_FILE")
     if not file:

@@ -81,6 +81,8 @@ class Comparison:
 def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int | None] | None = None) -> Comparison:
     """Compare results.
 
+    Raises `PblError` USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
+
     Parameters
     ----------
     chosen
@@ -88,11 +90,6 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
         methods that most of the visits have.
     reference
         One of `chosen`; None: the earliest.
-
-    Raises
-    ------
-    PblError
-        USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
     """
     chosen = list(dict.fromkeys(chosen))
     if not FEWEST <= len(chosen) <= MOST:

@@ -52,7 +52,6 @@ def newest_sets() -> Any:
 
 
 def _sessions() -> Any:
-    """Sessions with what restricts them: subject, label, date, population."""
     return session.Session.proj("subject", "session_label", "session_date") * lab.Subject.proj("population")
 
 

@@ -30,7 +30,6 @@ def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
 
 
 def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a key belongs to a table."""
     return {name: key[name] for name in table.primary_key}
 
 
@@ -93,7 +92,6 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
 
 
 def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
-    """The library's `SubjectChoice` of a row."""
     from pbl_pipeline.tracking import SubjectChoice
 
     return SubjectChoice(

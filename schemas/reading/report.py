@@ -17,11 +17,8 @@ if TYPE_CHECKING:
 def write_visit(restriction: Any, out: Path) -> list[Path]:
     """Write the files of `pbl_pipeline.pipeline.write_results` for one visit; nothing is computed anew.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what `to_show` raises;
-        VIDEO_MISSING when a recording is no longer where it was.
+    Raises `PblError` DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what
+    `to_show` raises; VIDEO_MISSING when a recording is no longer where it was.
     """
     # The library's drawing half is heavy; commands that only look at rows do not pay for it.
     from pbl_pipeline.pipeline import write_results

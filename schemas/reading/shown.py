@@ -201,7 +201,6 @@ def computations(video_id: int) -> tuple[Any, ...]:
 
 
 def _key_of(session_id: int, result: Result) -> dict[str, Any]:
-    """Return the key of SessionGdi of a result of a visit."""
     names = ("fit_method", "gait_method", "gdi_method", "norm")
     chain = dict(zip(names, result.methods, strict=True))
     # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
@@ -238,7 +237,6 @@ def _tasks_of(
 
 
 def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:
-    """Return the checks of a result in the order of the chain."""
     from pbl_pipeline.qc import Check
 
     out = []

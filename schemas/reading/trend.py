@@ -97,7 +97,6 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
 
 
 def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
-    """Return value, interval, sides and reason of a result of a visit."""
     from pbl_pipeline.gait import interval_90
 
     if measure == INDEX:

@@ -145,12 +145,8 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
 
     Parameters
     ----------
-    wanted
-        The filter.
     after
         `Page.after` of the page before: a day (ISO) and a number. None: the first page.
-    size
-        Visits of a page.
     """
     joins, where, args = _asked(wanted)
     if after is not None:
@@ -197,14 +193,10 @@ def judged(
 
     Parameters
     ----------
-    by
-        The change.
     errors
         Standard deviation of the error, and minimal detectable change, of both values; None where one is not known.
     differs
         What was not alike (`not_alike`).
-    important
-        Minimal important change; None where there is none.
     """
     from pbl_pipeline.gait import Z90, chances, change_sd
 
@@ -439,7 +431,6 @@ def _unusable() -> str:
 
 
 def _is_usable(alias: str) -> str:
-    """Condition on a table with `video_id`."""
     return f"NOT EXISTS (SELECT 1 FROM {_name(video.NotUsable)} u WHERE u.video_id = {alias}.video_id)"
 
 

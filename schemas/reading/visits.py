@@ -80,6 +80,9 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
     """Return everything that the tables hold of one visit. Arrays are loaded when they are asked for.
 
+    Raises `PblError` DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN
+    and NORM_UNKNOWN for unknown methods.
+
     Parameters
     ----------
     restriction
@@ -88,12 +91,6 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
         recordings of one camera, of several, or markers.
     measures
         Also events, cycles, measures, index and forces.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN and
-        NORM_UNKNOWN for unknown methods.
     """
     found, key = find_visit(restriction)
     videos = (video.Video & {"session_id": found["session_id"]}).to_dicts(order_by="video_id")
@@ -126,18 +123,15 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     Rows with `subject`, `session_label`, `folder` (subject and session as the names of a folder in a folder) and the
     key of the fit and its measures.
 
+    Raises `PblError` DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds
+    of recordings or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
+
     Parameters
     ----------
     restriction
         Subject, session, methods (short names too), `fit_set_kind`.
     slice_name
         The visits that count in this slice alone, with the sets and methods that it was frozen with.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds of recordings
-        or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
     """
     sets: Any = fit.current()
     restriction = with_keys(restriction)
@@ -312,7 +306,6 @@ def _log_of(number: int, points: Mapping[str, Any], rows: Rows) -> tuple[PhoneLo
 
 
 def _kind_of(row: Mapping[str, Any], trial_of: Mapping[int, int]) -> str:
-    """Return the kind of set that a recording (row of Video) belongs to."""
     if row["camera_motion"] == video.NO_CAMERA:
         return fit.MARKERS
     return fit.RIG if int(row["video_id"]) in trial_of else fit.SINGLE

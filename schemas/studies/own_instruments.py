@@ -34,8 +34,6 @@ def add_instrument(values: Mapping[str, str], by: str) -> dict[str, PblError]:
     ----------
     values
         Text by field (`TEXTS`, `NUMBERS`, `FLAGS` as yes or no); an empty one is not stated.
-    by
-        Name of who adds it.
     """
     return in_transaction(lambda: _add(Row("instrument", {k: t for k, v in values.items() if (t := v.strip())}), by))
 

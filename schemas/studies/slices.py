@@ -54,6 +54,9 @@ def freeze(
 ) -> Slice:
     """Freeze the visits of a cohort (None: of all people) with the measures that they have now.
 
+    Raises `PblError` USAGE for a name that is taken, labels too long, several chains of methods; DB_NOT_FOUND for an
+    unknown cohort, no visits, no measures.
+
     Parameters
     ----------
     name
@@ -66,12 +69,6 @@ def freeze(
         The event from which the days of the visits count, such as surgery.
     note
         Shown on the report, with how many people of the cohort have no visit, and why they were excluded.
-
-    Raises
-    ------
-    PblError
-        USAGE for a name that is taken, labels too long, several chains of methods; DB_NOT_FOUND for an unknown cohort,
-        no visits, no measures.
     """
     for what, text, longest, least in (("slice", name, 32, 1), ("event", event, 64, 0), ("note", note, 1000, 0)):
         check_label(what, text, longest, least)
@@ -128,10 +125,7 @@ def study_data(name: str, curves: bool = True) -> StudyData:
 
     Set-based but for the curves, whose files are read one by one (`curves` False leaves them out).
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown slice; STUDY_INVALID as `StudyData`.
+    Raises `PblError` DB_NOT_FOUND for an unknown slice; STUDY_INVALID as `StudyData`.
     """
     from pbl_pipeline.study import StudyData, StudyDescription
 
@@ -198,10 +192,7 @@ def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
 def changes(name: str) -> list[str]:
     """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
 
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND for an unknown slice.
+    Raises `PblError` DB_NOT_FOUND for an unknown slice.
     """
     about = _about(name)
     rows = _frozen(about)

@@ -72,17 +72,15 @@ def import_sheets(paths: Sequence[Path], dry_run: bool = False, distinct_codes: 
 
     Empty cells leave what is stored, "-" removes it. Rows that are stored as they stand change nothing.
 
+    Raises `PblError` FILE_MISSING, SHEET_FORMAT for a sheet that cannot be read. What is wrong with a row is in the
+    result.
+
     Parameters
     ----------
     dry_run
         Change nothing; return what would be done.
     distinct_codes
         Codes that differ only in case, zeros or hyphens are different people.
-
-    Raises
-    ------
-    PblError
-        FILE_MISSING, SHEET_FORMAT for a sheet that cannot be read. What is wrong with a row is in the result.
     """
     sheets = [sheet for path in paths for sheet in read_sheets(path)]
     return in_transaction(lambda: import_rows(sheets, dry_run, distinct_codes))

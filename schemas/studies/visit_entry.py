@@ -70,6 +70,9 @@ def instruments() -> dict[str, dict[str, Any]]:
 def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = "") -> Entered:
     """Bring what is stored of a visit to what was entered, all of it or nothing.
 
+    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored
+    meanwhile. What is wrong with a value is in the result.
+
     Parameters
     ----------
     values
@@ -78,12 +81,6 @@ def enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reason
         Who entered it, and why (no names).
     seen
         `Entry.seen` of the form that was filled in.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored meanwhile.
-        What is wrong with a value is in the result.
     """
     return in_transaction(lambda: _enter(session_id, values, by, seen, reason))
 

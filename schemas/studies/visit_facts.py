@@ -58,17 +58,12 @@ class Facts:
 def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
     """Register a visit, and its person where the code is new.
 
+    Returns the number of the visit, None where nothing was written; errors by field, "" for what is wrong with several.
+
     Parameters
     ----------
     values
         Text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
-    by
-        Name of who registers it.
-
-    Returns
-    -------
-    tuple
-        Number of the visit, None where nothing was written; errors by field, "" for what is wrong with several.
     """
     given = {name: text for name, text in _stripped(values).items() if text}
     return in_transaction(lambda: _register(given, by))
@@ -142,6 +137,11 @@ def correct(
     What was computed with another height, mass or walking aid, or pools other recordings now, is deleted and pending
     again.
 
+    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored
+    meanwhile.
+
+    Returns the fields that were changed; the errors by field, with any of which nothing was written.
+
     Parameters
     ----------
     values
@@ -150,16 +150,6 @@ def correct(
         Who entered it, and why (no names).
     seen
         `Facts.seen` of the form that was filled in.
-
-    Returns
-    -------
-    tuple
-        The fields that were changed; the errors by field, with any of which nothing was written.
-
-    Raises
-    ------
-    PblError
-        DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored meanwhile.
     """
     return in_transaction(lambda: _correct(session_id, _stripped(values), by, seen, reason))
 

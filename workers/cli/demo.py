@@ -52,7 +52,6 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
 
 
 def _fetched() -> dict[str, Path]:
-    """The models of the default methods and the demo recording."""
     from pbl_pipeline import assets
 
     return {name: assets.fetch(name) for name in assets.needed()}

@@ -3,5 +3,3 @@
 from .app import Options, create_app
 from .folder import ResultsFolder
 from .serve import Where, serve
-
-__all__ = ["Options", "ResultsFolder", "Where", "create_app", "serve"]

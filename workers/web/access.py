@@ -176,7 +176,6 @@ class Cookie:
 
     @property
     def name(self) -> str:
-        """Its name."""
         return f"__Host-{self.called}" if self.secure else self.called
 
     def of(self, request: Request) -> str:

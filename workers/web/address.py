@@ -67,7 +67,6 @@ def page(path: str, answer: Callable[..., Any], right: str, *, look: str = "") -
 
 
 def number_of(request: Request) -> int:
-    """Return the number in the address."""
     (number,) = request.path_params.values()
     return number
 

@@ -141,7 +141,6 @@ def _first_cycle(own: Sequence[comparison.Cycle], of_all: Sequence[Sequence[comp
 
 
 def _bounds(limits: tuple[float, float] | None, decimals: int) -> str:
-    """Limits of an interval as numbers; empty where there are none."""
     return "" if limits is None else f"{number(limits[0], decimals)}\N{EN DASH}{number(limits[1], decimals)}"
 
 

@@ -42,10 +42,7 @@ def begin(computing: ProcessQueue, target: Target, session_id: int, again: bool)
     A job that a worker has taken is not taken twice, and a process that ends leaves no partial result: all it does
     passes through the queues of the tables.
 
-    Raises
-    ------
-    PblError
-        USAGE where too many visits wait.
+    Raises `PblError` USAGE where too many visits wait.
     """
     for key in ((session_id, False), (session_id, True)):
         computing.drop(key)

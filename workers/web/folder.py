@@ -50,6 +50,8 @@ class _Place:
 class ResultsFolder:
     """Visits below a folder, each a folder with a `session.json` or, of a run that was ended, with fits alone.
 
+    Raises `PblError` FILE_MISSING where no results are in it.
+
     Parameters
     ----------
     path
@@ -57,11 +59,6 @@ class ResultsFolder:
     videos
         Where the recordings are looked for, by their names: the results hold none. None: beside the results and in the
         folder above.
-
-    Raises
-    ------
-    PblError
-        FILE_MISSING where no results are in it.
     """
 
     def __init__(self, path: Path, videos: Path | None = None) -> None:
@@ -298,7 +295,6 @@ def _tasks(visit: Visit) -> dict[str, dict[str, tuple[Measure | None, str]]]:
 
 
 def _subject(visit: Visit) -> str:
-    """Return the code of the person; empty where the files do not have one."""
     return "" if visit.subject == "-" else visit.subject
 
 

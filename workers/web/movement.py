@@ -83,6 +83,9 @@ def movement_json(found: Recording, body: dict[str, Any]) -> bytes:
 def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
     """The fitted body and the camera as the page's script draws them (`static/body.js`).
 
+    Raises `PblError` FILE_FORMAT for a fit of another body model than the installed one, and for movement that cannot
+    be sent.
+
     Returns
     -------
     dict
@@ -95,11 +98,6 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
         Channels (C, T): root x, y, z relative to `start`, four of each body's quaternion (w, x, y, z), four of the
         camera's, in steps. Of each channel second differences, first the low bytes of all, then the high bytes: that
         packs to a third. Frames without a pose repeat the one before.
-
-    Raises
-    ------
-    PblError
-        FILE_FORMAT for a fit of another body model than the installed one, and for movement that cannot be sent.
     """
     from pbl_pipeline.render import NEAR_M, body_track, turning_radius2
 

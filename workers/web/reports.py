@@ -143,7 +143,6 @@ def _not_made(found: str) -> PblError:
 
 
 def _copy_of(video_id: int) -> str:
-    """Hash of the de-identified copy of a recording, empty where there is none."""
     return "".join(str(h) for h in (privacy.Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))
 
 

@@ -25,9 +25,7 @@ class Source(Protocol):
     DB_NOT_FOUND.
     """
 
-    def visit(self, number: int, result: int) -> shown.ShownVisit:
-        """Return a visit with one of its results."""
-        ...
+    def visit(self, number: int, result: int) -> shown.ShownVisit: ...
 
     def recording(self, number: int) -> shown.ShownRecording:
         """Return a recording; its arrays are loaded when they are asked for."""

@@ -26,10 +26,8 @@ class Videos:
     def path(self, video_id: int) -> Path:
         """The file to show. Reads tables.
 
-        Raises
-        ------
-        PblError
-            DB_NOT_FOUND for an unknown video or one without the copy that is asked for, HEAD_NOT_FOUND, VIDEO_MISSING.
+        Raises `PblError` DB_NOT_FOUND for an unknown video or one without the copy that is asked for, HEAD_NOT_FOUND,
+        VIDEO_MISSING.
         """
         with self._lock:
             if video_id in self._open:

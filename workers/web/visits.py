@@ -69,8 +69,6 @@ def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
 
 
 def list_routes(pages: Pages, tables: Tables) -> list[Address]:
-    """Return the address of the list of the tables' visits."""
-
     async def visits(request: Request) -> Response:
         session: Session = request.state.session
         asked = dict(request.query_params)
@@ -136,7 +134,6 @@ def _after(text: str) -> tuple[str, int] | None:
 
 
 def _day(text: str) -> datetime.date | None:
-    """A day as pages write it, None for what is none."""
     try:
         return datetime.date.fromisoformat(text) if len(text) == len("2026-01-10") else None
     except ValueError:

@@ -21,28 +21,3 @@ from .types import (
     no_events,
 )
 from .walking import WalkingParams
-
-__all__ = [
-    "EVENTS",
-    "FOOT_DOWN",
-    "FOOT_UP",
-    "LEFT",
-    "METHODS",
-    "PHASE_ORDER",
-    "RIGHT",
-    "SIDES",
-    "EventParams",
-    "FilterParams",
-    "FootVelocityParams",
-    "GaitEvent",
-    "GaitEvents",
-    "PhaseParams",
-    "WalkingParams",
-    "apply_correction",
-    "candidates",
-    "check_correction",
-    "check_preconditions",
-    "detect_events",
-    "load_events",
-    "no_events",
-]

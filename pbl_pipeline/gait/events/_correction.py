@@ -34,6 +34,8 @@ def check_correction(
     apart, because the person may have stood still or left the view. Neighbours that the method detected as such may
     stay.
 
+    Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event and what is expected there.
+
     Parameters
     ----------
     events
@@ -42,11 +44,6 @@ def check_correction(
         Times of the first and the last frame of the recording (s).
     detected
         Time (s), side and kind of the detected events.
-
-    Raises
-    ------
-    PblError
-        EVENTS_IMPLAUSIBLE, which names the event and what is expected there.
     """
     found = sorted(events, key=lambda e: e.time_s)
     if len(found) > MOST_EVENTS:
@@ -84,8 +81,6 @@ def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_change
 
     Parameters
     ----------
-    detected
-        The events that the method found.
     events
         All events that there are now, as `check_correction` returned them.
     n_changed

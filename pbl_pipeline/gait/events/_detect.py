@@ -13,23 +13,17 @@ from .types import GaitEvents
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     """Foot down and foot up of both sides in order of time, in bouts of walking.
 
+    Raises `PblError` GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
+    SOLVER_UNKNOWN for an unknown method; ASSET_MISSING where the event model's weights are not there.
+
+    The status is PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view).
+
     Parameters
     ----------
     feet
         Trajectories with NaN where the person is not seen. Long gaps split the trial.
     params
         What `METHODS.find` takes: name of a method, a `Paramset`, or a method's own parameters; None for the default.
-
-    Returns
-    -------
-    GaitEvents
-        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view).
-
-    Raises
-    ------
-    PblError
-        GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
-        SOLVER_UNKNOWN for an unknown method; ASSET_MISSING where the event model's weights are not there.
     """
     method = METHODS.find(params)
     return method.function(feet, method)

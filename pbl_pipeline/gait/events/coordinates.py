@@ -12,7 +12,7 @@ from scipy.signal import find_peaks
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
-from pbl_pipeline.qc import PASS, WARN, Check
+from pbl_pipeline.qc import PASS, Check, warn_if
 
 from ._preconditions import check_preconditions
 from .order import Candidate, best_sequence
@@ -49,16 +49,10 @@ def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -
     threshold, near 1 for one far above it, times the confidence `c` of the points where the source states one. It
     orders events by how clear they are; it is not calibrated against truth.
 
-    Returns
-    -------
-    GaitEvents
-        Status PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot is
-        never seen, or the person walks backwards.
+    Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
 
-    Raises
-    ------
-    PblError
-        GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
+    The status is PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot
+    is never seen, or the person walks backwards.
     """
     p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)
@@ -251,16 +245,6 @@ def _offset(event: str, p: EventParams) -> float:
 
 
 def _checks(feet: FootTrajectories, n_events: int, breaks: int) -> tuple[Check, ...]:
-    checks = [
-        Check("walking", PASS, float(n_events), None, ""),
-        Check(
-            "event_order_breaks",
-            WARN if breaks else PASS,
-            float(breaks),
-            0.0,
-            "an event is missing or out of order: look at the feet in the overlay around the end of each bout"
-            if breaks
-            else "",
-        ),
-    ]
-    return (*checks, *heading_check(feet.heading_agreement))
+    advice = "an event is missing or out of order: look at the feet in the overlay around the end of each bout"
+    order = warn_if(breaks, "event_order_breaks", float(breaks), 0.0, advice)
+    return (Check("walking", PASS, float(n_events), None), order, *heading_check(feet.heading_agreement))

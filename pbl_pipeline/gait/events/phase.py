@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
-from pbl_pipeline.qc import PASS, WARN, Check
+from pbl_pipeline.qc import PASS, WARN, Check, warn_if
 
 from ._preconditions import check_preconditions, input_error
 from .network.predict import GRID_HZ, check_model, load, predict
@@ -196,12 +196,12 @@ def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, tur
     breaks = _breaks(events)
     checks = [
         Check("walking", PASS, float(len(events)), None, ""),
-        Check(
+        warn_if(
+            runs,
             "double_support_present",
-            WARN if runs else PASS,
             round(float(np.median(support)), 3) if len(support) else None,
             0.0,
-            "running: no double support; measures of walking do not apply" if runs else "",
+            "running: no double support; measures of walking do not apply",
         ),
     ]
     if breaks and not runs:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pbl_pipeline.bounded import MIB, read_text
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+from pbl_pipeline.qc import EMPTY, Check, warn_if
 
 LEFT, RIGHT = "left", "right"
 FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
@@ -142,9 +142,8 @@ def heading_check(agreement: float) -> tuple[Check, ...]:
     """Whether the person goes where the pelvis faces; nothing where the way is not known (NaN)."""
     if not math.isfinite(agreement):
         return ()
-    ok = agreement >= 0.5
-    advice = "" if ok else "the person does not go where the pelvis faces: sideways, or the camera moved"
-    return (Check("heading_agreement", PASS if ok else WARN, round(agreement, 3), 0.5, advice),)
+    advice = "the person does not go where the pelvis faces: sideways, or the camera moved"
+    return (warn_if(not agreement >= 0.5, "heading_agreement", round(agreement, 3), 0.5, advice),)
 
 
 def load_events(path: str | Path) -> tuple[GaitEvent, ...]:

@@ -11,17 +11,3 @@ from ._feet import (
 from ._heading import heading_agreement, heading_from_hips
 from ._legs import LEG_JOINTS
 from ._poses import BodyPoses, trial_poses
-
-__all__ = [
-    "BRIDGED_S",
-    "FOOT_MARKER_SETS",
-    "LEG_JOINTS",
-    "BodyPoses",
-    "FootTrajectories",
-    "feet_from_fit",
-    "feet_from_keypoints",
-    "feet_from_markers",
-    "heading_agreement",
-    "heading_from_hips",
-    "trial_poses",
-]

@@ -58,39 +58,24 @@ _FOOT = ("talus", "calcn", "toes")
 
 @dataclasses.dataclass(frozen=True)
 class FootTrajectories:
-    """Feet and pelvis of one trial. Frames without the person are NaN.
+    """Feet and pelvis of one trial. Frames without the person are NaN."""
 
-    Attributes
-    ----------
-    time_s : (T,)
-    heel_m, toe_m : (T, 2, 3)
-        [left, right], metres (or any one unit: only ratios to the leg length are used).
-    pelvis_m : (T, 3)
-        Middle between the hips. May stand still (root-relative points): only positions relative to it are used.
-    forward : (T, 3)
-        Unit horizontal heading, the direction the pelvis faces, averaged over about a stride.
-    up : (3,)
-        Unit vertical. World: z. Camera frame without phone orientation: -y, which assumes a level camera.
-    confidence : (T, 2)
-        0..1 of each foot's points; NaN where the source states none (a fit).
-    source
-        "fit", "keypoints <marker set>", "markers <marker set>".
-    heading_agreement
-        Cosine between heading and displacement, weighted by the way covered; 1 = walks where the pelvis faces,
-        -1 = backwards or left and right exchanged; NaN where the pelvis does not travel or its position is relative.
-    legs_m : (T, 5, 2, 3) or None
-        Hip, knee, ankle, heel, toe of [left, right] in the same frame, NaN where not known; what the event model reads.
-    """
-
-    time_s: np.ndarray
+    time_s: np.ndarray  # (T,)
+    #: (T, 2, 3) [left, right], metres (or any one unit: only ratios to the leg length are used).
     heel_m: np.ndarray
     toe_m: np.ndarray
+    #: (T, 3) middle between the hips. May stand still (root-relative points): only positions relative to it are used.
     pelvis_m: np.ndarray
-    forward: np.ndarray
+    forward: np.ndarray  # (T, 3) unit horizontal heading, the direction the pelvis faces, averaged over about a stride
+    #: (3,) unit vertical. World: z. Camera frame without phone orientation: -y, which assumes a level camera.
     up: np.ndarray
-    confidence: np.ndarray
-    source: str
+    confidence: np.ndarray  # (T, 2) 0..1 of each foot's points; NaN where the source states none (a fit)
+    source: str  # "fit", "keypoints <marker set>", "markers <marker set>"
+    #: Cosine between heading and displacement, weighted by the way covered; 1 = walks where the pelvis faces, -1 =
+    #: backwards or left and right exchanged; NaN where the pelvis does not travel or its position is relative.
     heading_agreement: float = float("nan")
+    #: (T, 5, 2, 3) or None: hip, knee, ankle, heel, toe of [left, right] in the same frame, NaN where not known; what
+    #: the event model reads.
     legs_m: np.ndarray | None = None
 
     def __post_init__(self) -> None:

@@ -48,10 +48,7 @@ def check_degrees(values: np.ndarray, about: str) -> None:
 
     In degrees every gait cycle has larger values: a knee bends by 15 and more in swing, a hip by 20. NaN are ignored.
 
-    Raises
-    ------
-    PblError
-        ANGLE_UNITS.
+    Raises `PblError` ANGLE_UNITS.
     """
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]

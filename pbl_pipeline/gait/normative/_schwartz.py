@@ -23,25 +23,19 @@ class GaitNorm:
 
     Speeds are dimensionless, v / sqrt(g L) with the leg length L; below the slowest and above the fastest of the five
     groups the curves are those of that group.
-
-    Attributes
-    ----------
-    groups, speed, cadence, foot_off
-        Names of the five groups, their mean speed, cadence (steps per sqrt(L / g)) and foot off (of the cycle).
-    mean_deg, sd_deg
-        angle -> (5, 1 + 2 K): mean, then (cosine, sine) of harmonics 1, 2, ...; phase 0 is the foot contact of the
-        angle's side. Signs: anterior tilt, side up, side ahead, flexion, adduction, internal rotation, dorsiflexion
-        positive; `foot_progression` toes in positive.
-    source, licence
-        Where the figures come from.
     """
 
+    #: Names of the five groups, their mean speed, cadence (steps per sqrt(L / g)) and foot off (of the cycle).
     groups: tuple[str, ...]
     speed: np.ndarray
     cadence: np.ndarray
     foot_off: np.ndarray
+    #: angle -> (5, 1 + 2 K): mean, then (cosine, sine) of harmonics 1, 2, ...; phase 0 is the foot contact of the
+    #: angle's side. Signs: anterior tilt, side up, side ahead, flexion, adduction, internal rotation, dorsiflexion
+    #: positive; `foot_progression` toes in positive.
     mean_deg: Mapping[str, np.ndarray]
     sd_deg: Mapping[str, np.ndarray]
+    #: Where the figures come from.
     source: str
     licence: str
 

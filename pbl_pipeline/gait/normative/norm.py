@@ -27,56 +27,32 @@ _FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 
 @dataclasses.dataclass(frozen=True)
 class NormativeSet:
-    """What a cycle is compared with.
+    """What a cycle is compared with."""
 
-    Attributes
-    ----------
-    name, version, n, source, licence, convention
-        Identity, number of normative vectors, where they are from, how their angles are defined.
-    variables
-        Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
-    angle_model
-        How the angles of the vectors are defined, one of `ANGLE_MODELS`.
-    mapped_from
-        The definition they were measured in, where they were mapped from another one; else empty.
-    percent : (P,)
-    mean_deg : (V * P,)
-        Mean normative vector.
-    components : (K, V * P)
-        Orthonormal principal components, largest variance first, the largest entry of each positive.
-    explained_variance : (K,)
-        deg^2 (n - 1).
-    explained_share
-        Fraction of the variance of the normative vectors in the K components.
-    ln_mean, ln_sd
-        Of the natural logarithm of the distance over the normative vectors (n - 1).
-    curves
-        name -> {"percent", "mean_deg", "sd_deg"}: the band of a report, also for angles outside the index.
-    sha256
-        Of the numbers above, checked at loading.
-    source_sha256
-        Of the file the set was built from.
-    """
-
+    #: Identity, number of normative vectors, where they are from, how their angles are defined.
     name: str
     version: int
     n: int
     source: str
     licence: str
     convention: str
+    #: Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
     variables: tuple[str, ...]
-    percent: np.ndarray
-    mean_deg: np.ndarray
+    percent: np.ndarray  # (P,)
+    mean_deg: np.ndarray  # (V * P,) mean normative vector
+    #: (K, V * P) orthonormal principal components, largest variance first, the largest entry of each positive.
     components: np.ndarray
-    explained_variance: np.ndarray
-    explained_share: float
+    explained_variance: np.ndarray  # (K,) deg^2 (n - 1)
+    explained_share: float  # fraction of the variance of the normative vectors in the K components
+    #: Of the natural logarithm of the distance over the normative vectors (n - 1).
     ln_mean: float
     ln_sd: float
+    #: name -> {"percent", "mean_deg", "sd_deg"}: the band of a report, also for angles outside the index.
     curves: dict[str, dict[str, np.ndarray]]
-    source_sha256: str = ""
-    sha256: str = ""
-    angle_model: str = PLUG_IN_GAIT
-    mapped_from: str = ""
+    source_sha256: str = ""  # of the file the set was built from
+    sha256: str = ""  # of the numbers above, checked at loading
+    angle_model: str = PLUG_IN_GAIT  # how the angles of the vectors are defined, one of `ANGLE_MODELS`
+    mapped_from: str = ""  # the definition they were measured in, where they were mapped from another one; else empty
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
@@ -130,11 +106,8 @@ def fit_norm(
     normative vectors alone or, as in the paper, of these together with the vectors `pooled` (M, V * P) of patients:
     mean and log distances are those of the normative vectors either way. `n_components` stands for `variance`.
 
-    Raises
-    ------
-    PblError
-        NORM_INVALID for too few vectors, no more vectors than components, another length or values that are not
-        finite; ANGLE_UNITS.
+    Raises `PblError` NORM_INVALID for too few vectors, no more vectors than components, another length or values that
+    are not finite; ANGLE_UNITS.
     """
     vectors = _vectors(vectors, variables, percent)
     _enough(len(vectors), n_components or 0)

@@ -10,22 +10,3 @@ from .folder import ADMIN_USER, APP_USER, Credentials, Folder
 from .port import HOST
 from .process import admin
 from .server import Status, allow_prefix, not_running, start, starts_on_demand, status, stop
-
-__all__ = [
-    "ADMIN_USER",
-    "APP_USER",
-    "HOST",
-    "Binaries",
-    "Credentials",
-    "Folder",
-    "Status",
-    "admin",
-    "allow_prefix",
-    "find_server",
-    "get_server",
-    "not_running",
-    "start",
-    "starts_on_demand",
-    "status",
-    "stop",
-]

@@ -37,15 +37,12 @@ class Account:
 def server_account(data: Path) -> Account:
     """The account for the server process: never root.
 
+    Raises `PblError` DB_UNAVAILABLE when the caller is root and the system has no unprivileged account to drop to.
+
     Parameters
     ----------
     data
         The data folder. When root meets one that exists, its owner goes on running it, whoever that is.
-
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE when the caller is root and the system has no unprivileged account to drop to.
     """
     import pwd  # here: Windows has none, and this module is imported there too
 
@@ -71,10 +68,7 @@ def server_account(data: Path) -> Account:
 def check_enterable(folder: Path, account: Account) -> None:
     """Make sure `account` can enter `folder`, by trying as that account (permission bits alone do not decide).
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE naming the first folder on the way that is closed, and the remedy.
+    Raises `PblError` DB_UNAVAILABLE naming the first folder on the way that is closed, and the remedy.
     """
     if not account.popen():
         return

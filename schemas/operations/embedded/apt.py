@@ -21,10 +21,7 @@ Say = Callable[[str], None]
 def install(say: Say) -> str | None:
     """Install the packages on the system, as root or with a sudo that asks no password.
 
-    Returns
-    -------
-    str | None
-        None when they are installed, else why not.
+    Returns None when they are installed, else why not.
     """
     prefix = _privilege()
     if prefix is None:

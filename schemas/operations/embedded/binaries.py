@@ -59,10 +59,7 @@ def find_server() -> Binaries | None:
 def check_obtainable() -> None:
     """Return where the server can be started or fetched; nothing is made or fetched.
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE with the reason and the other ways to a database.
+    Raises `PblError` DB_UNAVAILABLE with the reason and the other ways to a database.
     """
     if not hasattr(os, "geteuid"):
         raise _unavailable("the embedded database needs the accounts and file locks of Linux or macOS", install=False)
@@ -77,15 +74,7 @@ def check_obtainable() -> None:
 def get_server(say: Say = silent) -> Binaries:
     """The server of this machine, fetched with apt when it is absent.
 
-    Parameters
-    ----------
-    say
-        Called with a sentence for each step.
-
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE with the reason and the remedy.
+    Raises `PblError` DB_UNAVAILABLE with the reason and the remedy.
     """
     found = find_server()
     if found:

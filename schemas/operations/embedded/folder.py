@@ -51,7 +51,6 @@ class Folder:
 
     @staticmethod
     def default() -> Folder:
-        """The folder in `settings.home_dir()`."""
         return Folder(settings.home_dir() / "db")
 
     @property
@@ -89,10 +88,7 @@ class Folder:
     def create(self, account: Account) -> None:
         """Make the folders, with the server's two given to its account.
 
-        Raises
-        ------
-        PblError
-            DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
+        Raises `PblError` DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
         """
         try:
             missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
@@ -114,10 +110,7 @@ class Folder:
     def locked(self, timeout_s: float = 120.0) -> Iterator[None]:
         """Hold the folder's lock; another command that starts or stops the server waits.
 
-        Raises
-        ------
-        PblError
-            DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
+        Raises `PblError` DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
         """
         with ExitStack() as stack:
             try:
@@ -137,10 +130,7 @@ class Folder:
     def credentials(self) -> Credentials:
         """The stored passwords.
 
-        Raises
-        ------
-        PblError
-            DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read.
+        Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read.
         """
         try:
             return Credentials(**json.loads(self.credentials_file.read_text(encoding="utf-8")))

@@ -27,10 +27,7 @@ def port_free(port: int) -> bool:
 def free_port() -> int:
     """A random free port, so that several databases on one machine rarely collide.
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE when 200 tries find none.
+    Raises `PblError` DB_UNAVAILABLE when 200 tries find none.
     """
     for port in random.sample(PORTS, 200):
         if port_free(port):

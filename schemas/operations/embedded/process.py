@@ -51,10 +51,7 @@ def buffer_pool_mb() -> int:
 def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
     """Start the server as a separate process that outlives this one, and wait until it answers.
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE with the server's last lines and what to do.
+    Raises `PblError` DB_UNAVAILABLE with the server's last lines and what to do.
     """
     port = folder.state().get("port")
     for attempt in range(5):
@@ -104,10 +101,7 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
 def wait_until_answers(folder: Folder) -> None:
     """Return once an administrator can log in.
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE when the process ends, or does not answer within a minute (it is left alone then).
+    Raises `PblError` DB_UNAVAILABLE when the process ends, or does not answer within a minute (it is left alone then).
     """
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:

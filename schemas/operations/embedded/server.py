@@ -40,23 +40,10 @@ class Status:
 def start(say: Say = silent, folder: Folder | None = None) -> Status:
     """Have the server running: get it, set it up and start it as far as needed. Safe to call again, and at once.
 
-    Parameters
-    ----------
-    say
-        Called with a sentence for each step.
-    folder
-        Where; default `settings.home_dir()/db`.
+    Raises `PblError` DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start
+    (with its last log lines).
 
-    Returns
-    -------
-    Status
-        With `running` True.
-
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start (with its last
-        log lines).
+    Returns `Status`, with `running` True.
     """
     folder = folder or Folder.default()
     if running_pid(folder) is None:
@@ -82,20 +69,14 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
 def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = False) -> bool:
     """End the server and wait for it. Safe to call when none runs.
 
+    Raises `PblError` DB_REFUSED when it does not end within a minute.
+
+    Returns True when one was running.
+
     Parameters
     ----------
     on_demand
         The next connection starts it again (`starts_on_demand`), until it is stopped without this.
-
-    Returns
-    -------
-    bool
-        True when one was running.
-
-    Raises
-    ------
-    PblError
-        DB_REFUSED when it does not end within a minute.
     """
     folder = folder or Folder.default()
     if not folder.initialised():
@@ -160,10 +141,7 @@ def status(folder: Folder | None = None) -> Status:
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
     """Let the application use the schemas `<prefix>_...`; grants access and records it in `server.json`.
 
-    Raises
-    ------
-    PblError
-        USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer.
+    Raises `PblError` USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer.
     """
     folder = folder or Folder.default()
     if prefix in folder.state().get("prefixes", []):

@@ -30,10 +30,7 @@ DROP_EVERY_ACCOUNT = (
 def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     """Fill `folder.data` and write the credentials, which mark the set-up as complete.
 
-    Raises
-    ------
-    PblError
-        DB_UNAVAILABLE when there is too little space, or with what the program that failed said.
+    Raises `PblError` DB_UNAVAILABLE when there is too little space, or with what the program that failed said.
     """
     free_mb = shutil.disk_usage(folder.path).free // 2**20
     if free_mb < NEEDED_MB:
@@ -72,10 +69,7 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
 def grant(prefix: str) -> str:
     r"""The statement that lets the application do everything in the schemas `<prefix>_...`, and nothing elsewhere.
 
-    Raises
-    ------
-    PblError
-        USAGE when `prefix` cannot begin the name of a schema.
+    Raises `PblError` USAGE when `prefix` cannot begin the name of a schema.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,29}", prefix):
         raise PblError(
