@@ -61,8 +61,8 @@ def _corrections(conn: Any) -> list[str]:
     ]
     if _columns(conn, events):  # dropped first: a run that was broken off between the two tables has copied its rows
         out.append(
-            f"INSERT IGNORE INTO {_gait('event_correction__event')} (video_id, gait_method, correction_no, corrected_no,"
-            " corrected_time, corrected_side, corrected_kind, corrected_probability)"
+            f"INSERT IGNORE INTO {_gait('event_correction__event')} (video_id, gait_method, correction_no,"
+            " corrected_no, corrected_time, corrected_side, corrected_kind, corrected_probability)"
             " SELECT e.video_id, h.hand_from, 1, e.hand_no, e.hand_time, e.hand_side, e.hand_kind, e.hand_probability"
             f" FROM {events} AS e JOIN {hand} AS h USING (video_id)"
         )

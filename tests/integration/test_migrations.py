@@ -142,13 +142,13 @@ class Killed(BaseException):
     """The end of a migration in the middle."""
 
 
-def migrate_until(line: int | None) -> list[str]:
-    """Migrate, killed at that line of what it says (None: to the end); return what it said."""
+def migrate_until(line: int | str | None) -> list[str]:
+    """Migrate, killed at that line of what it says, by its number or text (None: to the end); return what it said."""
     done: list[str] = []
 
     def say(text: str) -> None:
         done.append(text)
-        if len(done) == line:
+        if line in (len(done), text.strip()):
             raise Killed
 
     with contextlib.suppress(Killed):
@@ -244,9 +244,9 @@ def test_instruments_and_errors_of_before_get_their_columns(empty: Callable[[], 
     assert migrations.migrate().steps == []
 
 
-@pytest.mark.parametrize("killed_before", [None, 4, 60])
+@pytest.mark.parametrize("killed_before", [None, 4, 60, "DROP TABLE `pbl_gait`.`hand_events`"])
 def test_corrections_by_a_method_become_rows(
-    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | None
+    empty: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, killed_before: int | str | None
 ):
     chain.install(monkeypatch)
     schemas.activate()
