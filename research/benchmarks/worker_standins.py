@@ -58,9 +58,9 @@ def install(patch: pytest.MonkeyPatch) -> None:
 
 
 def _timed(detect: Callable[..., Any], rate: float) -> Callable[..., Any]:
-    def timed(path: Path, *more: Any) -> Any:
+    def timed(path: Path, *more: Any, **named: Any) -> Any:
         time.sleep(frames_of(path) / rate)
-        return detect(path, *more)
+        return detect(path, *more, **named)
 
     return timed
 

@@ -435,6 +435,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
             if outcome is None:
                 begun.append((time.monotonic(), one))
             elif job.table.__name__ == "Keypoints":
+                assert outcome.what == "done", outcome
                 detected[one] = time.monotonic()
 
     class Visitors(Supervisor):
@@ -452,7 +453,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
                         queue.fill(video.VideoInfo, [{"video_id": one}], FIRST)
                     else:
                         refresh.refresh()
-            if len(detected) == videos + 1 + late:
+            if len(detected) == videos + 1 + late and not self._stopping:
                 self.stop()
 
     with installation():
