@@ -464,7 +464,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
         Worker(tables_of("decode"), Silent()).run(once=True)  # all are read
         read = time.monotonic()
         assert len(tracking.Tracking.jobs.pending) == videos + 1
-        options = Options(processes=processes, selftest=False)
+        options = Options("cpu", processes, selftest=False)  # the fit is left out
         assert Visitors(options, Heard(), worker_standins.work).run() == 0
         del os.environ[worker_standins.RATE]
     taken = [one for _, one in begun]

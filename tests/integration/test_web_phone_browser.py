@@ -346,25 +346,33 @@ def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit
 
 def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        origin = page.evaluate("location.origin")
-
-        def room(n_bytes: int) -> None:
-            used = page.evaluate("async () => (await navigator.storage.estimate()).usage")
-            page.cdp.send("Storage.overrideQuotaForOrigin", {"origin": origin, "quotaSize": used + n_bytes})
-
         page.locator(".allow").click()
-        room(100_000_000)
+        page.locator(".said", has_text="Ready").wait_for()
+        page.evaluate(
+            "() => { globalThis.estimate = navigator.storage.estimate.bind(navigator.storage);"
+            " navigator.storage.estimate = async () => ({quota: 1e9, usage: 9e8}); }"
+        )
         page.locator(".record").click()
         page.locator(".said", has_text="no room").wait_for()
         assert page.locator("main").get_attribute("data-filming") != "yes"
-        room(1_000_000_000)
+        page.evaluate("() => { navigator.storage.estimate = estimate; }")
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(3000)
-        room(0)
+        (writer,) = page.workers
+        writer.evaluate(
+            "() => { const written = FileSystemSyncAccessHandle.prototype.write;"
+            " FileSystemSyncAccessHandle.prototype.write = function (...more) {"
+            " if (globalThis.isFull) throw new DOMException('', 'QuotaExceededError');"
+            " return written.apply(this, more); }; globalThis.isFull = true; }"
+        )
         page.locator(".said", has_text="no room").wait_for()
-        room(1_000_000_000)  # somebody made room, and what was filmed is sent
-        page.locator(".keep").click()
+        page.locator(".after .keep").click()
+        again = page.locator(".takes button", has_text="Keep")
+        again.wait_for()
+        assert "no room" in (page.locator(".said").text_content() or "")
+        writer.evaluate("() => { globalThis.isFull = false; }")  # there is room again, and what was filmed is sent
+        again.click()
         arrived(page)
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 10
 
