@@ -20,7 +20,7 @@ import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas.video
 from tests.integration import chain
-from workers import heartbeat, process, selftest
+from workers import heartbeat, loop, process, selftest
 from workers.process import Options
 
 #: Variable that names the recording whose probe every video gives.
@@ -29,6 +29,8 @@ RECORDED = "PBL_BENCH_RECORDED"
 SLEEP = "PBL_BENCH_SLEEP"
 #: Frames of a video that tracking and keypoints read in a second; not set: they take no time.
 RATE = "PBL_BENCH_RATE"
+#: The same of a real detector, on a core that does other work as well.
+REAL_RATE = 20.0
 #: Frames of a video whose path does not say how many (6 s at 30 frames/s).
 FRAMES = 180
 
@@ -53,8 +55,10 @@ def install(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(chain, "probe", lambda _: probe(recorded))
     patch.setattr(schemas.video, "registered_file", lambda path, sha256, key: Path(path))
     if RATE in os.environ:
+        rate = float(os.environ[RATE])
+        patch.setattr(loop, "IDLE_S", tuple(s * REAL_RATE / rate for s in loop.IDLE_S))  # pauses are shorter as well
         for module, name in ((pbl_pipeline.tracking, "track_people"), (pbl_pipeline.keypoints, "detect_keypoints")):
-            patch.setattr(module, name, _timed(getattr(module, name), float(os.environ[RATE])))
+            patch.setattr(module, name, _timed(getattr(module, name), rate))
 
 
 def _timed(detect: Callable[..., Any], rate: float) -> Callable[..., Any]:

@@ -393,10 +393,6 @@ def memory(jobs: int) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------- long
-#: Frames that detection reads in a second, on a core that does other work as well.
-_DETECTION = 20.0
-
-
 @main.command()
 @click.option("--videos", default=300, show_default=True, help="Short recordings that wait.")
 @click.option("--minutes", default=120.0, show_default=True, help="Length of the long one, registered before them.")
@@ -445,7 +441,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
             super()._settle()
             n = len(registered) - videos - 1
             if n < late and any(one == hour for _, one in begun):
-                share = (n + 0.5) / late * 2 * frames / (_DETECTION * faster)
+                share = (n + 0.5) / late * 2 * frames / (worker_standins.REAL_RATE * faster)
                 if time.monotonic() - next(t for t, one in begun if one == hour and t > read) > share:
                     one = register(videos + n, f"/recordings/{videos + n:07d}.mp4")
                     if n % 2:
@@ -457,7 +453,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
                 self.stop()
 
     with installation():
-        os.environ[worker_standins.RATE] = str(_DETECTION * faster)
+        os.environ[worker_standins.RATE] = str(worker_standins.REAL_RATE * faster)
         hour = register(-1, f"/recordings/long_{frames}frames.mp4")
         register_many(recordings(0, videos))
         registered.update(dict.fromkeys(map(int, video.Video.to_arrays("video_id")), time.monotonic()))
@@ -478,7 +474,7 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
 
     queued = [one for one in registered if one <= videos + 1 and one != hour]
     others = [one for one in registered if one > videos + 1]
-    click.echo(f"{processes} processes, detection {_DETECTION:g} frames/s, {faster:g} times as fast")
+    click.echo(f"{processes} processes, detection {worker_standins.REAL_RATE:g} frames/s, {faster:g} times as fast")
     say("recordings taken before the long one", len(set(taken[: taken.index(hour)])), "", f"of {videos} that waited")
     say("one that waited: longest behind another's video", max(map(longest, queued)) / 60, "min", "bar 10")
     say("one that came meanwhile: longest behind another's video", max(map(longest, others)) / 60, "min", "bar 10")
