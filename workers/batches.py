@@ -26,8 +26,9 @@ class Runs(Protocol):
     def follow(self, outcomes: Sequence[Outcome]) -> None: ...
 
 
-def run_fits(first: list[Claim], worker: Runs) -> None:
-    """Do the jobs of `first` and, as long as there are more of that table, the next batches.
+def run_fits(first: list[Claim], worker: Runs, where: str | None = None) -> None:
+    """Do the jobs of `first` and, as long as there are more of that table, the next batches. `where`:
+    as for `queue.claim`.
 
     Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the
     next batch waiting. A job that the batch could not compute is computed alone.
@@ -36,7 +37,7 @@ def run_fits(first: list[Claim], worker: Runs) -> None:
     with ThreadPoolExecutor(max_workers=n, thread_name_prefix="fits") as device:
         waiting = deque([(first, _start(device, first))])
         while waiting:
-            while len(waiting) <= n and not worker.stop.is_set() and (more := queue.claim(table, worker.batch)):
+            while len(waiting) <= n and not worker.stop.is_set() and (more := queue.claim(table, worker.batch, where)):
                 waiting.append((more, _start(device, more)))
             batch, result = waiting.popleft()
             worker.heartbeat.doing(f"{table.__name__}: batch of {len(batch)}")

@@ -28,6 +28,8 @@ log = logging.getLogger("pbl.worker")
 IDLE_S = (0.5, 20.0)
 #: An idle worker looks at all tables when no worker has done so for as long.
 REFRESH_EVERY_S = 60.0
+#: Condition on a job that it is not of a long recording.
+_IS_SHORT = f"priority NOT IN ({','.join(map(str, registry.LONG.values()))})"
 
 
 @dataclasses.dataclass
@@ -37,7 +39,7 @@ class Worker:
     tables: the computed tables it serves. stop: set when it is to end after the running job. report: called with each
     job before it and while it waits for the database (without an outcome), and after it. batch: fits per batch.
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
-    job but of these recordings; called before each look, as sets come and go.
+    job but of these recordings; called before each look, as sets come and go. short: takes no job of a long recording.
     """
 
     tables: Sequence[Any]
@@ -47,6 +49,7 @@ class Worker:
     batch: int = 1
     limit: int | None = None
     only: Callable[[], Scope] | None = None
+    short: bool = False
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -103,20 +106,20 @@ class Worker:
             jobs = queue.claim(table, n, conditions[table]) if n > 0 else []
             if jobs:
                 self._taken[table.__name__] += len(jobs)
-                self._do(jobs)
+                self._do(jobs, conditions[table])
                 return len(jobs)
         return 0
 
     def _conditions(self) -> dict[Any, str | None]:
         """The tables of which jobs may be taken, and the condition on their keys."""
         if self.only is None:
-            return dict.fromkeys(self.tables)
+            return dict.fromkeys(self.tables, _IS_SHORT if self.short else None)
         scope = self.only()
         return {table: where for table in self.tables if (where := scope.where(table)) is not None}
 
-    def _do(self, jobs: list[Claim]) -> None:
+    def _do(self, jobs: list[Claim], where: str | None) -> None:
         if registry.stage_of(jobs[0].table).resource == registry.FIT and self.batch > 1:
-            run_fits(jobs, self)
+            run_fits(jobs, self, where)
             return
         ended, left = [], list(jobs)
         try:

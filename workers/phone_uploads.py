@@ -23,9 +23,7 @@ from schemas.operations.folders import private_folder, sync_folders
 
 from . import queue
 from .incoming import KEPT_FREE, Copy, check_opens, has_room, take_in
-
-#: Priority of the jobs of a phone's recording: the person is still there.
-FIRST = 1
+from .registry import FIRST
 
 
 def folder(phone: Phone, sent: Sent) -> Path:

@@ -30,7 +30,8 @@ SELFTEST_FAILED = 3
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
-    time limits of the tables. gpus: dealt to the processes in turn, one to each."""
+    time limits of the tables. gpus: dealt to the processes in turn, one to each. short: takes no job of a long
+    recording."""
 
     resource: str = "all"
     processes: int = 1
@@ -41,13 +42,16 @@ class Options:
     limit_factor: float = 1.0
     selftest: bool = True
     gpus: tuple[str, ...] = ()
+    short: bool = False
 
     def of_process(self, number: int) -> Options:
-        """The options of one of the processes: its GPU, and how many processes share that."""
+        """The options of one of the processes: its GPU, and how many processes share that; the first of several is for
+        short recordings, so that long ones never hold them all."""
+        one = dataclasses.replace(self, short=number == 0 and self.processes > 1)
         if not self.gpus:
-            return self
+            return one
         n = len(self.gpus)
-        return dataclasses.replace(self, gpus=(self.gpus[number % n],), processes=math.ceil(self.processes / n))
+        return dataclasses.replace(one, gpus=(self.gpus[number % n],), processes=math.ceil(self.processes / n))
 
 
 def work(options: Options, pipe: Connection) -> None:
@@ -97,7 +101,7 @@ def work(options: Options, pipe: Connection) -> None:
             stop.set()
 
     with heartbeat.Heartbeat(options.resource) as beats:
-        worker = loop.Worker(tables, beats, stop, report, options.batch)
+        worker = loop.Worker(tables, beats, stop, report, options.batch, short=options.short)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
             worker.run(once=options.once, max_jobs=options.max_jobs)

@@ -19,12 +19,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from schemas import chain
+from schemas import chain, fit, video
 from schemas.connection import dj
 from schemas.jobs import COUNTS, jobs_of, keys_of
 from schemas.transactions import repeated
 
-from .registry import NEW
+from .registry import LONG, LONG_FRAMES, NEW
 
 #: Candidates looked at for each job that is wanted: others look at the same ones.
 _SPREAD = 4
@@ -72,6 +72,7 @@ def fill(
     """Queue every key that can be computed and has neither a result nor a job, in one statement; returns how many.
 
     `keys`: only what belongs to these (keys of a table above); `where`: only what a condition on the key holds for.
+    `priority`: that of a short recording; jobs of a long one get `registry.LONG` instead.
     DataJoint's own refresh inserts row by row.
     """
     if (keys is not None and not keys) or not chain.is_wanted(table):
@@ -85,11 +86,20 @@ def fill(
     todo = (source - table.proj()).restrict(dj.Not(jobs), semantic_check=False).proj()
     columns = ",".join(quote(c) for c in todo.heading.primary_key)
     names = f"{columns},{quote('status')},{quote('priority')}"
-    values = f"{columns},'pending',{int(priority)}"
+    values = f"{columns},'pending',IF({_is_long(source)},{LONG.get(priority, priority)},{int(priority)})"
     # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
     # outside: names are DataJoint's own, quoted by its adapter.
     statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
     return _alone(table.connection, lambda: int(table.connection.query(statement).rowcount))
+
+
+def _is_long(keys: Any) -> str:
+    """Condition on keys: that of a long recording, or of a set with one."""
+    long = video.VideoInfo.proj("n_frames") & f"n_frames > {LONG_FRAMES}"
+    name = "video_id"
+    if name not in keys.heading.primary_key:
+        name, long = "fit_set", fit.FitSet.Video.proj() * long
+    return f"{name} IN (SELECT {name} FROM ({long.make_sql()}) AS long_ones)"  # noqa: S608  of constants
 
 
 @repeated

@@ -13,7 +13,7 @@ from schemas.worker import alone
 
 from . import queue, recover
 from .queue import Claim
-from .registry import NEW
+from .registry import NEW, base_priority
 
 #: Days in which something from outside counts as recent, and seconds after which a worker looks at everything again.
 RECENT_DAYS, ALL_EVERY_S = 2, 3600.0
@@ -46,8 +46,8 @@ def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
     for table in {c.table for c in done}:
         of_table = [c for c in done if c.table is table]
         for follower in chain.followers(table):
-            for priority in {c.priority for c in of_table}:
-                keys = [c.key for c in of_table if c.priority == priority]
+            for priority in {base_priority(c.priority) for c in of_table}:
+                keys = [c.key for c in of_table if base_priority(c.priority) == priority]
                 if follower is fit.TrialInput:
                     keys = fit.TrialInput.with_trials(keys)
                 out.queued[follower.__name__] += queue.fill(follower, keys, priority)
@@ -56,7 +56,7 @@ def after(done: Sequence[Claim], failed: Sequence[Claim] = ()) -> Refreshed:
     # A failure before the fit decides that a trial does not take part in it.
     touched += [c.key for c in failed if c.table in chain.before(fit.SessionFit)]
     if touched:
-        out.planned = plan(sessions_of(touched), min(c.priority for c in (*done, *failed)))
+        out.planned = plan(sessions_of(touched), min(base_priority(c.priority) for c in (*done, *failed)))
     return out
 
 

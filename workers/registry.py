@@ -21,8 +21,14 @@ GROUPS: dict[str, tuple[str, ...]] = {
     LIGHT: (LIGHT,),
 }
 
-#: Priority of new work and of what is computed again: the lower number is taken first.
-NEW, AGAIN = 5, 8
+#: Priority of a recording of a phone (the person is still there), of new work and of what is computed again: the lower
+#: number is taken first.
+FIRST, NEW, AGAIN = 1, 5, 8
+#: A recording with more frames is long: ten minutes of detection at 20 frames/s.
+LONG_FRAMES = 12_000
+#: Priority of the jobs of a long recording: behind the short ones of its kind, ahead of the next kind.
+LONG = {priority: priority + 1 for priority in (FIRST, NEW, AGAIN)}
+_SHORT = {long: priority for priority, long in LONG.items()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +59,11 @@ STAGES: dict[str, Stage] = {
     "KinematicError": Stage(LIGHT, 300.0, 16),
     "Deidentified": Stage(DETECTOR, 4 * 3600.0, 1),
 }
+
+
+def base_priority(priority: int) -> int:
+    """The priority that a job would have if its recording were short."""
+    return _SHORT.get(priority, priority)
 
 
 def stage_of(table: Any) -> Stage:

@@ -4,6 +4,7 @@
     python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
     python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
     python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
+    python -m research.benchmarks.workers long               # 300 videos with one of two hours among them
 
 Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
 folder and removes it.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import math
 import os
 import subprocess
@@ -388,6 +390,97 @@ def memory(jobs: int) -> None:
         )
         again = 100 * (mib[2 * jobs - 1] / mib[jobs - 1] - 1)
         say(f"memory after {2 * jobs} jobs", mib[2 * jobs - 1], "MiB", f"{again:+.1f} % since then")
+
+
+# ---------------------------------------------------------------------------------------------------------------- long
+@main.command()
+@click.option("--videos", default=300, show_default=True, help="Short recordings that wait.")
+@click.option("--minutes", default=120.0, show_default=True, help="Length of the long one, registered before them.")
+@click.option("--late", default=10, show_default=True, help="Recordings that come while it is detected, half by phone.")
+@click.option("--processes", default=1, show_default=True)
+@click.option("--faster", default=100.0, show_default=True, help="Detection takes 1/N of the time that it would.")
+def long(videos: int, minutes: float, late: int, processes: int, faster: float) -> None:
+    """How long a recording waits behind another's video: the longest time in which no process took any job."""
+    from research.benchmarks.many_recordings import archived, register_many
+    from schemas import tracking, video
+    from schemas.intake import VisitRecord
+    from workers import queue, refresh
+    from workers.heartbeat import Silent
+    from workers.loop import Worker
+    from workers.metrics import Metrics
+    from workers.process import Options
+    from workers.registry import FIRST, tables_of
+    from workers.supervisor import Supervisor
+
+    frames = round(minutes * 60 * 30)
+    begun: list[tuple[float, int]] = []  # when a job was taken, and of which recording
+    detected: dict[int, float] = {}
+    registered: dict[int, float] = {}
+    phones: set[int] = set()
+
+    def register(i: int, path: str) -> int:
+        visit = VisitRecord(f"S{i // EACH:07d}", "1") if i >= 0 else VisitRecord("LONG", "1")
+        register_many([archived(path, hashlib.sha256(path.encode()).hexdigest(), 1000 + i, visit)])
+        (video_id,) = (video.Video & {"video_path": path}).to_arrays("video_id")
+        registered[int(video_id)] = time.monotonic()
+        return int(video_id)
+
+    class Heard(Metrics):
+        def heard(self, job: Claim, outcome: Outcome | None) -> None:
+            one = int(job.key.get("video_id", 0))
+            if outcome is None:
+                begun.append((time.monotonic(), one))
+            elif job.table.__name__ == "Keypoints":
+                assert outcome.what == "done", outcome
+                detected[one] = time.monotonic()
+
+    class Visitors(Supervisor):
+        """Registers recordings while the long one is detected, and ends when all are."""
+
+        def _settle(self) -> None:
+            super()._settle()
+            n = len(registered) - videos - 1
+            if n < late and any(one == hour for _, one in begun):
+                share = (n + 0.5) / late * 2 * frames / (worker_standins.REAL_RATE * faster)
+                if time.monotonic() - next(t for t, one in begun if one == hour and t > read) > share:
+                    one = register(videos + n, f"/recordings/{videos + n:07d}.mp4")
+                    if n % 2:
+                        phones.add(one)
+                        queue.fill(video.VideoInfo, [{"video_id": one}], FIRST)
+                    else:
+                        refresh.refresh()
+            if len(detected) == videos + 1 + late and not self._stopping:
+                self.stop()
+
+    with installation():
+        os.environ[worker_standins.RATE] = str(worker_standins.REAL_RATE * faster)
+        hour = register(-1, f"/recordings/long_{frames}frames.mp4")
+        register_many(recordings(0, videos))
+        registered.update(dict.fromkeys(map(int, video.Video.to_arrays("video_id")), time.monotonic()))
+        Worker(tables_of("decode"), Silent()).run(once=True)  # all are read
+        read = time.monotonic()
+        assert len(tracking.Tracking.jobs.pending) == videos + 1
+        options = Options("cpu", processes, selftest=False)  # the fit is left out
+        assert Visitors(options, Heard(), worker_standins.work).run() == 0
+        del os.environ[worker_standins.RATE]
+    taken = [one for _, one in begun]
+    gaps = [(after - before, after) for (before, _), (after, _) in itertools.pairwise(begun)]
+
+    def longest(one: int) -> float:
+        """Seconds, as long as they would be, in which this recording waited and no process took a job."""
+        since = max(registered[one], read)
+        waits = [min(gap, after - since) for gap, after in gaps if since < after <= detected[one]]
+        return faster * max(waits)
+
+    queued = [one for one in registered if one <= videos + 1 and one != hour]
+    others = [one for one in registered if one > videos + 1]
+    click.echo(f"{processes} processes, detection {worker_standins.REAL_RATE:g} frames/s, {faster:g} times as fast")
+    say("recordings taken before the long one", len(set(taken[: taken.index(hour)])), "", f"of {videos} that waited")
+    say("one that waited: longest behind another's video", max(map(longest, queued)) / 60, "min", "bar 10")
+    say("one that came meanwhile: longest behind another's video", max(map(longest, others)) / 60, "min", "bar 10")
+    for name, group in (("phone", phones), ("other", {*others} - phones)):
+        times = sorted(faster * (detected[one] - registered[one]) / 60 for one in group)
+        say(f"one that came meanwhile, by {name}: keypoints after, median", times[len(times) // 2], "min")
 
 
 if __name__ == "__main__":

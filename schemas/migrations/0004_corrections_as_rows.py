@@ -52,16 +52,20 @@ def _corrections(conn: Any) -> list[str]:
     hand, methods = _gait("hand_events"), _gait("#gait_event_method")
     members = quote(connection.schema_name("fit"), "fit_set__video")
     keypoints = quote(connection.schema_name("keypoints"), "__keypoints")
+    events = _gait("hand_events__event")
     out = [
         f"INSERT IGNORE INTO {corrections} (video_id, gait_method, correction_no, correction_withdrawn,"
         " correction_changed, correction_tracking, correction_person, correction_by, correction_at)"
         " SELECT video_id, hand_from, 1, 0, hand_changed, hand_tracking, hand_person, hand_by, hand_at"
         f" FROM {hand}",
-        f"INSERT IGNORE INTO {_gait('event_correction__event')} (video_id, gait_method, correction_no, corrected_no,"
-        " corrected_time, corrected_side, corrected_kind, corrected_probability)"
-        " SELECT e.video_id, h.hand_from, 1, e.hand_no, e.hand_time, e.hand_side, e.hand_kind, e.hand_probability"
-        f" FROM {_gait('hand_events__event')} AS e JOIN {hand} AS h USING (video_id)",
     ]
+    if _columns(conn, events):  # dropped first: a run that was broken off between the two tables has copied its rows
+        out.append(
+            f"INSERT IGNORE INTO {_gait('event_correction__event')} (video_id, gait_method, correction_no,"
+            " corrected_no, corrected_time, corrected_side, corrected_kind, corrected_probability)"
+            " SELECT e.video_id, h.hand_from, 1, e.hand_no, e.hand_time, e.hand_side, e.hand_kind, e.hand_probability"
+            f" FROM {events} AS e JOIN {hand} AS h USING (video_id)"
+        )
     # Results by the method of a correction that counts in their set were computed from uncorrected events.
     counts = (
         f"EXISTS (SELECT 1 FROM {corrections} AS c JOIN {members} AS v ON v.video_id = c.video_id"
@@ -87,7 +91,7 @@ def _corrections(conn: Any) -> list[str]:
         slices = quote(connection.schema_name("study"), "study_slice")
         out.append(f"UPDATE {slices} SET gait_method = '{new}' WHERE gait_method = '{old}'")
     out += _delete(conn, methods, "t0.gait_method_name = 'by-hand'")
-    return [*out, f"DROP TABLE IF EXISTS {_gait('hand_events__event')}", f"DROP TABLE {hand}"]
+    return [*out, f"DROP TABLE IF EXISTS {events}", f"DROP TABLE {hand}"]
 
 
 def _lacks_trials(conn: Any) -> bool:

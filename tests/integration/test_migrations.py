@@ -250,13 +250,13 @@ class Killed(BaseException):
     """The end of a migration in the middle."""
 
 
-def migrate_until(line: int | None) -> list[str]:
-    """Migrate, killed at that line of what it says (None: to the end); return what it said."""
+def migrate_until(line: int | str | None) -> list[str]:
+    """Migrate, killed at that line of what it says, by its number or text (None: to the end); return what it said."""
     done: list[str] = []
 
     def say(text: str) -> None:
         done.append(text)
-        if len(done) == line:
+        if line in (len(done), text.strip()):
             raise Killed
 
     with contextlib.suppress(Killed):
@@ -324,8 +324,8 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put, killed_bef
     assert migrations.migrate().steps == []
 
 
-@pytest.mark.parametrize("killed_before", [None, 4, 60])
-def test_corrections_by_a_method_become_rows(put: Put, killed_before: int | None):
+@pytest.mark.parametrize("killed_before", [None, 4, 60, "DROP TABLE `pbl_gait`.`hand_events`"])
+def test_corrections_by_a_method_become_rows(put: Put, killed_before: int | str | None):
     rows = put(corrected_by_a_method)
     assert len(everything()["pbl_gdi.__session_gdi"]) == 2
     refused = pbl("populate")

@@ -24,7 +24,7 @@ from pbl_pipeline.errors import PblError
 from schemas import lab, session
 from schemas.rows import utc_now
 from workers.cli.web import web
-from workers.web import Options, Where, accounts, connections, create_app, serve
+from workers.web import Options, Where, accounts, certificates, connections, create_app, serve
 from workers.web.access import IDLE_HOURS, Sessions
 from workers.web.accounts import Accounts, Attempts
 from workers.web.serve import config
@@ -374,21 +374,25 @@ def asked(connection: socket.socket, host: str = "gait.example", more: str = "")
     return b"".join(parts)
 
 
-def test_tls_is_spoken_and_nothing_else(known: Accounts, tmp_path: Path):
-    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    made = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", cert, "-days", "2",
-            "-subj", "/CN=gait.example", "-addext", "subjectAltName=DNS:gait.example"]  # fmt: skip
-    try:
-        subprocess.run(made, check=True, capture_output=True)
-    except FileNotFoundError:
-        pytest.skip("no openssl on this machine")
-    where = Where("127.0.0.1", 0, cert, key, hostnames=("gait.example",))
-    where.check()
-    app = create_app(Options(hosts=where.names, accounts=known, secure=True))
-    with running(app, where) as port:
-        context = ssl.create_default_context(cafile=str(cert))
-        plain = socket.create_connection(("127.0.0.1", port))
-        with context.wrap_socket(plain, server_hostname="gait.example") as secure:
+@pytest.fixture
+def by_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Where:
+    """A page with a certificate."""
+    monkeypatch.setenv("PBL_HOME", str(tmp_path))
+    return Where("127.0.0.1", 0, *certificates.server_certificate(["gait.example"]), hostnames=("gait.example",))
+
+
+def secured(address: str, port: int) -> ssl.SSLSocket:
+    """A connection by TLS, which trusts the page's authority."""
+    plain = socket.create_connection(("127.0.0.1", port), source_address=(address, 0), timeout=20)
+    context = ssl.create_default_context(cafile=certificates.authority())
+    return context.wrap_socket(plain, server_hostname="gait.example")
+
+
+def test_tls_is_spoken_and_nothing_else(known: Accounts, by_tls: Where):
+    by_tls.check()
+    app = create_app(Options(hosts=by_tls.names, accounts=known, secure=True))
+    with running(app, by_tls) as port:
+        with secured("127.0.0.1", port) as secure:
             assert secure.version() in ("TLSv1.2", "TLSv1.3")
             assert b"401" in asked(secure).split(b"\r\n", 1)[0]
         with socket.create_connection(("127.0.0.1", port)) as plain, contextlib.suppress(ConnectionError):
@@ -530,11 +534,15 @@ def test_an_answer_that_nobody_takes_is_given_up(impatient: int, given_up: threa
         assert taken > 400 * 65536  # who takes it gets all
 
 
+async def nothing(scope: Any, receive: Any, send: Any) -> None:
+    """A page where nothing is found."""
+    if scope["type"] == "http":
+        await send({"type": "http.response.start", "status": 404, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
+
+
 def test_one_address_does_not_take_all_connections(impatient: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 3)
-
-    async def nothing(scope: Any, receive: Any, send: Any) -> None:
-        return
 
     with running(nothing, Where()) as port, contextlib.ExitStack() as stack:
         held = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(4)]
@@ -580,6 +588,46 @@ def test_a_few_addresses_keep_no_one_out(monkeypatch: pytest.MonkeyPatch, asks: 
         closed = sum(_is_closed(one, b"", 0.2) for one in held)
         assert 1 <= closed <= 4, closed
         assert not _is_closed(patient, b"", 0.2)
+
+
+def client_hello() -> bytes:
+    """First message of a handshake."""
+    out = ssl.MemoryBIO()
+    with contextlib.suppress(ssl.SSLWantReadError):
+        ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), out, server_hostname="gait.example").do_handshake()
+    return out.read()
+
+
+@pytest.mark.parametrize("begun", ["nothing", "half a hello", "a hello"])
+def test_a_handshake_that_never_ends_keeps_no_connection(impatient: int, by_tls: Where, begun: str):
+    """`impatient` is asked for the times that it sets."""
+    hello = client_hello()
+    sent = {"nothing": b"", "half a hello": hello[: len(hello) // 2], "a hello": hello}[begun]
+    with running(nothing, by_tls) as port, socket.create_connection(("127.0.0.1", port)) as slow:
+        slow.sendall(sent)
+        slow.settimeout(20)
+        with contextlib.suppress(ConnectionError):
+            while slow.recv(1 << 16):
+                continue
+
+
+def test_handshakes_count_as_connections(monkeypatch: pytest.MonkeyPatch, by_tls: Where):
+    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 4)
+    monkeypatch.setattr(sys.modules[config.__module__], "_CONNECTIONS", 10)
+    monkeypatch.setattr(connections, "REQUEST_S", 60.0)
+    with running(nothing, by_tls) as port, contextlib.ExitStack() as stack:
+
+        def held(address: str) -> socket.socket:
+            made = socket.create_connection(("127.0.0.1", port), source_address=(address, 0))
+            return stack.enter_context(made)
+
+        with secured("127.0.0.9", port) as patient:  # one that was there before
+            silent = [held(address) for _ in range(4) for address in ("127.0.0.2", "127.0.0.3")]
+            assert _is_closed(held("127.0.0.2"), b"", 5.0)
+            with secured("127.0.0.4", port) as other:
+                assert b"404" in asked(other)[:20]
+            assert 1 <= sum(_is_closed(one, b"", 0.2) for one in silent) <= 3
+            assert b"404" in asked(patient)[:20]
 
 
 @pytest.mark.parametrize(

@@ -308,6 +308,75 @@ def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
     assert len(video.Video() & {"session_id": visit}) == 1
 
 
+#: In the page: `jump_us` is added to the times of the camera's frames.
+JUMPING = """
+() => {
+  globalThis.jump_us = 0;
+  const Processor = MediaStreamTrackProcessor;
+  globalThis.MediaStreamTrackProcessor = class {
+    constructor(about) {
+      this.readable = new Processor(about).readable.pipeThrough(new TransformStream({
+        transform: (frame, out) => {
+          out.enqueue(new VideoFrame(frame, {timestamp: frame.timestamp + jump_us}));
+          frame.close();
+        },
+      }));
+    }
+  };
+}
+"""
+
+
+@pytest.mark.parametrize("jump_s", [5.0, -5.0])
+def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit: int, jump_s: float):
+    with filming(camera, visit) as page:
+        page.evaluate(JUMPING)
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(2000)
+        page.evaluate("us => { jump_us = us; }", 1e6 * jump_s)
+        page.locator(".said", has_text="jumped").wait_for()
+        page.locator(".keep").click()
+        arrived(page)
+    info = probe((video.Video & {"session_id": visit}).fetch1("video_path"))
+    assert np.diff(info.time_s).max() < 2.0
+    assert info.n_frames > 10
+
+
+def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.locator(".allow").click()
+        page.locator(".said", has_text="Ready").wait_for()
+        page.evaluate(
+            "() => { globalThis.estimate = navigator.storage.estimate.bind(navigator.storage);"
+            " navigator.storage.estimate = async () => ({quota: 1e9, usage: 9e8}); }"
+        )
+        page.locator(".record").click()
+        page.locator(".said", has_text="no room").wait_for()
+        assert page.locator("main").get_attribute("data-filming") != "yes"
+        page.evaluate("() => { navigator.storage.estimate = estimate; }")
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        page.wait_for_timeout(3000)
+        (writer,) = page.workers
+        writer.evaluate(
+            "() => { const written = FileSystemSyncAccessHandle.prototype.write;"
+            " FileSystemSyncAccessHandle.prototype.write = function (...more) {"
+            " if (globalThis.isFull) throw new DOMException('', 'QuotaExceededError');"
+            " return written.apply(this, more); }; globalThis.isFull = true; }"
+        )
+        page.locator(".said", has_text="no room").wait_for()
+        page.locator(".after .keep").click()
+        again = page.locator(".takes button", has_text="Keep")
+        again.wait_for()
+        assert "no room" in (page.locator(".said").text_content() or "")
+        writer.evaluate("() => { globalThis.isFull = false; }")  # there is room again, and what was filmed is sent
+        again.click()
+        arrived(page)
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 10
+
+
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
     with filming(chromium, visit, denied=True) as page:  # has none
         page.locator(".allow").click()

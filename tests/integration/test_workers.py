@@ -24,7 +24,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
 from research.benchmarks import worker_replay
-from schemas import connection, fit, gait, gdi, lab, qc, tracking, video, worker
+from schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
 from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
 from schemas.operations import embedded
@@ -203,6 +203,48 @@ def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
     for job in first + second:
         queue.put_back(job)
     assert jobs_left() == {"VideoInfo": {"pending": 6}}
+
+
+@pytest.fixture
+def of_lengths(tables: None, tmp_path: Path, monkeypatch) -> dict[str, int]:
+    """Recordings by name, the long ones first; all wait to be read."""
+    monkeypatch.setattr(queue, "LONG_FRAMES", chain.N_FRAMES)
+    hours = [chain.small_video(tmp_path, name, chain.N_FRAMES + 1) for name in ("hour", "hour_filmed")]
+    ids = register(*hours, *videos(tmp_path, "walk", "again", "filmed"))
+    named = dict(zip(("hour", "hour_filmed", "walk", "again", "filmed"), ids, strict=True))
+    priorities = {"again": registry.AGAIN, "filmed": registry.FIRST, "hour_filmed": registry.FIRST}
+    refresh.refresh()
+    for name, priority in priorities.items():
+        video.VideoInfo.jobs.update1({"video_id": named[name], "priority": priority})
+    return named
+
+
+def order_of(table: str, taken: list[queue.Claim]) -> list[int]:
+    """The recordings whose jobs of a table were taken, in their order."""
+    return list(dict.fromkeys(job.key["video_id"] for job in taken if job.table.__name__ == table))
+
+
+def test_a_long_recording_waits_behind_the_short_ones_of_its_kind(of_lengths: dict[str, int]):
+    taken: list[queue.Claim] = []
+    work(report=lambda job, _: taken.append(job))
+    expected = [of_lengths[name] for name in ("filmed", "hour_filmed", "walk", "hour", "again")]
+    assert order_of("Tracking", taken) == order_of("Keypoints", taken) == expected
+    stages = (tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
+    hour = {j.table: j.priority for j in taken if j.table in stages and j.key["video_id"] == of_lengths["hour"]}
+    assert hour == dict.fromkeys(stages, registry.LONG[registry.NEW])
+    assert {job.priority for job in taken if job.table is fit.SessionFit} <= {*registry.LONG.values()}  # the set's
+    assert jobs_left() == {}
+
+
+def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[str, int]):
+    first, second = (Options(processes=2).of_process(number) for number in (0, 1))
+    taken: list[queue.Claim] = []
+    work(report=lambda job, _: taken.append(job), short=first.short)
+    assert order_of("Tracking", taken) == [of_lengths[name] for name in ("filmed", "walk", "again")]
+    assert jobs_left() == {"Tracking": {"pending": 2}}
+    work(short=second.short)
+    assert jobs_left() == {}
+    assert not Options(processes=1).of_process(0).short  # it does everything
 
 
 def test_a_full_store_delays_the_job_and_says_why(tables: None, tmp_path: Path, monkeypatch):

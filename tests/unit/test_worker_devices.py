@@ -48,6 +48,7 @@ def test_processes_are_dealt_to_the_gpus_evenly():
     alone = Options(processes=2, gpus=("a", "b")).of_process(1)
     assert (alone.gpus, alone.processes) == (("b",), 1)
     assert Options(processes=2).of_process(1) == Options(processes=2)
+    assert [options.of_process(i).short for i in range(5)] == [True, *[False] * 4]
 
 
 def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections import Counter
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-#: Seconds in which a whole request, head and body, has to be here, counted from its first byte (the first also from the
-#: connection); and in which some of an answer has to be taken: a browser that plays a video stops reading when it has
-#: enough, and asks again for the rest.
+#: Seconds in which a whole request, head and body, has to be here, counted from its first byte (the first from the
+#: connection, with the handshake of TLS); and in which some of an answer has to be taken: a browser that plays a video
+#: stops reading when it has enough, and asks again for the rest.
 REQUEST_S, TAKE_S = 10.0, 120.0
 #: Seconds without a byte after which an upload (`more_time`) is given up, and those in which all of it has to be here.
 STALL_S, UPLOAD_S = 30.0, 7200.0
@@ -39,7 +40,10 @@ def customer(address: str) -> str:
 
 class Connection(H11Protocol):
     """uvicorn's protocol with these limits, at most `per_address` connections of one address or IPv6 network (None: any
-    number), and none but from `only_from` where that is set: a proxy in front.
+    number), and none but from `only_from` where that is set: a proxy in front. `tls`: speaks TLS by this context.
+
+    The handshake is done here, so that a connection counts and has its time from its first moment; a server that is
+    given the context hears of it when the handshake has ended.
 
     When all connections are taken, a new one closes one of the address that holds the most, so that a few addresses
     cannot keep others out. Behind a proxy all have its address, and the proxy has to limit them.
@@ -47,6 +51,7 @@ class Connection(H11Protocol):
 
     per_address: int | None = None
     only_from: IPv4Network | IPv6Network | None = None
+    tls: ssl.SSLContext | None = None
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -55,6 +60,8 @@ class Connection(H11Protocol):
         self._over = False  # the answer ended before the request: what still comes is not read
         self._made_at = self.loop.time()
         self._customer = ""
+        self._shakes_hands: asyncio.Task[None] | None = None
+        self._early = b""  # of a request, before the transport is there that its answer needs
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for a request."""
@@ -71,10 +78,28 @@ class Connection(H11Protocol):
             if self.limit_concurrency is not None and len(others) >= self.limit_concurrency - 1:
                 self._make_room(others)
         self._abort_after("request", REQUEST_S)
+        if self.tls is not None:
+            self._shakes_hands = self.loop.create_task(self._shake_hands(transport, self.tls))
+
+    async def _shake_hands(self, transport: asyncio.Transport, context: ssl.SSLContext) -> None:
+        try:
+            secure = await self.loop.start_tls(transport, self, context, server_side=True)
+        except OSError as error:
+            self.connection_lost(error)
+            return
+        self._shakes_hands = None
+        if secure is None or secure.is_closing():
+            self.connection_lost(None)
+            return
+        super().connection_made(secure)
+        if self._early:
+            self.data_received(self._early)
 
     def data_received(self, data: bytes) -> None:
         """Read more of a request, whose time ends when all of it is here."""
-        if not self._over:
+        if self._shakes_hands is not None:
+            self._early += data
+        elif not self._over:
             super().data_received(data)
             if self.scope is not None:
                 self.scope.setdefault(MORE_TIME, self.more_time)  # type: ignore[typeddict-item]

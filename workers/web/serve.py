@@ -59,6 +59,14 @@ class Where:
         own = {*LOOPBACK} if self.host in LOOPBACK and not self.by_accounts else {self.host} - {*EVERYWHERE}
         return frozenset({*self.hostnames, *own})
 
+    def tls(self) -> ssl.SSLContext | None:
+        """Return how TLS is spoken; None where it is not. Raises OSError."""
+        if self.tls_cert is None:
+            return None
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.load_cert_chain(self.tls_cert, self.tls_key)
+        return context
+
     def check(self) -> None:
         """Raise `PblError` where this cannot be served safely: WEB_TLS; USAGE for what does not belong together."""
         if (self.tls_cert is None) != (self.tls_key is None) or (self.tls_cert is not None and self.behind_proxy):
@@ -95,7 +103,7 @@ class Where:
             )
         if self.tls_cert is not None:
             try:
-                ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.tls_cert, self.tls_key)
+                self.tls()
             except (OSError, ssl.SSLError) as error:
                 raise PblError(
                     "WEB_TLS",
@@ -182,7 +190,7 @@ def serve(
 def config(app: object, where: Where) -> uvicorn.Config:
     """How uvicorn serves the page."""
     proxy = ipaddress.ip_network(where.behind_proxy, strict=False) if where.behind_proxy else None
-    limits = {"per_address": None if proxy else _OF_ONE, "only_from": proxy}
+    limits = {"per_address": None if proxy else _OF_ONE, "only_from": proxy, "tls": where.tls()}
     return uvicorn.Config(
         app,  # type: ignore[arg-type]
         http=type("Connection", (Connection,), limits),
@@ -195,8 +203,6 @@ def config(app: object, where: Where) -> uvicorn.Config:
         timeout_keep_alive=_IDLE_S,
         timeout_graceful_shutdown=5,
         h11_max_incomplete_event_size=16_384,
-        ssl_certfile=where.tls_cert,
-        ssl_keyfile=where.tls_key,
         # Who asks, as the proxy has it; what anybody else writes into those headers is left out.
         proxy_headers=bool(where.behind_proxy),
         forwarded_allow_ips=where.behind_proxy or None,

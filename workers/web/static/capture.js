@@ -80,10 +80,9 @@ function stated() {
 
 /** Its facts on the phone, with the log so far: also of one that is never ended. */
 async function keepFacts() {
+  if (take?.startMs) taken.log = logOf(sensors.samples, take.startMs, take.endMs, await phoneModel());
   const { file, ...facts } = taken;
-  if (take?.startMs) facts.log = logOf(sensors.samples, take.startMs, take.endMs, await phoneModel());
   await keep(facts);
-  return facts;
 }
 
 async function phoneModel() {
@@ -107,7 +106,7 @@ async function stop(reason) {
     return say(reason || "interrupted");
   }
   taken.about = { ...taken.about, frames: ending.frames, dropped: ending.dropped, sensor: sensors.source, camera: ending.how };
-  taken.log = (await keepFacts()).log;
+  await keepFacts().catch(() => { reason = "full"; });  // those of two seconds ago stay
   take = null;
   page.dataset.times = JSON.stringify(ending.times), page.dataset.start = String(ending.startMs);
   const lost = ending.dropped ? t("dropped", { n: ending.dropped, all: ending.frames + ending.dropped }) : "";
@@ -119,12 +118,12 @@ async function stop(reason) {
 /** @param {boolean} kept */
 async function decided(kept) {
   $(".film").hidden = false, $(".after").hidden = true;
+  let said = "ready";
   if (kept) {
     const { file, ...facts } = { ...taken, complete: true };
-    await keep({ ...facts, about: { ...facts.about, ...stated() } });
-    $("[name=note]").value = "";
+    await keep({ ...facts, about: { ...facts.about, ...stated() } }).then(() => { $("[name=note]").value = ""; }, () => { said = "full"; });
   } else await remove(taken.name);
-  say("ready");
+  say(said);
   await show();
   sendAll();
 }
@@ -147,7 +146,7 @@ setInterval(() => {
   level.dataset.level = Math.abs(tilt) < 2 ? "yes" : "no";
   level.ariaLabel = `${t("level")}: ${tilt.toFixed(0)}°`;
 }, 200);
-setInterval(() => { if (take && !why) keepFacts(); }, 2000);
+setInterval(() => { if (take && !why) keepFacts().catch(() => stop("full")); }, 2000);
 
 // ---------------------------------------------------------------------------------------------------------- sending
 /** @type {Map<string, string>} */
@@ -210,7 +209,7 @@ async function show() {
     const line = item(new Date(one.made).toLocaleTimeString(language), own);
     if (one.complete && !one.about.why) return line;
     const buttons = [[t("remove"), () => remove(one.name)]];
-    if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => keep({ ...one, complete: true }).then(sendAll)]);
+    if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => keep({ ...one, complete: true }).then(sendAll, () => say("full"))]);
     for (const [label, act] of buttons) {
       const button = document.createElement("button");
       button.textContent = label;

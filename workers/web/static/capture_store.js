@@ -10,23 +10,31 @@ async function opened(name) {
   return /** @type {any} */ (file).createSyncAccessHandle();
 }
 
+/** @param {any} file @param {Uint8Array} bytes @param {number} at */
+function write(file, bytes, at) {
+  if (file.write(bytes, { at }) !== bytes.byteLength) throw new DOMException("", "QuotaExceededError");
+}
+
 onmessage = async ({ data: { id, what, name, at, bytes } }) => {
   try {
     if (what === "open") {
       files.set(name, await opened(name));
       files.get(name).truncate(0);
     } else if (what === "write") {
-      if (files.get(name).write(bytes, { at }) !== bytes.byteLength) throw new DOMException("", "QuotaExceededError");
+      write(files.get(name), bytes, at);
     } else if (what === "close") {
       files.get(name).flush();
       files.get(name).close();
       files.delete(name);
     } else {  // put: a small file at once
       const file = await opened(name);
-      file.truncate(0);
-      file.write(bytes, { at: 0 });
-      file.flush();
-      file.close();
+      try {
+        write(file, bytes, 0);  // before it is cut: on a full phone what it held stays
+        file.truncate(bytes.byteLength);
+        file.flush();
+      } finally {
+        file.close();
+      }
     }
     postMessage({ id });
   } catch (error) {
