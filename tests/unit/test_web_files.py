@@ -77,7 +77,8 @@ def test_what_the_library_says_is_in_every_language():
     composed = re.compile(
         r"walks (part of the time )?(across|to and from|towards|away from) the (picture|camera)|look at the overlay"
         r"|the GDI needs .*|(only one|\{n\}) gait cycles?, and the first and last steps of a walk are excluded"
-        r"|keep head and feet in the picture, .*|the whole person is in view in .*, without a gap|the picture of the person .*"
+        r"|keep head and feet in the picture, .*|the whole person is in view in .*, without a gap"
+        r"|the picture of the person .*"
         r"|\{name\} of '\{value\}'|the measure '\{name\}'|\{table\} waits for a choice: \{note\}(; next: \{step\})?"
     )
     pool = "\0".join(plain)
