@@ -92,7 +92,7 @@ def test_a_sheet_registers_people_visits_pace_and_cameras_once(tables, recording
         ("three.mp4,Anna Meier,1,,,,,,,,", "USAGE", "pseudonymous"),
         ("three.mp4,p-1,1,,,,,,,,", "SHEET_CONFLICT", "P001"),
         (f"three.mp4,{'P' * 33},1,,,,,,,,", "USAGE", "subject"),
-        (f"three.mp4,P003,{'x' * 65},,,,,,,,", "USAGE", "visit"),
+        (f"three.mp4,P003,{'x' * 65},,,,,,,,", "USAGE", "65 characters"),
         (f"three.mp4,P003,1,,,,,,{'x' * 33},,", "USAGE", "population"),
         ("one.mp4,P001,2026-03-02,,,,,,,,", "SHEET_CONFLICT", "row 2"),
         (",P003,1,,,,,,,,", "SHEET_FORMAT", "no file"),
