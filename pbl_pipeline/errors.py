@@ -17,6 +17,8 @@ CODES: dict[str, str] = {
     "VIDEO_DAMAGED": "frames inside the recording do not decode cleanly, or the picture size changes",
     "VIDEO_TIMESTAMPS": "the frames carry no usable time stamps",
     "VIDEO_TOO_LARGE": "the pictures of the video are larger than are decoded here",
+    "VIDEO_SCREEN": "the video is the recording of a screen, or a copy with borders around the picture",
+    "VIDEO_UPSIDE_DOWN": "the people in the video are upside down",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
     "VIDEO_DUPLICATE": "the same bytes are registered for another person",
     "UPLOAD_REFUSED": "what was uploaded is not a recording that may be taken over",

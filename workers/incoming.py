@@ -267,6 +267,7 @@ def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path
 
     Raises `PblError` What is wrong with the recording.
     """
+    visit.check(file)
     recording, *logs = copies
     for log in logs:
         try:

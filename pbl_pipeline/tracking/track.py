@@ -32,6 +32,8 @@ from .types import Detection, PersonDetector, PersonTrack, Tracking
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.
 CONFIRM_IOU, SAME_BODY = 0.3, 0.25
+#: A body's axis is upside down beyond this turn (rad), a video where it is in more of the sightings than this fraction.
+UPSIDE_DOWN_RAD, UPSIDE_DOWN_SHARE = 0.75 * np.pi, 0.5
 #: Decoding goes on while a detector looks at a frame, which takes as long as decoding some.
 FRAMES_AHEAD = 8
 
@@ -47,9 +49,9 @@ def track_people(
     `params` is what `METHODS.find` takes; `detector` replaces the method's. `info` is what `video.probe` said of this
     file; without it the video is probed, which decodes it once more. Where nobody is found, the `Tracking` has no
     persons.
-    Raises the `PblError`s of `video.probe` and `assets.fetch`, SOLVER_UNKNOWN for an unknown method or detector, and
-    VIDEO_CHANGED when `info` is of another number of frames; for a registered model MODEL_MISSING, MODEL_INVALID,
-    MODEL_CHECKSUM, DEVICE_UNAVAILABLE.
+    Raises the `PblError`s of `video.probe` and `assets.fetch`, VIDEO_UPSIDE_DOWN, SOLVER_UNKNOWN for an unknown method
+    or detector, and VIDEO_CHANGED when `info` is of another number of frames; for a registered model MODEL_MISSING,
+    MODEL_INVALID, MODEL_CHECKSUM, DEVICE_UNAVAILABLE.
     """
     method = METHODS.find(params)
     params = method.params
@@ -60,7 +62,23 @@ def track_people(
     people = join_trails(undo_swaps([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
+    _check_upright(persons, video_path)
     return Tracking(info.time_s, size, persons, finder.name, finder.model_sha256)
+
+
+def _check_upright(persons: Sequence[PersonTrack], video_path: str | Path) -> None:
+    """Raise `PblError` VIDEO_UPSIDE_DOWN by the axes of the bodies, where the detector knows them."""
+    turn = np.concatenate([np.empty(0), *(p.roi_px[p.observed, 3] for p in persons)])
+    turn = np.abs(np.angle(np.exp(1j * turn[np.isfinite(turn)])))
+    share = float(np.mean(turn > UPSIDE_DOWN_RAD)) if len(turn) else 0.0
+    if share > UPSIDE_DOWN_SHARE:
+        raise PblError(
+            "VIDEO_UPSIDE_DOWN",
+            found=f"people whose heads are below their feet, in {share:.0%} of the sightings",
+            expected="people with their heads up",
+            next_step="turn the video by half a turn in the phone's editor and send it again",
+            key=str(video_path),
+        )
 
 
 def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:

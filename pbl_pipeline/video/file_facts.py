@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline import progress
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain
 
+from .borders import EVERY, BorderMeter
 from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
 from .orientation import Orientation, orientation_of
@@ -37,11 +39,12 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     counts differ from it. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED,
-    VIDEO_DAMAGED, VIDEO_TIMESTAMPS.
+    VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN.
     """
     path = check_file(path)
     sha256 = sha256_of(path)
     stamps: list[int] = []
+    borders = BorderMeter()
     turn, pixel_format, width, height = Orientation(), "", 0, 0
     with Decoder(path, threads, exact=True) as decoder:
         stream, container = decoder.stream, decoder.container
@@ -50,7 +53,18 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
                 turn = orientation_of(frame)
                 pixel_format = frame.format.name
                 width, height = turn.size(frame.width, frame.height)
+            if len(stamps) % EVERY == 0:
+                borders.add(frame)
             stamps.append(pts)
+        if (widths := borders.widths()) is not None:
+            raise PblError(
+                "VIDEO_SCREEN",
+                found=f"borders of {widths[0]:.0%} and {widths[1]:.0%} of the picture at two opposite sides, which "
+                "never change",
+                expected="the whole picture of a camera",
+                next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
+                key=path,
+            )
         ticks = np.asarray(stamps, np.int64) - stamps[0]
         tick_s = float(decoder.time_base)
         time_s = ticks * tick_s

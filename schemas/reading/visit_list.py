@@ -77,6 +77,11 @@ class Result:
     filming: Filming | None = None  # how it was filmed; None where it was not looked up
 
 
+#: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
+#: and index are others.
+DOUBTS = frozenset({"cadence_plausible"})
+
+
 @dataclasses.dataclass(frozen=True)
 class Change:
     """Change of a value against that of another result.
@@ -84,8 +89,9 @@ class Change:
     real: probability that the true change goes the same way; important: that it does by at least the minimal important
     change, None where there is none for the value. Both are None where the change cannot be judged. sure: whether it is
     at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike in the two results:
-    "methods", "corrected" (events), "error" (not known), or what `filming.differences` finds; with a verdict it is at
-    most the view, by which `least` is that of visits filmed from other sides.
+    "checks" (one is not to be used, or in doubt by `DOUBTS`), "methods", "corrected" (events), "error" (not known), or
+    what `filming.differences` finds; with a verdict it is at most the view, by which `least` is that of visits filmed
+    from other sides.
     """
 
     by: float
@@ -213,8 +219,11 @@ def judged(
 
 
 def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
-    """Return what of two results was not made or filmed alike: all but the view leaves a change without a verdict."""
+    """Return what of two results was not made or filmed alike, or whether one is in doubt: all but the view leaves a
+    change without a verdict."""
     found = []
+    if any(r.outcome == "FAIL" or DOUBTS.intersection(r.worst) for r in (result, before)):
+        found.append(Difference("checks"))
     if (result.kind, result.methods) != (before.kind, before.methods):
         found.append(Difference("methods"))
     if result.corrected != before.corrected:

@@ -285,6 +285,25 @@ def test_under_a_second_in_view(demo, tmp_path):
     assert code_of(result) == "TRACK_TOO_SHORT"
 
 
+def test_the_demo_upside_down_is_named_so(demo, tmp_path):
+    """Turned without a word of it in the file, as some programs save what a phone filmed."""
+    video = write_video(
+        tmp_path / "down.mp4", (f.image[::-1, ::-1] for f in read_frames(demo, stop=150)), constant_rate(150)
+    )
+    result = run(video, "--out", tmp_path / "down.npz")
+    assert code_of(result) == "VIDEO_UPSIDE_DOWN"
+    assert not (tmp_path / "down.npz").exists()
+
+
+def test_the_demo_on_a_phones_screen_is_named_so(demo, tmp_path):
+    frames = (
+        cv2.copyMakeBorder(cv2.resize(f.image, (720, 404)), 500, 656, 0, 0, cv2.BORDER_CONSTANT, value=(12, 12, 12))
+        for f in read_frames(demo, stop=60)
+    )
+    result = run(write_video(tmp_path / "s.mp4", frames, constant_rate(60)), "--out", tmp_path / "s.npz")
+    assert code_of(result) == "VIDEO_SCREEN"
+
+
 def test_usage_errors(tmp_path):
     assert run(tmp_path / "v.mp4", "--out", tmp_path / "x.csv").exit_code == 2
     assert run(tmp_path / "v.mp4", "--out", tmp_path / "x.npz", "--person", "her").exit_code == 2

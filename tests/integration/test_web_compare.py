@@ -98,6 +98,10 @@ def test_results_by_other_methods_are_not_judged(visits: None, monkeypatch: pyte
     strange = dataclasses.replace(other, methods=("another", *other.methods[1:]))
     reasons = (Difference("methods"),)
     assert comparison.change_since(strange, one) == comparison.Change(6.0, None, differs=reasons)
+    doubtful = comparison.Change(6.0, None, differs=(Difference("checks"),))
+    for doubt in ({"outcome": "FAIL"}, {"worst": ("legs_seen_alike", "cadence_plausible")}):
+        assert comparison.change_since(dataclasses.replace(other, **doubt), one) == doubtful
+        assert comparison.change_since(other, dataclasses.replace(one, **doubt)) == doubtful
     unknown = comparison.Change(6.0, None, differs=(Difference("error"),))
     assert comparison.change_since(dataclasses.replace(other, minimal_change=None), one) == unknown
     assert comparison.change_since(dataclasses.replace(other, index=None), one) is None

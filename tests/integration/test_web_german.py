@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import pbl_pipeline
 import pbl_pipeline.fit
 from pbl_pipeline.kinetics import REASONS
+from pbl_pipeline.words import check_words
 from schemas import study
 from schemas.intake.conditions import set_condition
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
+from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
 from workers.web import texts
 
 #: Attributes that a person reads or hears.
-_READ = ("aria-label", "alt", "title", "placeholder", "data-play", "data-pause", "data-text")
+_READ = ("aria-label", "alt", "title", "placeholder", "data-play", "data-pause", "data-text", "data-failed",
+         "data-checked")  # fmt: skip
 #: English words that are German words as well, or names of units and formats.
 _BOTH = {"in", "an", "am", "was", "war", "so", "die", "des", "also", "links", "person", "median"}
 
@@ -44,6 +51,8 @@ class _Reader(HTMLParser):
                 self._hidden.append(tag)
             return
         self.texts += [text for name in _READ if (text := given.get(name))]
+        said = json.loads(given.get("data-said") or "{}")  # by the script of the page
+        self.texts += [by_language["de"] for by_language in said.values()]
         if other and tag != "html":
             self.texts.append(f"<{tag} lang={given['lang']}>")
 
@@ -80,12 +89,14 @@ def english_of(page: str, english: set[str], names: str) -> list[str]:
         own = re.sub(names, " ", text)
         if (words(own) & english) or re.search(r"(?<![\d.])\d+\.\d+(?![\d.])", own) or own.startswith("<"):
             found.append(" ".join(text.split()))
+        elif found and found[-1].startswith("<"):
+            found[-1] += text  # what is marked
     return found
 
 
 @pytest.fixture(scope="module")
 def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
-    """P001 at three visits, one not computed; a chair test, nobody, two people alike, and a person chosen by hand."""
+    """P001 at three visits, one not computed; a chair test, nobody, two people alike, a screen recording, a film."""
     module_patch.setattr(pbl_pipeline.fit, "fit_session", fit_upright)
     for name, day in (("gang", "2026-01-10"), ("gang zwei", "2026-04-10")):
         register(small_video(module_tables, name), session_label=day, mass_kg=70.5)
@@ -93,6 +104,9 @@ def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     set_condition(chair[0], activity="sit_to_stand")
     register(small_video(module_tables, "leer", people="nobody"), subject="P003", session_label="2026-02-02")
     register(small_video(module_tables, "zwei", people="two alike"), subject="P004", session_label="2026-02-03")
+    of_screen = (np.pad(f, ((20, 20), (0, 0), (0, 0))) for f in numbered_frames(60, 72, 128))
+    film = write_video(module_tables / "schirm.mp4", of_screen, constant_rate(60))
+    register(film, subject="P005", session_label="2026-02-04")
     populate()
     register(small_video(module_tables, "neu"), session_label="2026-09-10")
     study.ClinicalScore.insert({"session_id": i, "instrument": "mJOA", "score_value": 12 + i} for i in (1, 2))
@@ -100,9 +114,9 @@ def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
 
 NAMES = (
     r"R\. Viewer|P00\d|pbl( \w+)*|blazepose[\w-]*|phase-transformer[\w-]*|gillette[\w-]*|mJOA(-LE)?|GDI|PBL [\w.+]+|"
-    r"(gang|stuhl|leer|neu|zwei)[\w ]*(\.mp4)?|JSON|csv|trc|mot|zip|Timed Up and Go|Four Square Step Test|"
+    r"\b(gang|stuhl|leer|neu|zwei|schirm)[\w ]*(\.mp4)?|JSON|csv|trc|mot|zip|Timed Up and Go|Four Square Step Test|"
     r"Schwartz et al\. 2008|"
-    r"csv|pre|baseline|\d+_\w+|Worker|Video_ID|WebGL|[A-Z]\w+[a-z][A-Z]\w+|Tracking|Keypoints|--[\w-]+"
+    r"csv|pre|baseline|\d+_\w+|Worker|Video_ID|WebGL|[A-Z]\w+[a-z][A-Z]\w+|Tracking|Keypoints|VIDEO_SCREEN|--[\w-]+"
 )
 
 
@@ -111,12 +125,15 @@ NAMES = (
     [
         "/visits",
         "/visits?quality=nonsense",
-        *(f"/visits/{n}" for n in range(1, 7)),
-        *(f"/visits/{n}/letter" for n in range(1, 7)),
+        *(f"/visits/{n}" for n in range(1, 8)),
+        *(f"/visits/{n}/letter" for n in range(1, 8)),
         "/visits/1/trend",
         "/visits/1/trend?measure=step_time_s",
         "/visits/1/enter",
-        *(f"/recordings/{n}" for n in range(1, 7)),
+        "/visits/new",
+        "/visits/1/facts",
+        "/visits/1/upload",
+        *(f"/recordings/{n}" for n in range(1, 8)),
         "/compare?v=1&v=2",
         "/compare?v=1",
         "/instruments",
@@ -132,6 +149,52 @@ def test_a_german_page_has_no_english_word(clinic: None, english: set[str], path
     page = browser.get(path)
     assert 'lang="de"' in page.text
     assert not english_of(page.text, english, NAMES)
+
+
+def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english: set[str]):
+    browser, phone = web.client(), web.client(signed_in=False)
+    for one in (browser, phone):
+        one.headers["accept-language"] = "de"
+    refused = phone.get("/visits").text
+    link = web.post(browser, "/visits/1/film", hours="2").text
+    found = re.search(r"/phone/open\?key=[\w-]+", link)
+    assert found is not None
+    page = phone.get(found[0]).text
+    assert "data-said" in page
+    for text in (refused, link, page, phone.get("/phone/open?key=another").text):
+        assert 'lang="de"' in text
+        assert not english_of(text, english, NAMES + r"|http\S+")
+
+
+def test_refusals_of_registration_and_upload_are_german(clinic: None, english: set[str]):
+    browser = web.client(role="reviewer")
+    browser.headers["accept-language"] = "de"
+    token, long = web.token(browser), "x" * 300
+    seen = re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/facts").text)
+    assert seen is not None
+    stated = {"height_m": "172", "mass_kg": "viel", "population": long, "assistive_device": long}
+    pages = [
+        web.post(browser, "/visits/new", subject="P001", visit="2026-01-10").text,
+        web.post(
+            browser, "/visits/new", **dict.fromkeys(("subject", "visit", "date", "role", "population"), long)
+        ).text,
+        web.post(browser, "/visits/new", subject="p1", visit="x", height_m="1,7x", date="31.2.2026").text,
+        web.post(browser, "/visits/1/facts", seen=seen[1], **stated).text,
+        web.post(browser, "/visits/1/facts", seen="alt", height_m="1,7").text,
+    ]
+    photo = b"\0\0\0\x18ftypheic" + bytes(500)
+    for name, content in (
+        ("IMG_1.HEIC", photo),
+        ("IMG_1.mov", photo),
+        ("neu.txt", b"x"),
+        ("neu.mp4", b""),
+        ("neu.mp4", b"x"),
+    ):
+        sent = {"token": token, "activity": "walking", "pace": ""}
+        pages.append(browser.post("/visits/1/upload", data=sent, files=[("files", (name, content))]).text)
+    for page in pages:
+        assert 'class="problem"' in page or 'role="alert"' in page or "DECIDED_MEANWHILE" in page
+        assert not english_of(page, english, NAMES + r"|x{3,}|IMG_1\.\w+|neu\.\w+|\.\w+|p1|1,7x|viel")
 
 
 def test_refusals_of_forms_are_german(clinic: None, english: set[str]):
@@ -157,27 +220,47 @@ def test_refusals_of_forms_are_german(clinic: None, english: set[str]):
 
 def advice() -> dict[str, str]:
     """Advice of every check in the library and the tables, with {place} for what is filled in, and where it stands."""
-    root, found = Path(pbl_pipeline.__file__).parent.parent, {}
+    return {text: file for _, text, file in _checks() if text}
 
-    def of(node: ast.expr) -> list[str]:
-        if isinstance(node, ast.Constant):
-            return [str(node.value)]
-        if isinstance(node, ast.JoinedStr):
-            return ["".join(v.value if isinstance(v, ast.Constant) else "0.5" for v in node.values)]  # type: ignore[misc]
-        if isinstance(node, ast.IfExp):
-            return [*of(node.body), *of(node.orelse)]
-        return []  # made elsewhere
 
+def _checks() -> Iterator[tuple[str, str, str]]:
+    """Name (empty where it is made), advice and file of every check."""
+    root = Path(pbl_pipeline.__file__).parent.parent
     for file in (f for room in ("pbl_pipeline", "schemas") for f in sorted((root / room).rglob("*.py"))):
-        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Check" and len(node.args) > 4:
-                found |= {text: file.name for text in of(node.args[4]) if text}
-    return found
+        tree = list(ast.walk(ast.parse(file.read_text("utf-8"))))
+        named: dict[str, list[ast.expr]] = {}
+        for node in tree:
+            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+                named.setdefault(node.targets[0].id, []).append(node.value)
+        for node in tree:
+            made = isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Check", "_low", "_high")
+            if not made or not isinstance(node, ast.Call) or len(node.args) < 5:
+                continue
+            name = node.args[0].value if isinstance(node.args[0], ast.Constant) else ""
+            for text in _texts_of(node.args[4], named):
+                yield str(name), text, file.name
+
+
+def _texts_of(node: ast.expr, named: dict[str, list[ast.expr]]) -> list[str]:
+    """Texts that an expression may be; none where it is made elsewhere."""
+    if isinstance(node, ast.Constant):
+        return [str(node.value)]
+    if isinstance(node, ast.JoinedStr):
+        return ["".join(v.value if isinstance(v, ast.Constant) else "0.5" for v in node.values)]  # type: ignore[misc]
+    if isinstance(node, ast.IfExp):
+        return [*_texts_of(node.body, named), *_texts_of(node.orelse, named)]
+    if isinstance(node, ast.BinOp):
+        return [a + b for a in _texts_of(node.left, named) for b in _texts_of(node.right, named)]
+    if isinstance(node, ast.Name):
+        return [text for value in named.get(node.id, ()) for text in _texts_of(value, {})]
+    return []
 
 
 def test_the_advice_of_every_check_has_its_german(english: set[str]):
     every = advice()
     assert len(every) > 25
+    nameless = {name for name, _, _ in _checks() if name and "<span" in texts.library("de", check_words(name))}
+    assert not nameless
     untold = {text: file for text, file in every.items() if "<span" in texts.library("de", text)}
     # The advice about the far leg names a side and is written out for both.
     assert not {t: f for t, f in untold.items() if "leg was behind the" not in t}

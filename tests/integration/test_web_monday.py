@@ -1,27 +1,31 @@
 """From an empty database to two visits compared, in a Chromium, with nothing typed into a terminal. The stages that
-need a model's weights are stand-ins; `PBL_TEST_REAL=1` with the shared data runs them all, on a recorded clip."""
+need a model's weights are stand-ins; with `-m machine` all stages run, on the demo recording."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from schemas import gdi, lab, video
+from schemas import gdi, lab, session, video
+from schemas.reading import comparison
 from schemas.review import Decision
 from tests.integration import compute_target, web
 from tests.integration.chain import small_video
+from tests.unit.test_blazepose import asset
 from workers.web.computing import compute_visit
 
-REAL = os.environ.get("PBL_TEST_REAL") == "1"
+
+@pytest.fixture(params=["stand-ins", pytest.param("real", marks=[pytest.mark.machine, pytest.mark.slow])])
+def real(request: pytest.FixtureRequest) -> bool:
+    return request.param == "real"
 
 
 @pytest.fixture
-def clips(request: pytest.FixtureRequest, tmp_path: Path) -> list[Path]:
-    if REAL:
-        found = request.getfixturevalue("shared_data") / "real" / "video_mocap" / "walk" / "video.mp4"
+def clips(real: bool, tmp_path: Path) -> list[Path]:
+    if real:
+        found = asset("demo_video")
         again = tmp_path / "again.mp4"  # other bytes, the same pictures
         again.write_bytes(found.read_bytes() + b"\0\0\0\x08free")
         return [found, again]
@@ -29,18 +33,17 @@ def clips(request: pytest.FixtureRequest, tmp_path: Path) -> list[Path]:
 
 
 @pytest.fixture
-def place(declared: None, tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def place(real: bool, declared: None, tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if real:
+        monkeypatch.undo()  # the stand-ins of `tables`
     monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
     monkeypatch.setenv("PBL_TEST_HOLD", str(tmp_path / "hold"))
-    if REAL:
-        monkeypatch.undo()
-        monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
 
 
-def test_from_an_empty_database_to_two_visits_compared(place: None, chromium: Any, clips: list[Path]):
+def test_from_an_empty_database_to_two_visits_compared(place: None, real: bool, chromium: Any, clips: list[Path]):
     assert not len(lab.Subject())
-    wait = 600_000 if REAL else 60_000
-    target = compute_visit if REAL else compute_target.compute
+    wait = 600_000
+    target = compute_visit if real else compute_target.compute
     with web.shown(chromium, name="A. First", target=target, locale="en", accept_downloads=True) as page:
         for label, role, clip in (("2026-01-10", "baseline", clips[0]), ("2026-04-10", "3_months", clips[1])):
             page.goto("/visits")
@@ -68,6 +71,16 @@ def test_from_an_empty_database_to_two_visits_compared(place: None, chromium: An
         assert "2026-01-10" in text
         assert "2026-04-10" in text
     assert len(gdi.SessionGdi()) == len(video.Video()) == 2
+    visits = session.Session.to_arrays("session_id", order_by="session_id").tolist()
+    found = comparison.compare([(i, None) for i in visits]).compared
+    first, second = (c.about.result.index for c in found if c.about.result is not None)
+    assert first is not None
+    assert second == pytest.approx(first, abs=1.0)
+    assert found[1].change is not None
+    assert found[1].change.sure is not True  # the same walk twice
+    if real:
+        assert 80 < first < 120
+        assert found[1].change.sure is False
     assert lab.Subject.fetch1("subject_height") == 1.72
     kinds = [str(k) for k in Decision().to_arrays("decision_what")]
     assert sorted(kinds) == ["height", "mass", "recording", "recording", "visit", "visit"]

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
+from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
 
 #: What a page of each kind needs until everything on it is there.
@@ -22,8 +26,15 @@ PAGES = {
     "nobody": ("/recordings/3", ""),
     "overlay": ("/recordings/1/overlay", ""),
     "report": ("/visits/1/report", ""),
-    "compare": ("/compare?v=1.0&v=2", ""),
+    "compare": ("/compare?v=1.0&v=4", ""),
+    "trend": ("/visits/1/trend", ""),
+    "letter": ("/visits/1/letter", ""),
+    "refused": ("/recordings/5", ""),
     "enter": ("/visits/1/enter", ""),
+    "new": ("/visits/new", ""),
+    "facts": ("/visits/1/facts", ""),
+    "upload": ("/visits/1/upload", ""),
+    "instruments": ("/instruments", ""),
     "operate": ("/operate", ""),
     "missing": ("/recordings/99", ""),
     "away": ("/nothing", ""),
@@ -59,11 +70,15 @@ LAYOUT = """
 
 @pytest.fixture(scope="module")
 def visits(chromium: Any, module_tables: Path) -> None:
-    """Video 1 with a fit, 2 in which somebody has to be chosen, 3 with nobody; a long label among the visits."""
+    """Video 1 with a fit, 2 in which somebody has to be chosen, 3 with nobody; a long label among the
+    visits; 4 a later walk of the same person, 5 a screen recording."""
     walk, two = small_video(module_tables, "walk"), small_video(module_tables, "two", people="two alike")
     register(walk, session_label="2026-01-10")
     register(two, session_label="after the second operation, left knee")
     register(small_video(module_tables, "none", people="nobody"), subject="P002", session_label="2026-02-10")
+    register(small_video(module_tables, "later"), session_label="2026-04-10")
+    of_screen = (np.pad(f, ((20, 20), (0, 0), (0, 0))) for f in numbered_frames(60, 72, 128))
+    register(write_video(module_tables / "screen.mp4", of_screen, constant_rate(60)), subject="P003")
     populate()
 
 
@@ -134,3 +149,21 @@ def test_german_fits_on_a_phone(chromium: Any, visits: None):
             found[kind] = page.evaluate(LAYOUT)
         assert page.get_by_role("link", name="Ganganalyse").count()
     assert not any(found.values()), {kind: bad for kind, bad in found.items() if bad}
+
+
+@pytest.mark.machine
+def test_pictures_of_every_page(chromium: Any, visits: None, tmp_path: Path):
+    """At two widths, in both languages, light and dark: into the folder PBL_TEST_PICTURES, to be looked at."""
+    folder, found = Path(os.environ.get("PBL_TEST_PICTURES", tmp_path)), {}
+    for language in ("en", "de"):
+        with web.shown(chromium, "reviewer,operator", locale=language, refused=True) as page:
+            for kind in PAGES:
+                go(page, kind)
+                for width, scheme in itertools.product((390, 1200), ("light", "dark")):
+                    page.set_viewport_size({"width": width, "height": 900})
+                    page.emulate_media(color_scheme=scheme)
+                    page.wait_for_timeout(150)
+                    name = f"{kind}.{language}.{width}.{scheme}"
+                    page.screenshot(path=folder / f"{name}.png", full_page=True)
+                    found[name] = page.evaluate(LAYOUT)
+    assert not any(found.values()), {what: bad for what, bad in found.items() if bad}

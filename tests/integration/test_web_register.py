@@ -279,6 +279,18 @@ def test_what_is_no_recording_is_named_and_leaves_nothing(archive: Path, name: s
     assert not [p for p in archive.rglob("*") if p.is_file()]
 
 
+@pytest.mark.parametrize("values", [{"activity": "x" * 300}, {"activity": "two\nlines"}, {"pace": "x" * 33}])
+def test_a_wrong_statement_of_an_upload_takes_nothing(tmp_path: Path, archive: Path, values: dict[str, str]):
+    browser = web.client()
+    new(browser)
+    before = everything()
+    answer = upload(browser, small_video(tmp_path, "walk", n=30), **values)
+    assert answer.status_code == 200
+    assert "USAGE" in answer.text
+    assert everything() == before
+    assert not [p for p in archive.rglob("*") if p.is_file()]
+
+
 def test_a_good_file_beside_a_bad_one_is_taken(tmp_path: Path):
     browser = web.client()
     new(browser)

@@ -325,6 +325,60 @@ def test_a_photo_that_decodes_is_still_no_video(tmp_path):
         assert (error.value.code, error.value.found) == ("VIDEO_NOT_A_VIDEO", f"a photo ({name})")
 
 
+def on_a_screen(image: np.ndarray, top: int, bottom: int, side: int, grey: int) -> np.ndarray:
+    """A picture between borders, with the clock, the progress bar and the handle of a phone's screen."""
+    screen = cv2.copyMakeBorder(image, top, bottom, side, side, cv2.BORDER_CONSTANT, value=(grey,) * 3)
+    if bottom:
+        screen[8:20, 16:60] = 255
+        screen[-30:-26, 10:-10] = screen[-10:-6, 60:-60] = 128
+    return screen
+
+
+def scene(n: int) -> Iterator[np.ndarray]:
+    """A person before a wall that is dark above: a flat background, and noise of the camera."""
+    rng = np.random.default_rng(3)
+    still = 120 + 25 * cv2.GaussianBlur(rng.normal(size=(240, 180, 3)), (0, 0), 8) * 28
+    still[:60] = 40
+    for i in range(n):
+        image = still + rng.normal(0, 3, still.shape)
+        image[90:200, 10 + 3 * i : 40 + 3 * i] = 200
+        yield image.clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("top", "bottom", "side", "grey"),
+    [(70, 90, 0, 12), (90, 90, 20, 255), (0, 0, 60, 0)],
+    ids=["a phone's player", "white, on all sides", "upright in a wide picture"],
+)
+def test_a_screen_recording_is_named_as_one(tmp_path, top, bottom, side, grey):
+    frames = (on_a_screen(image, top, bottom, side, grey) for image in scene(30))
+    assert code_of(write_video(tmp_path / "v.mp4", frames, constant_rate(30), crf=28)) == "VIDEO_SCREEN"
+
+
+def test_a_dark_room_a_doorway_and_a_flat_picture_are_no_screen_recording(tmp_path):
+    def dark(image: np.ndarray) -> np.ndarray:
+        return (image * np.linspace(0, 1, 240)[:, None, None] ** 3).astype(np.uint8)
+
+    def doorway(image: np.ndarray) -> np.ndarray:
+        image[:200, :40] = image[:200, -50:] = 4
+        return image
+
+    def flat(image: np.ndarray) -> np.ndarray:
+        return np.where(image == 200, image, 90).astype(np.uint8)
+
+    for change in (np.copy, dark, doorway, flat):
+        frames = (change(image) for image in scene(30))
+        assert probe(write_video(tmp_path / "v.mp4", frames, constant_rate(30))).n_frames == 30
+
+
+@pytest.mark.slow
+def test_no_recording_of_a_camera_is_taken_for_one_of_a_screen(shared_data):
+    found = sorted((shared_data / "real").rglob("*.mp4"))
+    assert len(found) == 6
+    for path in found:
+        assert probe(path).n_frames > 0
+
+
 def test_not_one_frame_decodes(tmp_path):
     path = write_video(
         tmp_path / "v.mp4", noise_frames(10), constant_rate(10), container_options={"movflags": "+faststart"}

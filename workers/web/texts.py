@@ -10,6 +10,8 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from pbl_pipeline.errors import CODES
+
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
@@ -43,7 +45,7 @@ def library_words(language: str, english: str) -> str:
 
 @functools.lru_cache(4096)
 def _library_words(language: str, english: str) -> str | None:
-    if language == "en":
+    if language == "en" or english in CODES:
         return english
     own = catalogue().get(f"library.{english}", {}).get(language)
     if own is not None:
@@ -102,7 +104,8 @@ def on_page(language: str, english: str) -> Markup:
         return shown
     parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )|, (?=then `?pbl )", english)
     kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
-    return Markup("{} {}").format(library(language, kept), text(language, "error.click"))
+    stop = "" if kept.endswith((".", "!", "?")) else "."
+    return Markup("{}{} {}").format(library(language, kept), stop, text(language, "error.click"))
 
 
 def language_of(cookie: str | None, accepted: str) -> str:

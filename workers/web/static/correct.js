@@ -39,7 +39,7 @@ function edit(form, look, times) {
   track.style.width = `${Math.ceil((times[times.length - 1] ?? 0) * SECOND) + 40}px`;
   const x = (/** @type {number} */ time) => 20 + time * SECOND;
   const name = (/** @type {Mark} */ m) => (words.label ?? "").replace("{side}", (m.side === "l" ? words.left : words.right) ?? "")
-    .replace("{event}", (m.event === "d" ? words.down : words.up) ?? "").replace("{time}", m.time.toFixed(2));
+    .replace("{event}", (m.event === "d" ? words.down : words.up) ?? "").replace("{time}", m.time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false }));
   const seek = (/** @type {number} */ time) => look.dispatchEvent(new CustomEvent("seek", { detail: time }));
   const changed = () => textOf(marks) !== before;
 

@@ -24,6 +24,7 @@ export function frameAt(times, at) {
 
 const within = (spans, at) => spans.some(([from, to]) => from <= at && at <= to);
 const $ = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
+const seconds = (/** @type {number} */ time) => time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false });
 const colour = (/** @type {string} */ name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 /** Moves a picture of what is at a time; a video where there is one, else a clock. */
@@ -179,7 +180,7 @@ async function start() {
     else canvas.getContext("2d")?.clearRect(0, 0, canvas.width, canvas.height);
     canvas.dataset.frame = String(frame);
     position.value = frame;
-    now.textContent = `${m.time[frame].toFixed(2)} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
+    now.textContent = `${seconds(m.time[frame])} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
     cursor(m.time[frame]);
     for (const seen of watching) seen(frame);
     look.dispatchEvent(new CustomEvent("frame", { detail: frame }));

@@ -1,0 +1,53 @@
+"""One walk, changed in nothing that matters, is no change: the demo recording through the whole chain, each variant a
+visit of its own, and every pair of them compared as the page compares visits."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from research.benchmarks.same_walk import VARIANTS, encoded
+from schemas.reading import comparison
+from tests.rows import register, remove_all
+from tests.unit.test_blazepose import asset
+from workers.populate import populate
+
+pytestmark = [pytest.mark.machine, pytest.mark.slow]
+
+#: The variants of `research.benchmarks.same_walk`, and the picture as it is in another container.
+KINDS = (*VARIANTS, "other container")
+#: Root mean square difference (deg) of two mean curves from which on a reader would see a change.
+SEEN_DEG = 5.0
+
+
+@pytest.fixture(scope="module")
+def visits(declared: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, int]]:
+    """A visit of each variant; its number by the variant's name. The stages are the real ones."""
+    folder = tmp_path_factory.mktemp("videos")
+    demo = asset("demo_video")
+    for i, kind in enumerate(KINDS):
+        name = folder / f"{i}.{'mkv' if kind == 'other container' else 'mp4'}"
+        register(encoded(demo, kind if kind in VARIANTS else "as it is", name), session_label=kind)
+    populate()
+    yield {kind: i + 1 for i, kind in enumerate(KINDS)}
+    remove_all()
+
+
+def test_no_pair_is_called_changed_and_curves_that_are_apart_have_their_reason(visits: dict[str, int]):
+    called, unexplained = {}, {}
+    for a, b in itertools.combinations(visits, 2):
+        one, other = comparison.compare([(visits[a], None), (visits[b], None)]).compared
+        assert other.change is not None, (a, b)
+        changes = {"index": other.change, **other.changes}
+        called |= {(a, b, name): change for name, change in changes.items() if change.sure}
+        keys = ["angle", "side", "percent"]
+        both = one.curves.merge(other.curves, on=keys, suffixes=("", "_other"))
+        apart = (both["mean_deg"] - both["mean_deg_other"]).pow(2).groupby([both["angle"], both["side"]]).mean()
+        seen = apart[np.sqrt(apart) > SEEN_DEG]
+        if len(seen) and not other.differs:
+            unexplained[a, b] = np.sqrt(seen).to_dict()
+    assert not called
+    assert not unexplained
