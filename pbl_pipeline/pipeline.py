@@ -60,7 +60,7 @@ def run_visit(
     `mass_kg`: as in `visit_kinetics`. `activity`: what the person does in the videos; None: unknown, which counts
     as walking.
 
-    Raises `PblError` The error of the video where no video of the visit can be fitted: the VIDEO_ codes,
+    Raises the error of the video where no video of the visit can be fitted: the VIDEO_ codes,
     TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes, CAMERA_INVALID, MODEL_
     codes, DEVICE_UNAVAILABLE. NORM_UNKNOWN, NORM_INVALID; FILE_MISSING, PHONE_LOG for a log that cannot be read.
     """

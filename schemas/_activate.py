@@ -10,7 +10,7 @@ _methods_done: set[str] = set()
 def activate(start: bool = False, methods: bool = True) -> None:
     """Bind all tables to the database; safe to call again.
 
-    Raises `PblError` What `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or
+    Raises what `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or
     newer.
 
     Parameters

@@ -194,7 +194,7 @@ def _tls() -> bool | dict[str, Any] | None:
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
     """A connection of the driver with the login of the tables, for statements that are not queries of a table.
 
-    Raises `PblError` What `connect` raises.
+    Raises what `connect` raises.
     """
     target = _target(start=False)
     _check_answers(target)

@@ -35,7 +35,7 @@ def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup
 
     Recordings that the newest one has are linked: they take room once. The remains of an interrupted run are removed.
 
-    Raises `PblError` What `schemas.operations.backup.backup` raises; nothing is removed then.
+    Raises what `schemas.operations.backup.backup` raises; nothing is removed then.
     """
     with worker.alone("backup", connection.connect()) as obtained:
         if not obtained:

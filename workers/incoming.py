@@ -265,7 +265,7 @@ def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path
     """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
     them; return the outcome. `file`: the name that the recording came with.
 
-    Raises `PblError` What is wrong with the recording.
+    Raises `PblError`, which says what is wrong with the recording.
     """
     visit.check(file)
     recording, *logs = copies

@@ -153,7 +153,7 @@ class ProcessQueue:
 def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | None:
     """Run a task to its end; return the file that it made, if it makes one.
 
-    Raises `PblError` The error that the function raised, `task.broken`, or INTERNAL for any other exception.
+    Raises the error that the function raised, `task.broken`, or INTERNAL for any other exception.
     """
     folder = root / secrets.token_hex(8)
     folder.mkdir()

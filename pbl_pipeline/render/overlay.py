@@ -169,7 +169,7 @@ def overlay_frames(
     `crop_to_body` cuts each picture to the drawn person with a margin (4:3 where the frame allows it); a frame whose
     fit is unknown stays whole. The longer side is then scaled down to at most `max_side_px`.
 
-    Raises `PblError` As `render_overlay`; USAGE when a frame does not exist.
+    Raises `PblError` as `render_overlay`; USAGE when a frame does not exist.
     """
     wanted = sorted({int(i) for i in indices})
     if wanted and (wanted[0] < 0 or wanted[-1] >= len(fit.time_s)):

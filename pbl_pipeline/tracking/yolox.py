@@ -55,7 +55,7 @@ class YoloxDetector:
 
     `min_iou`: of two boxes that overlap more, the less sure one is dropped (OpenCV's non-maximum suppression).
 
-    Raises `PblError` What `OnnxModel` raises; MODEL_INVALID when the model is of another kind, or its output has
+    Raises what `OnnxModel` raises; MODEL_INVALID when the model is of another kind, or its output has
     another shape.
     """
 

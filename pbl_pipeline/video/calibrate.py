@@ -97,7 +97,7 @@ class Calibration:
 def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = None) -> Calibration:
     """The lens of the camera that filmed `board`. Reads the video twice; memory does not grow with its length.
 
-    Raises `PblError` The VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
+    Raises `PblError` of the VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
     """
     info = info or probe(path)
     candidates = sharpest_frames(path, info)

@@ -100,7 +100,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
 def read_first(path: str | Path) -> FirstPicture:
     """Size and rotation of a video's first picture, and the phone that recorded it. No more is decoded.
 
-    Raises `PblError` As `probe`.
+    Raises `PblError` as `probe`.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
@@ -126,7 +126,7 @@ def packet_times(path: str | Path) -> np.ndarray:
 def read_metadata(path: str | Path) -> dict[str, str]:
     """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
 
-    Raises `PblError` As `probe`.
+    Raises `PblError` as `probe`.
     """
     path = check_file(path)
     with Decoder(path) as decoder:
@@ -137,7 +137,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 def recorded_utc(path: str | Path) -> str | None:
     """Return when a file says that it was recorded (YYYY-MM-DDTHH:MM:SSZ); None where it does not. Nothing is decoded.
 
-    Raises `PblError` As `probe`.
+    Raises `PblError` as `probe`.
     """
     return _recorded_utc(read_metadata(path))
 

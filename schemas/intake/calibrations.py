@@ -80,7 +80,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
     """Register the calibration in `file` for all videos of its phone's lens, size and rate without another calibration.
     It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
 
-    Raises `PblError` What `pbl_pipeline.video.load_lens_calibration` raises.
+    Raises what `pbl_pipeline.video.load_lens_calibration` raises.
     """
     from pbl_pipeline.video import load_lens_calibration
 

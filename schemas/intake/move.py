@@ -92,7 +92,7 @@ def carry_out(plan: Move) -> None:
     that was computed from them; the rest of the old visit, and the new one, are fitted by the next populate. A
     recording in the archive goes to the folder of its new person, so that `pbl forget` finds it there.
 
-    Raises `PblError` What `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
+    Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
     cannot be moved, or another process is changing the archive. Nothing is changed then.
     """
     of_these = [{"video_id": v} for v in plan.files]

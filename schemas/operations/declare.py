@@ -15,7 +15,7 @@ def declare_all() -> None:
 
     DataJoint declares a queue when it is first used, which a worker's account may not. Safe to repeat.
 
-    Raises `PblError` What `schemas.activate` raises, STORE_UNAVAILABLE.
+    Raises what `schemas.activate` raises, STORE_UNAVAILABLE.
     """
     activate()
     log = logging.getLogger("datajoint")

@@ -124,7 +124,7 @@ def serve(
     """Serve the page. On this machine alone a one-time link is printed, after its use the next one; elsewhere people
     sign in with accounts (`pbl web account`).
 
-    Raises `PblError` What `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more
+    Raises what `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more
     than this machine may see; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the port is
     taken.
 

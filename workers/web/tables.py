@@ -33,7 +33,7 @@ class Files:
 async def on_disk(next_step: str, work: Callable[..., T], *args: Any) -> T:
     """Return what a function returns that reads or writes the archive.
 
-    Raises `PblError` The error of the function; FILE_UNWRITABLE, with `next_step`, for its OSError.
+    Raises the error of the function; FILE_UNWRITABLE, with `next_step`, for its OSError.
     """
     try:
         return await asyncio.to_thread(work, *args)
@@ -56,7 +56,7 @@ class Tables:
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
         """The answer of a function that reads or writes tables.
 
-        Raises `PblError` What the function raises; DB_NOT_RUNNING where the database is away, DB_REFUSED with the
+        Raises what the function raises; DB_NOT_RUNNING where the database is away, DB_REFUSED with the
         server's words for its other errors, STORE_FULL.
         """
         return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, question, args)
