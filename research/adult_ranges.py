@@ -24,8 +24,8 @@ OUT = PACKAGE / "gait" / "normative" / "curves" / "adult_ranges.json"
 def build(path: Path) -> dict:
     """Return the ranges as a JSON object."""
     people = pd.read_csv(path)
-    columns = {angle: people[column] for angle, column in COLUMNS.items()}
-    speed = people["AvgSpeed_mps"]
+    columns = {angle: people[column].to_numpy(float) for angle, column in COLUMNS.items()}
+    age, speed = people["Age"].to_numpy(int), people["AvgSpeed_mps"].to_numpy(float)
     return {
         "name": "adults-138",
         "source": "138 able-bodied adults of Van Criekinge et al. 2023, as tabulated in "
@@ -33,9 +33,9 @@ def build(path: Path) -> dict:
         "licence": "CC BY 4.0 (the source's); mean and standard deviation of its figures",
         "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "n": len(people),
-        "age": [int(people["Age"].min()), int(people["Age"].max())],
-        "speed_m_per_s": [round(float(speed.mean()), 2), round(float(speed.std()), 2)],
-        "range_deg": {a: [round(float(v.mean()), 1), round(float(v.std()), 1)] for a, v in columns.items()},
+        "age": [int(age.min()), int(age.max())],
+        "speed_m_per_s": [round(float(speed.mean()), 2), round(float(speed.std(ddof=1)), 2)],
+        "range_deg": {a: [round(float(v.mean()), 1), round(float(v.std(ddof=1)), 1)] for a, v in columns.items()},
     }
 
 

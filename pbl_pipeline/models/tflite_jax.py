@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -46,7 +46,7 @@ class JaxModel:
     _input: int
     _outputs: tuple[int, ...]
 
-    def __call__(self, weights: dict[int, Array], images: Float[Array, "N H W 3"]) -> tuple[Float[Array, "N _"], ...]:
+    def __call__(self, weights: Mapping[int, Any], images: Float[Array, "N H W 3"]) -> tuple[Float[Array, "N _"], ...]:
         """Return each output of the model, flattened, for each picture."""
         values: Values = dict(weights)
         values[self._input] = images

@@ -23,7 +23,9 @@ class BorderMeter:
 
     def __init__(self) -> None:
         self._n = 0
-        self._colours = self._ever = self._often = np.empty(0)
+        self._colours: np.ndarray = np.empty(0)
+        self._ever: np.ndarray = np.empty(0, bool)
+        self._often: np.ndarray = np.empty(0, np.int64)
 
     def add(self, frame: av.VideoFrame) -> None:
         """Look at a frame; all have one size."""

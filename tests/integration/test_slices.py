@@ -111,7 +111,7 @@ def test_a_slice_as_frames(cohort: Path):
 
 def test_a_slice_and_its_folder_make_the_same_report(cohort: Path, tmp_path: Path):
     found = slices.study_data("first")
-    assert ((found.measures["measure"] == "gdi") & (found.measures["side"] == "left")).any()
+    assert ("gdi", "left") in set(zip(found.measures["measure"], found.measures["side"], strict=True))
     write_study(found, tmp_path)
     of_tables, of_folder = (study_results(s, plan(s), permutations=100) for s in (found, read_study(tmp_path)))
     assert of_tables.plan.measures[0] == "gdi"

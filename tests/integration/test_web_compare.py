@@ -221,6 +221,7 @@ def test_tables_and_a_visit_from_them_know_the_same_filming(visits: None):
     assert about.result is not None
     assert about.visit is not None
     assert about.result.filming == about.visit.filming
+    assert about.result.filming is not None
     assert about.result.filming.cameras
     assert about.result.filming.pictures
 

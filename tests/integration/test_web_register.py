@@ -32,11 +32,11 @@ def new(browser: Any, **values: str):
     return web.post(browser, "/visits/new", **{**VISIT, **values})
 
 
-def correct(browser: Any, number: int = 1, seen: str = "", **values: str):
-    return web.post(browser, f"/visits/{number}/facts", seen=seen or facts(number).seen, **values)
+def correct(browser: Any, number: int | str = 1, seen: str = "", **values: str):
+    return web.post(browser, f"/visits/{number}/facts", seen=seen or facts(int(number)).seen, **values)
 
 
-def upload(browser: Any, *files: Path | tuple[str, bytes], number: int = 1, **values: str):
+def upload(browser: Any, *files: Path | tuple[str, bytes], number: int | str = 1, **values: str):
     given = [(f.name, f.read_bytes()) if isinstance(f, Path) else f for f in files]
     fields = {"token": web.token(browser), "activity": "walking", "pace": "", **values}
     parts = [("files", file) for file in given]

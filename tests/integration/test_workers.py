@@ -211,7 +211,7 @@ def of_lengths(tables: None, tmp_path: Path, monkeypatch) -> dict[str, int]:
     monkeypatch.setattr(queue, "LONG_FRAMES", chain.N_FRAMES)
     hours = [chain.small_video(tmp_path, name, chain.N_FRAMES + 1) for name in ("hour", "hour_filmed")]
     ids = register(*hours, *videos(tmp_path, "walk", "again", "filmed"))
-    named = dict(zip(("hour", "hour_filmed", "walk", "again", "filmed"), ids, strict=True))
+    named: dict[str, int] = dict(zip(("hour", "hour_filmed", "walk", "again", "filmed"), ids, strict=True))
     priorities = {"again": registry.AGAIN, "filmed": registry.FIRST, "hour_filmed": registry.FIRST}
     refresh.refresh()
     for name, priority in priorities.items():

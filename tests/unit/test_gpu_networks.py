@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -42,7 +43,7 @@ def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
     model = read_model(read_network(spec))
     shown = [spec.entered(p) for p in pictures(model.image_shape[0], 2)]
-    got = model(model.weights, np.stack(shown))
+    got = model(model.weights, jnp.stack(shown))
     lite = LiteModel(spec.path, spec.sha256, spec.outputs)
     for i, picture in enumerate(shown):
         expected = lite(picture)
@@ -57,6 +58,7 @@ def test_unknown_operation_is_named() -> None:
 
     spec = spec_of("blazepose_landmarks")
     content = schema.ModelT.InitFromObj(schema.Model.GetRootAs(read_network(spec), 0))
+    assert content.operatorCodes is not None
     for code in content.operatorCodes:
         if code.builtinCode == schema.BuiltinOperator.LOGISTIC:
             code.builtinCode = code.deprecatedBuiltinCode = schema.BuiltinOperator.SOFTMAX
