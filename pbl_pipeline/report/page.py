@@ -82,7 +82,8 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["cycles_used"], page["cycles_found"] = plural(values.n_cycles_used, "gait cycle"), values.n_cycles_found
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
-        page["bands"], page["far_leg"] = bands, far_leg_of(cycles)
+        page["bands"] = {"words": bands.words(), "source": bands.source}
+        page["far_leg"] = far_leg_of(cycles)
         shipped = _norm(visit)
         people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
         page["index"] = _index(metrics.gdi, metrics.cycles, people)
