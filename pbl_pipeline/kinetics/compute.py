@@ -297,7 +297,7 @@ def _checks(
     small = residual <= MAX_RESIDUAL_BW
     unexplained = "much of the force that the motion needs is carried by no foot: look at the events and at the fit"
     sized = all(is_metric(f) or np.isfinite(f.height_m) for f in fits)
-    assumed = "accelerations are scaled by an assumed body size: state the measured height (--height-m)"
+    assumed = "accelerations are scaled by an assumed body size: state the measured height"
     return (
         Check(
             "kinetics_residual",
