@@ -47,6 +47,10 @@ def test_every_text_of_the_catalogue_is_on_a_page():
     assert not [n for n in own() if not _BY_VALUE.match(n) and not re.search(f"[\"']{n}[\"']", pages)]
 
 
+#: Functions that make a check -> the place of its name among their arguments.
+_NAMED_AT = {"Check": 0, "_low": 0, "_high": 0, "warn_if": 1}
+
+
 def said_by_the_library() -> tuple[set[str], list[re.Pattern[str]], set[str]]:
     """The texts in the library's sources, patterns of those with places, and the names of its checks."""
     plain, placed, checks = set(), [], set()
@@ -57,8 +61,8 @@ def said_by_the_library() -> tuple[set[str], list[re.Pattern[str]], set[str]]:
             elif isinstance(node, ast.JoinedStr):
                 parts = [re.escape(p.value) if isinstance(p, ast.Constant) else "(.+)" for p in node.values]  # pyright: ignore[reportArgumentType]
                 placed.append(re.compile("".join(parts)))
-            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Check", "_low", "_high"):
-                checks.add(name if isinstance(name := getattr(node.args[0], "value", ""), str) else "")
+            elif isinstance(node, ast.Call) and (called := getattr(node.func, "id", "")) in _NAMED_AT:
+                checks.add(name if isinstance(name := getattr(node.args[_NAMED_AT[called]], "value", ""), str) else "")
     return plain, placed, checks - {""}
 
 
