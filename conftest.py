@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if _NO_BROWSER:
                 item.add_marker(pytest.mark.skip(reason=f"browser: {_NO_BROWSER}"))
         if item.get_closest_marker("machine") and "machine" not in config.option.markexpr:
-            item.add_marker(pytest.mark.skip(reason="takes minutes and starts services: pytest -m machine"))
+            item.add_marker(pytest.mark.skip(reason="takes long or starts services: pytest -m machine"))
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

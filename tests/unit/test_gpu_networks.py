@@ -38,7 +38,10 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
     return [np.ascontiguousarray(cv2.resize(s, (size, size))[:, :, ::-1]) for s in squares]
 
 
-@pytest.mark.parametrize("name", ["blazepose_detector", "blazepose_landmarks", "blazepose_landmarks_heavy"])
+@pytest.mark.parametrize(
+    "name",
+    ["blazepose_detector", "blazepose_landmarks", pytest.param("blazepose_landmarks_heavy", marks=pytest.mark.machine)],
+)
 def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
     model = read_model(read_network(spec))

@@ -267,6 +267,7 @@ def test_the_files_of_a_report(written):
     assert float(found[0]["low"]) < made.INDEX.srm < float(found[0]["high"])
 
 
+@pytest.mark.machine
 @pytest.mark.slow
 def test_the_script_of_a_folder_makes_the_same_tables(written):
     """In a process that cannot import the tables of the database."""
