@@ -42,8 +42,8 @@ def of_stage(name: str) -> Stage[Any]:
 def stored(*, stage: str, name: str, version: int, params: Mapping[str, Any], sha: str) -> Method[Any]:
     """The method of a row of a method table, checked against the row's hash.
 
-    Raises `PblError` SOLVER_UNKNOWN where this version has no such function or parameters, or where somebody edited the
-    row.
+    Raises `PblError` SOLVER_UNKNOWN where this version has no such function or parameters, or where the row was
+    edited.
     """
     method: Method[Any] = of_stage(stage).of(Paramset(stage, name, version, params))
     if method.hash != sha:

@@ -17,7 +17,7 @@ _MOST = 1_000_000
 
 @dataclasses.dataclass(frozen=True)
 class SampleSize:
-    """What a study needs."""
+    """The persons that a study needs."""
 
     n: int  # persons who complete it: in all ("paired") or in each of two groups
     recruited: int  # persons to recruit (in each group) so that `n` are left after the drop-outs

@@ -21,7 +21,7 @@ _LONGEST = 200
 
 @dataclasses.dataclass(frozen=True)
 class StudyDescription:
-    """What a study is and how it was made."""
+    """A study and how it was made."""
 
     #: Of the frozen slice; the hash covers its rows. "" where there is no slice.
     name: str = ""

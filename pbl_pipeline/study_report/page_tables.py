@@ -181,7 +181,7 @@ def flow(results: StudyResults) -> PageTable:
         "Of them without index": lambda r: str(r["without_index"]),
         "Why left out": lambda r: str(r["reasons"]),
     }
-    note = "Visits by group; what is left out is in no number below."
+    note = "Visits by group; persons left out are in no number below."
     return _table("flow", "Who is in and out", note, results.flow, columns, _Marks())
 
 

@@ -147,7 +147,7 @@ class Visit:
     kind: str = "single"  # "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's)
     #: Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    #: What its files lack, in sentences: those of an older version, or of a run that was ended.
+    #: Things that its files lack, in sentences: those of an older version, or of a run that was ended.
     lacks: tuple[str, ...] = ()
     #: Forces and joint moments of the fitted recordings, None where they were not computed.
     kinetics: Kinetics | None = None

@@ -21,11 +21,10 @@ import numpy as np
 
 from pbl_pipeline.bench.clip import demo_clip
 from pbl_pipeline.bench.detect_case import measure
-from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.keypoints import METHODS, Keypoints
 from pbl_pipeline.resources import cores
 from pbl_pipeline.temporary import new_folder
-from pbl_pipeline.tracking import choose_subject, track_people
-from pbl_pipeline.video import guess_camera, probe
+from research.clip_keypoints import clip_keypoints
 
 #: Points that a detector is less sure of are not compared.
 SURE = 0.5
@@ -36,13 +35,10 @@ def frames_of(video: Path, method: str) -> int:
     return measure(video, None, 1, method)["frames"]
 
 
-def keypoints_of(video: Path, method: str, device: str) -> Keypoints:
+def keypoints_of(video: Path, folder: Path, method: str, device: str) -> Keypoints:
     """Return the keypoints of a video's subject, all networks computed on a device."""
     os.environ["PBL_ONNX_DEVICE"] = device
-    info = probe(video)
-    tracking = track_people(video, info=info)
-    subject = choose_subject(tracking).person_id
-    return detect_keypoints(video, tracking, subject or 0, guess_camera(info), params=method)
+    return clip_keypoints(video, folder / f"{device}.jpg", METHODS.find(method))
 
 
 def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +78,7 @@ def main(
         click.echo(f"{len(of) * copies} videos, {some} processes: {found:.0f} frames/s; first round {first:.1f} s")
         if against_cpu:
             with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-                two = list(pool.map(keypoints_of, [of[0]] * 2, [method] * 2, [device, "cpu"]))
+                two = list(pool.map(keypoints_of, [of[0]] * 2, [folder] * 2, [method] * 2, [device, "cpu"]))
             for unit, apart in zip(("px", "mm"), differences(*two), strict=True):
                 median, most = np.percentile(apart, [50, 99])
                 click.echo(f"from the CPU's: median {median:.4f} {unit}, 99th percentile {most:.4f} {unit}")

@@ -1,4 +1,4 @@
-"""What every form over the stored values of a visit checks: its fields, and that nothing else was stored meanwhile."""
+"""Checks of every form over the stored values of a visit: its fields, and that nothing else was stored meanwhile."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 
 @dataclasses.dataclass(frozen=True)
 class NormativeSet:
-    """What a cycle is compared with."""
+    """Healthy gait with which a cycle is compared."""
 
     #: Identity, number of normative vectors, where they are from, how their angles are defined.
     name: str

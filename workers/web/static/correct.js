@@ -1,6 +1,8 @@
 // Correct events: marks on a line that are dragged, moved by the arrow keys, deleted and added, then saved together.
 // The player (recording.js) tells the frame that it shows and the frames there are; a mark that moves has it show its own.
 
+import { seconds } from "./recording.js";
+
 /** @typedef {{time: number, side: "l"|"r", event: "d"|"u", changed: boolean}} Mark */
 
 /** Pixels of a second. */
@@ -39,7 +41,7 @@ function edit(form, look, times) {
   track.style.width = `${Math.ceil((times[times.length - 1] ?? 0) * SECOND) + 40}px`;
   const x = (/** @type {number} */ time) => 20 + time * SECOND;
   const name = (/** @type {Mark} */ m) => (words.label ?? "").replace("{side}", (m.side === "l" ? words.left : words.right) ?? "")
-    .replace("{event}", (m.event === "d" ? words.down : words.up) ?? "").replace("{time}", m.time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false }));
+    .replace("{event}", (m.event === "d" ? words.down : words.up) ?? "").replace("{time}", seconds(m.time));
   const seek = (/** @type {number} */ time) => look.dispatchEvent(new CustomEvent("seek", { detail: time }));
   const changed = () => textOf(marks) !== before;
 

@@ -24,7 +24,8 @@ export function frameAt(times, at) {
 
 const within = (spans, at) => spans.some(([from, to]) => from <= at && at <= to);
 const $ = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
-const seconds = (/** @type {number} */ time) => time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false });
+/** A time (s) as the page's language writes it. @param {number} time */
+export const seconds = (time) => time.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 2, maximumFractionDigits: 2, useGrouping: false });
 const colour = (/** @type {string} */ name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
 /** Moves a picture of what is at a time; a video where there is one, else a clock. */
