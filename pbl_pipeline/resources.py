@@ -9,8 +9,8 @@ from pathlib import Path
 
 #: Variable with the number of cores of each of several processes that share a machine; `pbl worker` sets it.
 CORES = "PBL_CORES"
-#: Variables by which numerical libraries choose their number of threads when they are loaded: OpenMP, BLAS, XLA.
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC")
+#: Variables by which numerical libraries choose their number of threads when they are loaded: OpenMP, BLAS, XLA, OpenCV.
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
 #: Where the kernel shows control groups, and to which of them a process belongs.
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 

@@ -9,6 +9,8 @@ from .types import PersonKeypoints
 
 #: The Gaussian kernel is cut off at so many standard deviations.
 REACH_SD = 4.0
+#: A tenth of a degree: at the edge of a crop of 256 pixels a quarter of one.
+ROTATION_STEP_RAD = 1 / 512
 
 
 def smooth_rois(roi: np.ndarray, time_s: np.ndarray, sigma_s: float) -> np.ndarray:
@@ -42,6 +44,14 @@ def smooth_at(roi: np.ndarray, time_s: np.ndarray, at_s: float, sigma_s: float) 
     normal = design.T @ (weight[:, None] * design) + np.diag([0.0, 1e-9])
     value = np.linalg.solve(normal, design.T @ (weight[:, None] * values))[0]
     return np.array([value[0], value[1], np.exp(value[2]), np.arctan2(value[3], value[4])])
+
+
+def rounded(roi: np.ndarray, step_px: float) -> np.ndarray:
+    """Regions (..., 4) on the grid of `KeypointParams.crop_step_px`."""
+    if step_px <= 0:
+        return roi
+    step = np.array([step_px, step_px, step_px, ROTATION_STEP_RAD])
+    return np.maximum(np.round(roi / step), [-np.inf, -np.inf, 1, -np.inf]) * step
 
 
 def corrected(
@@ -91,7 +101,7 @@ class Regions:
     """
 
     def __init__(self, track_px: np.ndarray, time_s: np.ndarray, params: KeypointParams) -> None:
-        self.track_px, self._time_s, self._params = track_px, time_s, params
+        self.track_px, self._time_s, self._params = rounded(track_px, params.crop_step_px), time_s, params
         self.rows = np.flatnonzero(np.isfinite(track_px).all(axis=1))
         first = first_pass_rows(self.rows, time_s, params.first_look_s) if params.passes > 1 else self.rows[:0]
         self.first = frozenset(first.tolist())
@@ -110,4 +120,5 @@ class Regions:
         if not self.first:
             return self.track_px[row]
         regions, at_s = self._corrected[: self._n], self._corrected_s[: self._n]
-        return smooth_at(regions, at_s, float(self._time_s[row]), self._params.smooth_s)
+        region = smooth_at(regions, at_s, float(self._time_s[row]), self._params.smooth_s)
+        return rounded(region, self._params.crop_step_px)

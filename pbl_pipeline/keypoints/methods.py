@@ -22,13 +22,17 @@ class RegisteredModels:
 
 #: A family is a detector: a function from its parameters to a `KeypointDetector`.
 METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
-METHODS.register("blazepose-33", 2, KeypointParams(), blazepose)
+METHODS.register("blazepose-33", 3, KeypointParams(crop_step_px=0.25), blazepose)
 #: It shares inferences at 24 frames/s and more: each is slow, and its answers for two frames lie close together.
 METHODS.register(
     "blazepose-heavy",
-    3,
+    4,
     KeypointParams(
-        model_sha256=HEAVY_SHA256, share_looks_s=0.042, confidence_curve="blazepose-heavy-v3", lighter_first=True
+        model_sha256=HEAVY_SHA256,
+        share_looks_s=0.042,
+        confidence_curve="blazepose-heavy-v3",
+        lighter_first=True,
+        crop_step_px=0.25,
     ),
 )
 METHODS.register_family("onnx", ModelKeypointParams, onnx)

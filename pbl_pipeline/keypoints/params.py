@@ -29,6 +29,9 @@ class KeypointParams:
     share_looks_s: frames no further apart than this share the inferences of picture and mirror image: every second
     frame is mirrored (`MirroredInference.shared`); 0: each frame has both.
     lighter_first: the first pass, which only places the crop, takes BlazePose's lighter network.
+    crop_step_px: centre and side of a crop are multiples of this, its rotation one of `ROTATION_STEP_RAD`; 0: exact.
+    A network answers otherwise by a pixel where a crop moves by a ten-thousandth of one, so without it the rounding of
+    another device in an earlier stage would show.
     sides: where left and right are exchanged back, see `exchange_sides`; None: nowhere.
     min_time_s: a person in view for less cannot be measured.
     box_margin: added to the keypoints' box on each side, as a fraction of its size.
@@ -52,6 +55,7 @@ class KeypointParams:
     confidence_curve: str = "blazepose-v1"
     share_looks_s: float = later(0.0)
     lighter_first: bool = later(False)
+    crop_step_px: float = later(0.0)
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""

@@ -3,8 +3,8 @@
     python -m research.benchmarks.many_videos                      # the demo recording at 1080p, 64 times
     python -m research.benchmarks.many_videos VIDEO ... --copies 8 --processes 2 --device cpu
 
-Each process probes, tracks and detects one video after the other, as those of `pbl worker` do. A first round, of one
-video a process, loads the networks and is not counted.
+Each process probes, tracks and detects one video after the other with its share of the cores, as those of `pbl worker`
+do. A first round, of one video a process, loads the networks and is not counted.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from pbl_pipeline.bench.clip import demo_clip
 from pbl_pipeline.bench.detect_case import measure
 from pbl_pipeline.keypoints import METHODS, Keypoints
-from pbl_pipeline.resources import cores
+from pbl_pipeline.resources import cores, shared_cores
 from pbl_pipeline.temporary import new_folder
 from research.clip_keypoints import clip_keypoints
 
@@ -50,7 +50,7 @@ def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
 
 def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float]:
     """Return frames a second over all videos, and the seconds of the first round."""
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+    with shared_cores(processes), ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         begin = time.perf_counter()
         list(pool.map(frames_of, videos[:processes], [method] * processes))
         first = time.perf_counter() - begin

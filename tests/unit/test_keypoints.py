@@ -21,7 +21,7 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES
 from pbl_pipeline.keypoints.crop_geometry import crop_matrix
-from pbl_pipeline.keypoints.crops import corrected, first_pass_rows, smooth_at, smooth_rois
+from pbl_pipeline.keypoints.crops import Regions, corrected, first_pass_rows, smooth_at, smooth_rois
 from pbl_pipeline.keypoints.detect import _detect_all
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
@@ -127,6 +127,20 @@ def test_smoothing_leaves_gaps_and_turns_through_half_a_circle():
     smooth = smooth_rois(roi, time, 0.1)
     assert np.isnan(smooth[5:8]).all()
     np.testing.assert_allclose(np.abs(smooth[np.r_[:5, 8:20], 3]), np.pi, atol=1e-6)
+
+
+def test_crops_do_not_depend_on_rounding_elsewhere() -> None:
+    """An earlier stage computed on another device differs by some 1e-4 px; the answer to such a crop by pixels."""
+    time = np.arange(60) / 30.0
+    track = np.column_stack([100 + 50 * time, 400 - 7 * time, 300 + 3 * time, 0.02 * time])
+    other = track + np.random.default_rng(0).choice([-1e-4, 1e-4], track.shape) * [1, 1, 1, 1e-3]
+    exact, stepped = (KeypointParams(passes=1, crop_step_px=step) for step in (0.0, 0.25))
+    regions = [
+        np.array([Regions(t, time, p).at(i) for i in range(60)]) for p in (exact, stepped) for t in (track, other)
+    ]
+    assert not np.any(np.all(regions[0] == regions[1], axis=1))
+    assert np.mean(np.all(regions[2] == regions[3], axis=1)) > 0.95
+    assert np.abs(regions[2] - track)[:, :3].max() <= 0.125
 
 
 def test_first_pass_rows_are_spread_evenly_and_begin_and_end_each_run():
@@ -298,7 +312,7 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
 
 def test_paramset_names_the_model():
     method = METHODS["blazepose-33"]
-    assert (method.stage, method.version) == ("keypoints", 2)
+    assert (method.stage, method.version) == ("keypoints", 3)
     assert method.params.model_sha256 == KeypointParams().model_sha256
 
 

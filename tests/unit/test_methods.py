@@ -24,8 +24,8 @@ from pbl_pipeline.tracking import TrackingParams
 SHIPPED = {
     ("tracking", "blazepose-tiles", 2): "0dab616291af7eea",
     ("subject", "walker", 2): "4a27a14ec961fed1",
-    ("keypoints", "blazepose-33", 2): "8efcb026b6d5256a",
-    ("keypoints", "blazepose-heavy", 3): "74bc8449d95c5e03",
+    ("keypoints", "blazepose-33", 3): "b3aa243c34a157df",
+    ("keypoints", "blazepose-heavy", 4): "266d0193cbc443f5",
     ("fit", "paper-2025", 2): "177d1e2810a04248",
     ("fit", "paper-gauss-newton", 2): "7e7d29aa9b130fbc",
     ("fit", "gauss-newton", 4): "2aa1bf299ebeaa9e",
