@@ -16,7 +16,7 @@ import numpy as np
 from pbl_pipeline.body import SLIDES, stature_m
 from pbl_pipeline.keypoints import Keypoints
 
-from .initial_pose import pelvis_path, pelvis_values
+from .initial_pose import pelvis_rest
 from .session import Session
 from .solution import Solution
 
@@ -40,13 +40,12 @@ def _enlarged(session: Session, solution: Solution, factor: float) -> Solution:
     qpos, points = solution.qpos.copy(), np.array(solution.outcome.x_world_m)
     sd = None if solution.qpos_sd is None else solution.qpos_sd.copy()
     slides = [session.body.joint_names.index(name) for name in SLIDES]
+    stands, rest = pelvis_rest(session.body)
     for i, arrays in enumerate(session.arrays):
         frames, camera = session.frames(i), arrays.p_nc[:, 0]
-        x, R = pelvis_path(session.body, qpos[frames])
-        for name, value in pelvis_values(session.body, R, camera + factor * (x - camera)).items():
-            if name in SLIDES:
-                qpos[frames, session.body.joint_names.index(name)] = value
-        points[frames] = camera[:, None] + factor * (points[frames] - camera[:, None])
+        x = qpos[frames, slides] @ stands.T + rest
+        qpos[frames, slides] += (factor - 1.0) * (x - camera) @ stands
+        points[frames] += (factor - 1.0) * (points[frames] - camera[:, None])
     if sd is not None:
         sd[:, slides] *= factor
     s = factor * solution.s
