@@ -9,6 +9,7 @@ compile and many sessions of one size are solved in little more time than one, w
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -209,6 +210,7 @@ def step_rates(time_s: np.ndarray) -> np.ndarray:
     return np.append(FRAME_S / np.diff(time_s), 0.0)
 
 
+@functools.lru_cache(16)
 def point_table(body: Body, markers: MarkerSet, size: int) -> PointTable:
     """A marker set padded to `size` rows, then the soles and the ends of the axis of a body that has them."""
     places = [p for p in (*SOLES, *ENDS) if p[0] in body.body_names]
