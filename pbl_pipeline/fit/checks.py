@@ -74,8 +74,7 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     shares = []
     for arrays, trial in zip(session.arrays, trials, strict=True):
         seen = (arrays.c_2d > 0) & arrays.used[:, None, None]
-        y = np.where(seen, arrays.xy_px[..., 1], np.nan)
-        y = y[np.isfinite(y).any(axis=-1)]
+        y = np.where(seen, arrays.xy_px[..., 1], np.nan)[seen.any(axis=-1)]
         height = np.median(np.nanmax(y, axis=-1) - np.nanmin(y, axis=-1))
         residual = trial.residual_2d_px
         shares.append(np.median(residual[np.isfinite(residual)]) / height)
