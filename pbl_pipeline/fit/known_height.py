@@ -11,8 +11,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import numpy as np
-
 from pbl_pipeline.body import SLIDES, stature_m
 from pbl_pipeline.keypoints import Keypoints
 
