@@ -214,7 +214,7 @@ def pelvis_path(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pelvis_turn(tilt: np.ndarray, lean: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) of the hinges' angles (T,), which turn about z, x and y in this order, Rz(tilt) Rx(list) Ry(heading)."""
+    """Rz(tilt) Rx(list) Ry(heading), (T, 3, 3): the hinges turn about z, x and y in this order."""
     (a, b, c), (sa, sb, sc) = ([f(angle) for angle in (tilt, lean, heading)] for f in (np.cos, np.sin))
     rows = [
         [a * c - sa * sb * sc, -sa * b, a * sc + sa * sb * c],
