@@ -6,6 +6,7 @@ A method row in the database is one `Paramset`. It is never edited: other parame
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Mapping
@@ -50,7 +51,7 @@ class Paramset:
         """The parameters as JSON with sorted keys and no spaces: equal parameters, equal text."""
         return canonical_json(self.params)
 
-    @property
+    @functools.cached_property
     def hash(self) -> str:
         """First 16 hex digits of the SHA-256 over stage, name, version and canonical JSON."""
         text = "\n".join([self.stage, self.name, str(self.version), self.canonical_json])

@@ -24,7 +24,7 @@ _LARGEST = 1 << 17
 MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for p in _DATA.glob("markers_*.csv")))
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class MarkerSet:
     """J named points fixed to bodies."""
 

@@ -33,6 +33,8 @@ ARM_DEG = {
 #: Mean distance (m) of an arm's points from a posture that is taken: less than from hanging by the first at least, and
 #: below the second, which the walks of the tests do not reach on a body that faces the wrong way.
 NEARER_M, FURTHEST_M = 0.10, 0.15
+#: Marker sets whose places in the postures are kept.
+SETS = 8
 #: Arms are looked at every so many frames, and interpolated.
 ARMS_EVERY = 15
 
@@ -42,17 +44,16 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
     arrays = session.arrays[trial]
     points, c = world_points(arrays)
     body, markers = session.body, session.markers
-    template = standing_markers(body, markers)
     trunk = trunk_of(markers)
-    weight = np.where(trunk, c, 0.0)
-    R, x = align(template, points, weight)
+    template, weight = standing_markers(body, markers)[trunk], c[:, trunk]
+    R, x = align(template, points[:, trunk], weight)
     known = (np.count_nonzero(weight, axis=1) >= 3) & np.isfinite(x).all(axis=1) & arrays.used
     if not known.any():
         # Nothing to turn it by: straight ahead of the first camera, facing it.
         R, x = np.tile(np.diag([-1.0, -1.0, 1.0]), (len(x), 1, 1)), np.tile([4.0, 0.0, 0.0], (len(x), 1))
         known = arrays.used.copy()
     if flip:
-        middle = np.average(template[trunk], axis=0)
+        middle = np.mean(template, axis=0)
         about = R @ middle + x
         R = R @ np.diag([-1.0, -1.0, 1.0])  # half a turn about the standing body's vertical
         x = about - R @ middle
@@ -68,46 +69,45 @@ def _place_arms(
 ) -> None:
     """Set the arms' columns of qpos (T, Q) by points (S, J, 3) and confidences (S, J) of the frames `seen`, in the axes
     of the standing body, from its pelvis."""
-    for arm in _arms(body):
-        at = np.flatnonzero([b in arm.bodies for b in markers.body_names])
-        enough = np.count_nonzero(c[:, at] > 0, axis=1) >= 2
+    for arm in _arms(body, markers):
+        enough = np.count_nonzero(c[:, arm.markers] > 0, axis=1) >= 2
         if enough.any():
-            angles = arm.nearest(markers, at, points[enough][:, at], c[enough][:, at])
+            angles = arm.nearest(points[enough][:, arm.markers], c[enough][:, arm.markers])
             for column, values in zip(arm.columns, angles.T, strict=True):
                 qpos[:, column] = np.interp(np.arange(len(qpos)), seen[enough], values)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Arm:
-    """Postures (K, n) in rad of the joints in `columns`, the first of them hanging, and where all bodies are in these,
-    from the pelvis (K, B, 3), and how they are turned (K, B, 3, 3)."""
+    """Postures (K, n) in rad of the joints in `columns`, the first of them hanging, and where the arm's `markers` (m,)
+    are in these, from the pelvis (K, m, 3)."""
 
-    bodies: set[str]
+    markers: np.ndarray
     columns: list[int]
     postures: np.ndarray
-    x: np.ndarray
-    R: np.ndarray
+    places: np.ndarray
 
-    def nearest(self, markers: MarkerSet, at: np.ndarray, points: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Angles (T, n) in rad for points (T, m, 3) of the markers `at`, from the pelvis of the standing body."""
-        places = marker_places(self.x, self.R, markers, at)
-        away = np.where(c[:, None] > 0, np.linalg.norm(points[:, None] - places, axis=-1), 0.0)
-        mean = np.einsum("tkm,tm->tk", away, c) / c.sum(axis=1)[:, None]
+    def nearest(self, points: np.ndarray, c: np.ndarray) -> np.ndarray:
+        """Angles (T, n) in rad for points (T, m, 3) of the markers, from the pelvis of the standing body."""
+        # Squared distances (m, T, K) by products of matrices: the differences are many.
+        x, y = np.swapaxes(points, 0, 1), np.swapaxes(self.places, 0, 1)
+        square = np.sum(x**2, axis=-1)[..., None] + np.sum(y**2, axis=-1)[:, None] - 2 * x @ np.swapaxes(y, 1, 2)
+        mean = np.einsum("mtk,tm->tk", np.sqrt(np.maximum(square, 0.0)), c) / c.sum(axis=1)[:, None]
         least = np.min(mean, axis=1)
         taken = (least < FURTHEST_M) & (least < mean[:, 0] - NEARER_M)
         return self.postures[np.where(taken, np.argmin(mean, axis=1), 0)]
 
 
-@functools.cache
-def _arms(body: Body) -> list[_Arm]:
+@functools.lru_cache(SETS)
+def _arms(body: Body, markers: MarkerSet) -> list[_Arm]:
     found, standing = [], _bent(body)
     for side in "rl":
         columns = [body.joint_names.index(f"{joint}_{side}") for joint in ARM_DEG]
         postures = np.vstack([standing[columns], np.deg2rad(list(itertools.product(*ARM_DEG.values())))])
         qpos = np.tile(standing, (len(postures), 1))
         qpos[:, columns] = postures
-        x, R = bodies_at(body, qpos)
-        found.append(_Arm({f"{name}_{side}" for name in ARM_BODIES}, columns, postures, x, R))
+        at = np.flatnonzero([b in {f"{name}_{side}" for name in ARM_BODIES} for b in markers.body_names])
+        found.append(_Arm(at, columns, postures, marker_places(*bodies_at(body, qpos), markers, at)))
     return found
 
 
@@ -132,20 +132,17 @@ def root_positions(x_cam: np.ndarray, xy_px: np.ndarray, c: np.ndarray, matrix: 
     Weighted least squares on ``fx (x + tx) = (u - cx) (z + tz)`` and the like for v, linear in the unknown
     (tx, ty, tz). NaN in frames with fewer than four points seen.
     """
-    focal, centre = np.stack([matrix[:, 0, 0], matrix[:, 1, 1]], -1), matrix[:, :2, 2]
-    d = (xy_px - centre[:, None]) / focal[:, None]  # (T, J, 2)
-    # Rows a . t = b with a = (1, 0, -du) and (0, 1, -dv), b = d z - x.
-    b = d * x_cam[..., 2:] - x_cam[..., :2]
-    normal = np.zeros((len(c), 3, 3))
-    total = np.sum(c, axis=1)
-    normal[:, 0, 0] = normal[:, 1, 1] = total
-    weighted = c[..., None] * d
-    normal[:, :2, 2] = normal[:, 2, :2] = -(c[:, None] @ d)[:, 0]
-    normal[:, 2, 2] = np.einsum("tjk,tjk->t", weighted, d)
-    right = np.concatenate([(c[:, None] @ b)[:, 0], -np.einsum("tjk,tjk->t", weighted, b)[:, None]], axis=1)
-    enough = np.count_nonzero(c > 0, axis=1) >= 4
-    out = np.full((len(c), 3), np.nan)
-    out[enough] = np.linalg.solve(normal[enough] + 1e-9 * np.eye(3), right[enough][..., None])[..., 0]
+    x, y, z = np.moveaxis(x_cam, -1, 0)
+    u, v = ((xy_px[..., k] - matrix[:, k, 2, None]) / matrix[:, k, k, None] for k in (0, 1))  # (T, J)
+    # Rows a . t = b with a = (1, 0, -u) and (0, 1, -v), b = (u, v) z - (x, y).
+    b_u, b_v = u * z - x, v * z - y
+    total = lambda a: np.einsum("tj,tj->t", c, a)  # noqa: E731
+    n, of_u, of_v = np.sum(c, axis=1) + 1e-9, total(u), total(v)
+    to_u, to_v = total(b_u), total(b_v)
+    tz = of_u * to_u + of_v * to_v - n * total(u * b_u + v * b_v)
+    tz /= n * (total(u**2 + v**2) + 1e-9) - of_u**2 - of_v**2
+    out = np.stack([(to_u + of_u * tz) / n, (to_v + of_v * tz) / n, tz], axis=-1)
+    out[np.count_nonzero(c > 0, axis=1) < 4] = np.nan
     return out
 
 
@@ -169,9 +166,10 @@ def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple
     """Rotations (T, 3, 3) and positions (T, 3) with points = R template + x, weighted least squares (Kabsch)."""
     total = np.maximum(weight.sum(axis=1), 1e-9)[:, None]
     a = weight @ template / total
-    b = (weight[:, None] @ points)[:, 0] / total
+    weighted = weight[..., None] * points
+    b = weighted.sum(axis=1) / total
     # The weighted points have mean b, so the template needs no centring.
-    H = np.swapaxes(weight[..., None] * (points - b[:, None]), 1, 2) @ template
+    H = np.tensordot(weighted, template, (1, 0)) - b[:, :, None] * (weight @ template)[:, None]
     U, _, Vt = np.linalg.svd(np.nan_to_num(H))
     mirror = np.sign(np.linalg.det(U @ Vt))
     U[:, :, 2] *= np.where(mirror == 0, 1.0, mirror)[:, None]
@@ -199,6 +197,7 @@ def _bent(body: Body) -> np.ndarray:
     return qpos
 
 
+@functools.cache
 def pelvis_rest(body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (3, 3) and position (3,) of the pelvis in the world at qpos 0."""
     pelvis = body.mj_model.body("pelvis")
@@ -211,14 +210,22 @@ def pelvis_path(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     stands, rest = pelvis_rest(body)
     slides = qpos[:, [column[n] for n in SLIDES]]
     turns = qpos[:, [column[n] for n in PELVIS_TURNS]]
-    return slides @ stands.T + rest, stands @ Rotation.from_euler("ZXY", turns).as_matrix()
+    return slides @ stands.T + rest, stands @ _pelvis_turn(*turns.T)
+
+
+def _pelvis_turn(tilt: np.ndarray, lean: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Rz(tilt) Rx(list) Ry(heading), (T, 3, 3): the hinges turn about z, x and y in this order."""
+    (a, b, c), (sa, sb, sc) = ([f(angle) for angle in (tilt, lean, heading)] for f in (np.cos, np.sin))
+    rows = [
+        [a * c - sa * sb * sc, -sa * b, a * sc + sa * sb * c],
+        [sa * c + a * sb * sc, a * b, sa * sc - a * sb * c],
+        [-b * sc, sb, b * c],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
 
 
 def pelvis_values(body: Body, R: np.ndarray, x: np.ndarray) -> dict[str, np.ndarray]:
-    """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world.
-
-    The hinges turn about z, x and y in this order, so R = Rz(tilt) Rx(list) Ry(rotation).
-    """
+    """The pelvis' six joint values (T,) where its frame is turned by R (T, 3, 3) and lies at x (T, 3), in the world."""
     stands, rest = pelvis_rest(body)
     turned = stands.T @ R
     tilt = np.arctan2(-turned[:, 0, 1], turned[:, 1, 1])

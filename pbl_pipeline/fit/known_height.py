@@ -11,12 +11,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import numpy as np
-
 from pbl_pipeline.body import SLIDES, stature_m
 from pbl_pipeline.keypoints import Keypoints
 
-from .initial_pose import pelvis_path, pelvis_values
+from .initial_pose import pelvis_rest
 from .session import Session
 from .solution import Solution
 
@@ -37,27 +35,23 @@ def in_metres(session: Session, solution: Solution, height_m: float | None) -> t
 
 def _enlarged(session: Session, solution: Solution, factor: float) -> Solution:
     """The whole scene larger by a factor, about the camera."""
-    qpos, points = solution.qpos.copy(), np.array(solution.outcome.x_world_m)
+    qpos, camera = solution.qpos.copy(), session.problem.p_nc[:, 0]
     sd = None if solution.qpos_sd is None else solution.qpos_sd.copy()
     slides = [session.body.joint_names.index(name) for name in SLIDES]
-    for i, arrays in enumerate(session.arrays):
-        frames, camera = session.frames(i), arrays.p_nc[:, 0]
-        x, R = pelvis_path(session.body, qpos[frames])
-        for name, value in pelvis_values(session.body, R, camera + factor * (x - camera)).items():
-            if name in SLIDES:
-                qpos[frames, session.body.joint_names.index(name)] = value
-        points[frames] = camera[:, None] + factor * (points[frames] - camera[:, None])
+    stands, rest = pelvis_rest(session.body)
+    qpos[:, slides] += (factor - 1.0) * (qpos[:, slides] @ stands.T + rest - camera) @ stands
     if sd is not None:
         sd[:, slides] *= factor
     s = factor * solution.s
     s[0] += factor - 1.0  # a multiplier is 1 plus these
-    shown: Any = points, factor * np.asarray(solution.outcome.residual_3d_m)
+    outcome = solution.outcome
+    shown: Any = factor * outcome.x_world_m - (factor - 1.0) * camera[:, None], factor * outcome.residual_3d_m
     return dataclasses.replace(
         solution,
         qpos=qpos,
         qpos_sd=sd,
         s=s,
         scale=factor * solution.scale,
-        outcome=dataclasses.replace(solution.outcome, x_world_m=shown[0], residual_3d_m=shown[1]),
+        outcome=dataclasses.replace(outcome, x_world_m=shown[0], residual_3d_m=shown[1]),
         metre=factor,
     )

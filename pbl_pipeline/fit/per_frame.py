@@ -43,11 +43,11 @@ BACKWARDS_FRACTION = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class _Found:
-    """Where an iteration ended, on the host, with the points there; of the last one also the variances (F, U) of the
-    frames' unknowns and the outcome."""
+    """Where an iteration ended, on the host; the points there or, of the last one, the variances (F, U) of the frames'
+    unknowns and the outcome."""
 
     end: Progress
-    x: np.ndarray  # (F, P, 3)
+    x: np.ndarray | None  # (F, P, 3)
     variance: np.ndarray | None = None
     outcome: Outcome | None = None
 
@@ -93,8 +93,9 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     n = len(sessions)
     scales = np.asarray(scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found]))), np.float64)
     spent = (time.perf_counter() - begin) / n, (compile_seconds() - compiled) / n
-    each = zip(sessions, found, scales, traces, told, strict=True)
-    return [_solution(session, params, f, scale, trace, asked, *spent) for session, f, scale, trace, asked in each]
+    body, each = sessions[0].body, zip(sessions, found, scales, traces, told, strict=True)
+    spread = by_joint(body.joint_names, params.sd_factor, 1.0), floors_of(body, params.sd_floor)
+    return [_solution(session, spread, f, scale, trace, asked, *spent) for session, f, scale, trace, asked in each]
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -201,7 +202,8 @@ def _solve(
         begin = (_begin_one if alone else _begin_many)(body, p, w, start)
         end = (_step_by_step if alone else _many)(body, p, w, begin, limits)
         rest = (_finish_one if alone else _finish_many)(p, end.latest, end.state.R_nc) if last else ()
-        found = jax.device_get((dataclasses.replace(end, latest=None, candidate=None), end.latest.x, *rest))
+        x = None if last else end.latest.x
+        found = jax.device_get((dataclasses.replace(end, latest=None, candidate=None), x, *rest))
     each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
     return [_Found(*f) for f in each]
 
@@ -209,6 +211,7 @@ def _solve(
 def _on_floor(session: Session, found: _Found) -> tuple[Problem, State]:
     """The problem with the frames in which feet stand, as a solution shows them, and that solution to start from."""
     p, state = session.problem, found.end.state
+    assert found.x is not None
     soles = p.split(found.x)[1]
     contact, floor = np.zeros(p.contact.shape, np.float32), np.zeros(state.floor.shape, np.float32)
     for i, arrays in enumerate(session.arrays):
@@ -230,7 +233,7 @@ def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> 
 
 def _solution(
     session: Session,
-    params: GaussNewtonParams,
+    spread: tuple[np.ndarray, np.ndarray],
     found: _Found,
     scale: np.ndarray,
     trace: np.ndarray,
@@ -238,11 +241,10 @@ def _solution(
     seconds: float,
     compiled: float,
 ) -> Solution:
-    state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
+    state, (factor, floor) = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), spread
     assert found.variance is not None
     assert found.outcome is not None
-    factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
-    variance = np.maximum(found.variance[:, : len(names)], 0.0)
+    variance = np.maximum(found.variance[:, : len(factor)], 0.0)
     return Solution(
         qpos=state.qpos,
         R_nc=state.R_nc,

@@ -9,7 +9,8 @@ compile and many sessions of one size are solved in little more time than one, w
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -209,6 +210,7 @@ def step_rates(time_s: np.ndarray) -> np.ndarray:
     return np.append(FRAME_S / np.diff(time_s), 0.0)
 
 
+@functools.lru_cache(16)
 def point_table(body: Body, markers: MarkerSet, size: int) -> PointTable:
     """A marker set padded to `size` rows, then the soles and the ends of the axis of a body that has them."""
     places = [p for p in (*SOLES, *ENDS) if p[0] in body.body_names]
@@ -222,57 +224,61 @@ def point_table(body: Body, markers: MarkerSet, size: int) -> PointTable:
 def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Problem:
     """All trials of a session as one `Problem`, still on the host."""
     coarse = jax.default_backend() != "cpu"
-    total = sum(len(t.time_s) for t in trials)
-    frames, n_markers = pad_frames(total, coarse) - total, len(markers)
-    size = pad_markers(n_markers)
-    n = pad_trials(len(trials), coarse)
-    used = np.concatenate([t.used for t in trials])
+    frames, n_markers = pad_frames(sum(len(t.time_s) for t in trials), coarse), len(markers)
+    size, n = pad_markers(n_markers), pad_trials(len(trials), coarse)
+    per_view = n_markers * max(trials[0].c_3d.shape[1], 1)
 
-    def joined(field: str, marker_axis: int | None = None) -> np.ndarray:
-        a = np.concatenate([getattr(t, field) for t in trials])
-        widths = [(0, 0)] * a.ndim
-        widths[0] = (0, frames)
-        if marker_axis is not None:
-            widths[marker_axis] = (0, (size - n_markers) * (a.shape[marker_axis] > 0))
-        return np.pad(a, widths, mode="constant" if marker_axis is not None else "edge")
+    def rows(of: Callable[[TrialArrays], np.ndarray], marker_axis: int = 0, edge: bool = False) -> np.ndarray:
+        whole = np.concatenate([of(t) for t in trials])
+        shape = [frames, *whole.shape[1:]]
+        if marker_axis and shape[marker_axis]:
+            shape[marker_axis] = size
+        out = np.zeros(shape, np.float32)
+        out[tuple(map(slice, whole.shape))] = whole
+        if edge:
+            out[len(whole) :] = out[len(whole) - 1]
+        return out
 
-    def confidence(field: str) -> np.ndarray:
-        a = joined(field, getattr(trials[0], field).ndim - 1) / (n_markers * max(trials[0].c_3d.shape[1], 1))
-        return a * np.pad(used, (0, frames)).reshape(-1, *[1] * (a.ndim - 1))
+    def confidence(t: TrialArrays, c: np.ndarray) -> np.ndarray:
+        return c * (t.used / per_view).reshape(-1, *[1] * (c.ndim - 1))
 
     quats, starts = _phone_samples(trials, n, coarse)
-    pixel_px = joined("pixel_px")
-    to_pixels = np.ones((*pixel_px.shape, 3, 1))
-    to_pixels[..., :2, 0] /= pixel_px[..., None]
-    bend = np.concatenate([bend_weights(t.time_s, t.used) for t in trials])
-    arrays = {
+    number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
+    soles = sum(name in body.body_names for name, _ in SOLES)
+    arrays: dict[str, Any] = {
         "weight_3d": np.pad(markers.weight_3d, (0, size - n_markers)),
-        "time_s": np.concatenate([t.time_s - t.time_s[0] for t in trials] + [np.zeros(frames)]),
-        "weight": np.pad(used.astype(float), (0, frames)),
-        "x_cam": joined("x_cam", 2),
-        "c_3d": confidence("c_3d"),
-        "xy_px": joined("xy_px", 2) / pixel_px[..., None, None],
-        "c_2d": confidence("c_2d"),
-        "x_world": joined("x_world", 1),
-        "c_world": confidence("c_world"),
-        "R_nc": joined("R_nc"),
-        "p_nc": joined("p_nc"),
-        "camera_matrix": joined("camera_matrix") * to_pixels,
-        "pixel_px": pixel_px,
-        "bend": np.pad(bend, [(0, frames), (0, 0)]),
-        "rate": np.pad(np.concatenate([step_rates(t.time_s) for t in trials]), (0, frames)),
-        "contact": np.zeros((total + frames, sum(name in body.body_names for name, _ in SOLES))),
-        "pelvis": np.zeros((total + frames, 2)),
-        "c_pelvis": np.zeros(total + frames),
+        "time_s": rows(lambda t: t.time_s - t.time_s[0]),
+        "weight": rows(lambda t: t.used),
+        "x_cam": rows(lambda t: t.x_cam, 2),
+        "c_3d": rows(lambda t: confidence(t, t.c_3d), 2),
+        "xy_px": rows(lambda t: t.xy_px / t.pixel_px[..., None, None], 2),
+        "c_2d": rows(lambda t: confidence(t, t.c_2d), 2),
+        "x_world": rows(lambda t: t.x_world, 1),
+        "c_world": rows(lambda t: confidence(t, t.c_world), 1),
+        "R_nc": rows(lambda t: t.R_nc, edge=True),
+        "p_nc": rows(lambda t: t.p_nc, edge=True),
+        "camera_matrix": rows(_matrix_of_cost, edge=True),
+        "pixel_px": rows(lambda t: t.pixel_px, edge=True),
+        "bend": rows(lambda t: bend_weights(t.time_s, t.used)),
+        "rate": rows(lambda t: step_rates(t.time_s)),
+        "contact": np.zeros((frames, soles)),
+        "pelvis": np.zeros((frames, 2)),
+        "c_pelvis": np.zeros(frames),
         "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,
         "sample_step_s": np.asarray(SAMPLE_S),
     }
-    number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
-    f32: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-    f32["trial"] = np.pad(number, (0, frames), mode="edge").astype(np.int32)
-    return Problem(points=point_table(body, markers, size), **f32)
+    arrays = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
+    arrays["trial"] = np.pad(number, (0, frames - len(number)), mode="edge").astype(np.int32)
+    return Problem(points=point_table(body, markers, size), **arrays)
+
+
+def _matrix_of_cost(trial: TrialArrays) -> np.ndarray:
+    """(T, V, 3, 3): the cameras' matrices in the pixels of the cost."""
+    matrix = trial.camera_matrix.copy()
+    matrix[..., :2, :] /= trial.pixel_px[..., None, None]
+    return matrix
 
 
 def _phone_samples(trials: Sequence[TrialArrays], n: int, coarse: bool) -> tuple[np.ndarray, np.ndarray]:

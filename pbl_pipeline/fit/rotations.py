@@ -19,7 +19,7 @@ def mean_rotation(R: np.ndarray) -> np.ndarray:
 
 def quat_wxyz(R: np.ndarray) -> np.ndarray:
     """(T, 4) quaternions of (T, 3, 3), without jumps of sign from one to the next."""
-    q = Rotation.from_matrix(R).as_quat(scalar_first=True)
+    q = Rotation.from_matrix(R, assume_valid=True).as_quat(scalar_first=True)
     same = np.sign(np.sum(q[1:] * q[:-1], axis=1))
     q[1:] *= np.cumprod(np.where(same == 0, 1.0, same))[:, None]
     return q

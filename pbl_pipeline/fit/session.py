@@ -246,9 +246,10 @@ def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     """Undistorted pixels, their confidence, 3D points, theirs."""
     c = np.asarray(trial.confidence, float)
     seen = c > 0
-    xy = undistort_px(np.where(seen[..., None], trial.xy_px, 0.0), trial.camera)
     known = seen & _finite(trial.xyz_cam_m)
-    return xy, c, np.where(known[..., None], trial.xyz_cam_m, 0.0), np.where(known, c, 0.0)
+    xy, x_cam = np.array(trial.xy_px), np.array(trial.xyz_cam_m)
+    xy[~seen], x_cam[~known] = 0.0, 0.0
+    return undistort_px(xy, trial.camera), c, x_cam, np.where(known, c, 0.0)
 
 
 def _orientation(

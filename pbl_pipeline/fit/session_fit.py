@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
 from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import Camera
 
 from .checks import check_fit
@@ -33,7 +35,7 @@ from .vertical import upright
 
 #: Sessions solved at once on a GPU: enough to fill it, few enough that the next ones are packed meanwhile.
 BATCH = 32
-#: Threads that pack them: numpy's larger steps run beside each other.
+#: Threads that pack them and make their results: numpy's larger steps run beside each other.
 PACKERS = 4
 
 
@@ -97,19 +99,26 @@ def fit_sessions(
     Raises `PblError` SOLVER_UNKNOWN.
     """
     method = METHODS.find(paramset)
-    paramset = method.paramset
     if batch is None:
         batch = 1 if jax.default_backend() == "cpu" else BATCH
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
-    for part in _made_ahead(_batches(sessions, method.params, batch, out)):
-        for packed, solution in zip(part, _solve(part, method), strict=True):
-            given = sessions[packed.index]
-            try:
-                if isinstance(solution, PblError):
-                    raise solution
-                out[packed.index] = _session_fit(packed, solution, paramset, given)
-            except PblError as error:
-                out[packed.index] = error
+
+    def finish(packed: _Packed, solution: Solution | PblError) -> None:
+        try:
+            if isinstance(solution, PblError):
+                raise solution
+            out[packed.index] = _session_fit(packed, solution, method.paramset, sessions[packed.index])
+        except PblError as error:
+            out[packed.index] = error
+
+    # While a batch is solved, the results of the one before are made and the next one is packed.
+    with (
+        ThreadPoolExecutor(PACKERS) as threads,
+        contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
+    ):
+        finished = [threads.map(finish, part, _solve(part, method)) for part in parts]
+        for results in finished:
+            list(results)  # raises what was raised there
     return [r for r in out if r is not None]
 
 
@@ -124,7 +133,11 @@ class _Packed:
 
 
 def _batches(
-    sessions: Sequence[SessionInput], params: Params, batch: int, out: list[SessionFit | PblError | None]
+    sessions: Sequence[SessionInput],
+    params: Params,
+    batch: int,
+    out: list[SessionFit | PblError | None],
+    threads: ThreadPoolExecutor,
 ) -> Iterator[list[_Packed]]:
     """Up to `batch` sessions of the same sizes and terms at a time; errors of the others go to `out`."""
     waiting: dict[tuple, list[_Packed]] = {}
@@ -139,29 +152,19 @@ def _batches(
             return error
         return _Packed(i, session, start_of(session), time.perf_counter() - begin)
 
-    with ThreadPoolExecutor(PACKERS) as threads:
-        for first in range(0, len(sessions), batch):
-            some = range(first, min(first + batch, len(sessions)))
-            for i, packed in zip(some, threads.map(pack, some), strict=True):
-                if isinstance(packed, PblError):
-                    out[i] = packed
-                    continue
-                problem = packed.session.problem
-                shapes = tuple(a.shape for a in jax.tree.leaves(problem))
-                key = (shapes, pixels_alone(problem), type(packed.session.trials[0]))
-                waiting.setdefault(key, []).append(packed)
-                if len(waiting[key]) == batch:
-                    yield waiting.pop(key)
+    for first in range(0, len(sessions), batch):
+        some = range(first, min(first + batch, len(sessions)))
+        for i, packed in zip(some, threads.map(pack, some), strict=True):
+            if isinstance(packed, PblError):
+                out[i] = packed
+                continue
+            problem = packed.session.problem
+            shapes = tuple(a.shape for a in jax.tree.leaves(problem))
+            key = (shapes, pixels_alone(problem), type(packed.session.trials[0]))
+            waiting.setdefault(key, []).append(packed)
+            if len(waiting[key]) == batch:
+                yield waiting.pop(key)
     yield from waiting.values()
-
-
-def _made_ahead(parts: Iterator[list[_Packed]]) -> Iterator[list[_Packed]]:
-    """The same, each packed in a thread of its own while the caller is busy with the one before."""
-    with ThreadPoolExecutor(1) as thread:
-        following = thread.submit(next, parts, None)
-        while (part := following.result()) is not None:
-            following = thread.submit(next, parts, None)
-            yield part
 
 
 def _motions(given: SessionInput) -> list[str]:

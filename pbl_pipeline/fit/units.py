@@ -106,18 +106,14 @@ def body_metres(
     for points, confidence in zip(x_cam, c, strict=True):
         weight = np.where(confidence[:, 0, trunk] > 0, 1.0, 0.0)
         enough = weight.sum(axis=1) >= 3
-        if enough.any():
-            at = np.where(weight[enough, :, None] > 0, points[enough, 0][:, trunk], 0.0)
-            seen = _spread(at, weight[enough])
-            own = _spread(np.broadcast_to(template, at.shape), weight[enough])
-            ratios.append(own[seen > 0] / seen[seen > 0])
-    found = np.concatenate(ratios) if ratios else np.zeros(0)
+        seen, own = (_spread(x, weight[enough]) for x in (points[enough, 0][:, trunk], template[None]))
+        ratios.append(own[seen > 0] / seen[seen > 0])
+    found = np.concatenate(ratios)
     return float(np.median(found)) if len(found) else 1.0
 
 
-def _spread(points: Float[np.ndarray, "T J 3"], weight: Float[np.ndarray, "T J"]) -> Float[np.ndarray, " T"]:
+def _spread(points: Float[np.ndarray, "#T J 3"], weight: Float[np.ndarray, "T J"]) -> Float[np.ndarray, " T"]:
     """Root mean square distance of weighted points from their middle."""
-    total = weight.sum(axis=1)[:, None]
-    middle = np.einsum("tj,tji->ti", weight, points) / total
-    square = np.sum((points - middle[:, None]) ** 2, axis=-1)
-    return np.sqrt(np.sum(weight * square, axis=1) / total[:, 0])
+    total = weight.sum(axis=1)
+    away = points - ((weight[:, None] @ points) / total[:, None, None])
+    return np.sqrt(np.einsum("tj,tji,tji->t", weight, away, away) / total)

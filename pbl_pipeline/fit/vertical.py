@@ -48,7 +48,7 @@ def upright(session: Session, solution: Solution) -> tuple[Solution, tuple[str, 
         for name, value in values.items():
             qpos[frames, session.body.joint_names.index(name)] = value
         R_nc[frames] = turn @ R_nc[frames]
-        points[frames] = points[frames] @ turn.T
+        points[frames] = (points[frames].reshape(-1, 3) @ turn.T.astype(points.dtype)).reshape(points[frames].shape)
         sources[i] = GAIT
     shown: Any = points
     solution = dataclasses.replace(solution, qpos=qpos, R_nc=R_nc, outcome=dataclasses.replace(seen, x_world_m=shown))

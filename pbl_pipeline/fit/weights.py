@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -45,6 +46,7 @@ class Weights:
         return self.numbers[name]
 
     @classmethod
+    @functools.lru_cache(16)
     def of(cls, body: Body, params: GaussNewtonParams | ImplicitAdamParams, size_unseen: bool = False) -> Weights:
         """Return those of a paramset. `size_unseen`: nothing seen tells the person's size, so a prior does.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
+import functools
 import math
 import re
 
@@ -94,11 +94,7 @@ def visibility(
     whole = whole_person_in_view(keypoints, min_confidence)
     seen = np.mean(keypoints.confidence > 0, axis=1) >= SEEN_SHARE
     counts = bridge_gaps(whole, time, max_gap_s) & ~blind_runs(seen, time, max_blind_s)
-    gaps = [
-        Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all()))
-        for a, b in itertools.pairwise(np.flatnonzero(whole))
-        if b > a + 1
-    ]
+    gaps = [Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all())) for a, b in _around_gaps(whole)]
     return Visibility(time, seen, whole, counts, tuple(gaps))
 
 
@@ -114,8 +110,8 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
     if given.mean() < SEEN_SHARE:
         return np.zeros(len(keypoints.time_s), bool)
     width, height = keypoints.image_size_px
-    xy = np.nan_to_num(keypoints.xy_px, nan=-1.0)
-    inside = (xy[..., 0] >= 0) & (xy[..., 0] <= width) & (xy[..., 1] >= 0) & (xy[..., 1] <= height)
+    x, y = np.moveaxis(keypoints.xy_px, -1, 0)
+    inside = (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     inside &= keypoints.confidence > 0
     needed = np.tile(given, (len(inside), 1))
     for points, at_border in ends(keypoints):
@@ -128,16 +124,29 @@ def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
     """Of the feet and the lower border, then of the head and the upper one: which points (J,) bool they are, and in
     which frames (T,) bool the person reaches to that border."""
     box, height = np.asarray(keypoints.box_px, float), keypoints.image_size_px[1]
-    feet, head = (np.array([bool(p.search(n)) for n in keypoints.names]) for p in (_FEET, _HEAD))
+    feet, head = _feet_and_head(tuple(keypoints.names))
     return (feet, box[:, 3] >= height - 1), (head, box[:, 1] <= 0)
+
+
+@functools.cache
+def _feet_and_head(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Which markers (J,) bool are of the feet, and which of the head."""
+    feet, head = (np.array([bool(p.search(n)) for n in names]) for p in (_FEET, _HEAD))
+    return feet, head
+
+
+def _around_gaps(flags: np.ndarray) -> np.ndarray:
+    """Return (N, 2): the last frame before and the first after each stretch of False between two of True (T,)."""
+    index = np.flatnonzero(flags)
+    before = np.flatnonzero(np.diff(index) > 1)
+    return np.stack([index[before], index[before + 1]], axis=1)
 
 
 def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:
     """Frames to use: those in view and those inside a gap between two of them that is shorter than `max_gap_s`."""
     used = in_view.copy()
-    index = np.flatnonzero(in_view)
-    for a, b in itertools.pairwise(index):
-        if b > a + 1 and time_s[b] - time_s[a] < max_gap_s:
+    for a, b in _around_gaps(in_view):
+        if time_s[b] - time_s[a] < max_gap_s:
             used[a:b] = True
     return used
 
@@ -149,9 +158,8 @@ def blind_runs(seen: np.ndarray, time_s: np.ndarray, max_blind_s: float) -> np.n
     through such a hole invents movement (on a synthetic walker up to 50 deg at the knee within 0.9 s).
     """
     blind = np.zeros(len(seen), bool)
-    index = np.flatnonzero(seen)
-    for a, b in itertools.pairwise(index):
-        if b > a + 1 and time_s[b] - time_s[a] > max_blind_s:
+    for a, b in _around_gaps(seen):
+        if time_s[b] - time_s[a] > max_blind_s:
             blind[a + 1 : b] = True
     return blind
 

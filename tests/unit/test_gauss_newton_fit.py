@@ -273,8 +273,13 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
     for one, other in zip(a.trials, b.trials, strict=True):
         np.testing.assert_allclose(one.qpos, other.qpos, atol=1e-4)
         np.testing.assert_allclose(one.qpos_sd, other.qpos_sd, rtol=1e-2)
+        np.testing.assert_allclose(one.markers_world_m, other.markers_world_m, atol=1e-3)
     np.testing.assert_allclose(a.scale, b.scale, atol=1e-4)
     np.testing.assert_allclose(a.site_offset_m, b.site_offset_m, atol=1e-4)
+    for check, other in zip(a.qc, b.qc, strict=True):
+        assert (check.check, check.outcome, check.advice) == (other.check, other.outcome, other.advice)
+        assert (check.value is None) == (other.value is None)
+        assert check.value is None or check.value == pytest.approx(other.value, rel=1e-2)
 
 
 def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monkeypatch):
