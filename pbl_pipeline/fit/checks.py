@@ -15,7 +15,7 @@ from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
 from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
 from .results import TrialFit
-from .session import GAIT, LEVEL, Session
+from .session import GAIT, LEVEL, Session, has_3d
 from .solution import Solution
 
 #: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
@@ -110,9 +110,9 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> 
 def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
     """Of trials of one camera whose detector gave no 3D: whether the view can stand in for it. Nothing without such."""
     facing = []
-    for trial, arrays, fit in zip(session.trials, session.arrays, trials, strict=True):
+    for trial, fit in zip(session.trials, trials, strict=True):
         known = np.isfinite(fit.qpos[:, 0])
-        if not isinstance(trial, Keypoints) or np.any(arrays.c_3d > 0) or not known.any():
+        if not isinstance(trial, Keypoints) or has_3d(trial) or not known.any():
             continue
         forward = pelvis_path(session.body, np.asarray(fit.qpos[known], float))[1][:, :, 0].mean(axis=0)
         axis = Rotation.from_quat(fit.phone_quat_wxyz[known], scalar_first=True).apply([0.0, 0.0, 1.0]).mean(axis=0)
