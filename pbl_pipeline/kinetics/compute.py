@@ -101,7 +101,7 @@ HEALTHY_SD: Mapping[str, float] = {
 }
 #: Half of the range of healthy people in which 95 % of them lie, in their standard deviations.
 HEALTHY_RANGE = 1.96
-#: Why a measure is absent whose 90 % interval is wider than that range: it would tell nobody from a healthy person.
+#: Why a measure is absent whose 90 % interval is wider than that range: it cannot tell a patient from a healthy person.
 TOO_UNCERTAIN = "its 90 % interval is wider than the range of healthy people"
 #: Reasons for missing forces, by code.
 REASONS = {

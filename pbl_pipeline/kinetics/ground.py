@@ -161,11 +161,11 @@ def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:
     """Return `TRANSIENT` over each double and single support that is seen from its first to its last moment, 0
     elsewhere."""
     out = np.zeros(len(vertical))
-    both, any_foot = stands.all(axis=1), stands.any(axis=1)
-    if any_foot.any():
-        size = float(np.subtract(*np.percentile(vertical[any_foot], [95, 5])))
-        for on, values in zip((both, any_foot & ~both), TRANSIENT, strict=True):
-            for first, last in _runs(on):
+    feet = stands.sum(axis=1)
+    if feet.any():
+        size = float(np.subtract(*np.percentile(vertical[feet > 0], [95, 5])))
+        for n, values in zip((2, 1), TRANSIENT, strict=True):
+            for first, last in _runs(feet == n):
                 if first > 0 and last + 1 < len(vertical):
                     out[first : last + 1] = size * _course(_phase(first, last), values)
     return out
