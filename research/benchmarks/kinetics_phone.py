@@ -72,10 +72,10 @@ def known_walks(kind: str) -> Iterator[Known]:
             lab = read_walk(path)
             fit = fit_walk(lab)
             seen = np.isfinite(fit.qpos).all(axis=1)
-            time = np.arange(fit.time_s[seen][0], fit.time_s[seen][-1], 1 / RATE_HZ)
+            time = np.arange(fit.time_s[seen][0], fit.time_s[seen][-1] - 1e-6, 1 / RATE_HZ)
             qpos = CubicSpline(fit.time_s[seen], fit.qpos[seen])(time)
             events = read_lab_trial(path).events
-            walk = Walk(lab.name, "recorded", kind, 0.0, time, qpos, fit.scale, events.events)
+            walk = Walk(f"kid {lab.name[:-2]}", "recorded", kind, 0.0, time, qpos, fit.scale, events.events)
             plates = {SIDES[s.side]: s.true_measured for s in steps_of(lab, fit, METHODS.find().params.cutoff_hz)}
             labels = Labelled(events, tuple(find_cycles(events.events, keep_ends=True)))
             yield Known(walk, lab.name.startswith(TUNING), labels, plates)

@@ -78,9 +78,9 @@ def test_rows_say_what_forces_were_computed_from(walk: Path):
     assert 0 < row["forces_residual"] < 1
     measures = {r["force_measure"]: r for r in kinetics.Kinetics.Measure.to_dicts()}
     assert measures.keys() == set(MEASURES)
-    peak = measures["vertical_peak_loading_bw"]
-    assert peak["force_left"] < 2
-    assert peak["force_sd"] > 0
+    impulse = measures["vertical_impulse_bw_s"]
+    assert impulse["force_left"] < 2
+    assert impulse["force_sd"] > 0
     power = measures["ankle_push_off_power_w_per_kg"]
     assert (power["force_mean"], power["force_n"]) == (None, 0)
     assert power["force_missing"] == TOO_UNCERTAIN
@@ -89,10 +89,10 @@ def test_rows_say_what_forces_were_computed_from(walk: Path):
     assert set(MEASURES) == names - set(kinetics.Kinetics.Cycle.primary_key) - {"forces_missing"}
     of_cycles = (kinetics.Kinetics.Cycle * gait.GaitCycle.Cycle).to_dicts()
     assert len(of_cycles) == len(gait.GaitCycle.Cycle())
-    used = [r["vertical_peak_loading_bw"] for r in of_cycles if r["cycle_used"] and r["cycle_side"] == "left"]
+    used = [r["vertical_impulse_bw_s"] for r in of_cycles if r["cycle_used"] and r["cycle_side"] == "left"]
     known = [v for v in used if v is not None]
     assert known
-    assert peak["force_left"] == pytest.approx(sum(known) / len(known))
+    assert impulse["force_left"] == pytest.approx(sum(known) / len(known))
     assert {r["forces_check"] for r in kinetics.Kinetics.Check.to_dicts()} == {"kinetics_residual", "kinetics_scale"}
 
 
@@ -229,7 +229,7 @@ def test_forces_are_of_the_trials_that_the_index_pools(upright: None, tmp_path: 
     populate()
     n = {
         r["gdi_method"].split("-v")[0]: r["force_n"]
-        for r in (kinetics.Kinetics.Measure & {"force_measure": "vertical_peak_loading_bw"}).to_dicts()
+        for r in (kinetics.Kinetics.Measure & {"force_measure": "vertical_impulse_bw_s"}).to_dicts()
     }
     assert n.pop("paper-2025") > max(n.values()) > 0
     # A pace that is stated later pools another recording, and forces of it.
@@ -239,7 +239,7 @@ def test_forces_are_of_the_trials_that_the_index_pools(upright: None, tmp_path: 
     populate()
     own = load_visit({**VISIT, "gdi_method": default}).kinetics
     assert own is not None
-    assert own.measures["vertical_peak_loading_bw"].n > n[default]
+    assert own.measures["vertical_impulse_bw_s"].n > n[default]
 
 
 def test_the_frame_of_forces_has_a_row_per_measure_with_its_interval(walk: Path):
@@ -287,7 +287,7 @@ def test_the_page_of_a_visit_shows_forces_in_both_languages(walk: Path):
     assert "1 BW is 686 N." in page
     assert page.count("over the gait cycle, in BW") == 3
     about = browser.get("/visits/1.json").json()["forces"]["found"]
-    peak = found().measures["vertical_peak_loading_bw"]
-    assert about["measures"]["vertical_peak_loading_bw"]["mean"] == pytest.approx(peak.mean)
+    impulse = found().measures["vertical_impulse_bw_s"]
+    assert about["measures"]["vertical_impulse_bw_s"]["mean"] == pytest.approx(impulse.mean)
     german = browser.get("/visits/1", headers={"accept-language": "de"}).text
     assert "Vertikale Kraft, Spitze der Lastübernahme" in german
