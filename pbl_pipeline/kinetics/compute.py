@@ -111,6 +111,7 @@ REASONS = {
     "VERTICAL_UNKNOWN": "the tilt of the camera is not known: a level one may be off by more than 5 deg",
     "TOO_SHORT": "no stretch of a second without gaps",
     "AID": "a walking aid may carry a part of the weight",
+    "UNCERTAIN": "the 90 % interval of every measure is wider than the range of healthy people",
 }
 #: Root mean square of the residual force beyond which a check warns (body weights).
 MAX_RESIDUAL_BW = 0.15
@@ -139,8 +140,8 @@ def visit_kinetics(
     cameras = [ONE_CAMERA_SD.get(f.marker_set, ONE_CAMERA_SD["blazepose_33"]) for f in fits if not is_metric(f)]
     measures, reasons = _pool(pooled, {name: max((c[name] for c in cameras), default=0.0) for name in MEASURES})
     first = next((t for t in trials if t.code), None)
-    code = "" if measures else (first.code if first is not None else "NO_CYCLES")
-    reason = "" if measures else (first.reason if first is not None else REASONS["NO_CYCLES"])
+    code = "" if measures else (first.code if first else "UNCERTAIN" if pooled else "NO_CYCLES")
+    reason = REASONS.get(code, "")
     if not measures:
         reasons = dict.fromkeys(map(str, MEASURES), reason)
     return Kinetics(

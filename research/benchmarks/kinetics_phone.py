@@ -94,7 +94,8 @@ def forces(known: Known, view: str, detector: str) -> tuple[TrialFit, TrialFit, 
     height = stature_m(load_body(), walk.scale)
     session = fit_session([points], [walk.person], chosen, "static", height_m=height)
     fit = dataclasses.replace(session.trials[0], orientation_source="measured: phone")
-    exact = dataclasses.replace(walk.fit(), orientation_source="measured: phone", camera_motion="static")
+    unknown = np.full_like(walk.qpos, np.nan)  # the exact motion has no error to draw
+    exact = dataclasses.replace(walk.fit(), orientation_source="measured: phone", qpos_sd=unknown)
     gait = [known.labels] * 2 if known.labels else [gait_metrics([f]).trials[0] for f in (fit, exact)]
     with (
         mock.patch.dict(HEALTHY_SD, dict.fromkeys(MEASURES, np.inf)),

@@ -319,6 +319,8 @@ def test_what_is_less_certain_than_healthy_people_differ_is_left_out(walk: Trial
         found = kinetics_of(unsure)
         assert found.measures.keys().isdisjoint({name})
         assert found.reasons[name] == TOO_UNCERTAIN
+    nothing = kinetics_of(dataclasses.replace(metric, qpos_sd=np.full_like(walk.qpos, 10.0)))
+    assert (nothing.status, nothing.code) == ("EMPTY", "UNCERTAIN")
     for measure, own in known.measures.items():
         low, high = own.interval or (0.0, 0.0)
         assert high - low <= 2 * 1.96 * HEALTHY_SD[measure]
