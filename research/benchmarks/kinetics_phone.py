@@ -45,7 +45,7 @@ VIEWS = ("frontal", "sagittal", "oblique")
 #: Marker set -> largest root mean square of the vertical force (% BW).
 BARS = {"bml_movi_87": 6.0, "blazepose_33": 10.0}
 #: How many synthetic walkers, and frames a second that a phone takes.
-N_SYNTHETIC, RATE_HZ = 12, 30.0
+N_SYNTHETIC, RATE_HZ = 4, 30.0
 
 
 class Labelled(NamedTuple):
