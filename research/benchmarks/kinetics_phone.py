@@ -13,7 +13,8 @@ detector (`research.walker.detectors`), the body height stated:
 
 For persons on whom numbers were chosen and for the others: the mean true measure, the error's mean and root mean square
 over both sides and all views, the stated standard deviation, how many of the 90 % intervals hold the truth, and, of
-the whole interval, how often the visit shows the measure. Exit code 1 where the vertical force of the others is further off than the bar.
+the whole interval, how often the visit shows the measure. Exit code 1 where the vertical force of the others is
+further off than the bar.
 """
 
 from __future__ import annotations
@@ -145,16 +146,14 @@ def main(kind: str, detector: str) -> None:
     for tuning in (True, False):
         click.echo(f"\n{kind}, {detector}, {'tuning' if tuning else 'held out'}: {len(rms[tuning])} clips")
         click.echo(f"vertical force against the exact motion {np.mean(rms[tuning]):.1f} % BW (bar {bar:g})")
-        click.echo(
-            f"{'':42}{'true':>9}{'mean':>9}{'rms':>9}{'sd':>9}{'held':>7}{'shown':>7}"[
-                : None if kind == "plates" else -7
-            ]
-        )
+        columns = ("true", "mean", "rms", "sd")
+        shares = ("held", "shown") if kind == "plates" else ("held",)
+        click.echo(f"{'':42}" + "".join(f"{c:>9}" for c in columns) + "".join(f"{c:>7}" for c in shares))
         for name in MEASURES:
             truth, error, sd, shown = np.array(rows[tuning, name]).T
             cells = (truth.mean(), error.mean(), np.sqrt(np.mean(error**2)), np.sqrt(np.mean(sd**2)))
-            shares = [np.mean(np.abs(error) < WIDTH_SD * sd)] + [shown.mean()] * (kind == "plates")
-            click.echo(f"{name:42}" + "".join(f"{c:9.3f}" for c in cells) + "".join(f"{s:7.0%}" for s in shares))
+            found = (np.mean(np.abs(error) < WIDTH_SD * sd), shown.mean())[: len(shares)]
+            click.echo(f"{name:42}" + "".join(f"{c:9.3f}" for c in cells) + "".join(f"{s:7.0%}" for s in found))
     sys.exit(int(np.mean(rms[False]) > bar))
 
 
