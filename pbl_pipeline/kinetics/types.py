@@ -46,13 +46,14 @@ class KineticsParams:
     """Parameters of the stage.
 
     cutoff_hz: of the low-pass of the joint values; samples: how many motions are drawn from the fit's uncertainty for
-    the intervals; lasting: the fraction of its variance that is the same in all frames; memory_s: how long the rest
-    stays alike.
+    the intervals; varying_turns, varying_slides: the fraction of its variance that varies over a walk, of joint angles
+    and of the pelvis' place; memory_s: how long an error stays alike.
     """
 
     cutoff_hz: float = 6.0
     samples: int = 20
-    lasting: float = 0.95
+    varying_turns: float = 0.05
+    varying_slides: float = 0.002
     memory_s: float = 0.2
 
 

@@ -79,17 +79,26 @@ def _label(title: str, unit: str, n: int) -> str:
 
 
 def force_charts(kinetics: Kinetics, label: Callable[[str, str, int], str]) -> list[dict]:
-    """Return one chart for each curve that cycles have; of hip and knee only where their measures are known.
+    """Return one chart for each curve that cycles have; of hip and knee, and powers, only where a measure of them is
+    known.
 
     `label` describes a chart for those who do not see it, by the curve's title, its unit and the number of cycles.
     """
-    shown = ("force_", "ankle_") if "knee_extension_moment_peak_nm_per_kg" in kinetics.reasons else ("",)
+    hidden = [
+        text
+        for measure, text in (
+            ("knee_extension_moment_peak_nm_per_kg", "hip_"),
+            ("knee_extension_moment_peak_nm_per_kg", "knee_"),
+            ("ankle_push_off_power_w_per_kg", "_power_"),
+        )
+        if measure in kinetics.reasons
+    ]
     cycles = [c for t in kinetics.trials for c in t.cycles if c.used and c.curves]
     drawn = []
     for name, (title, unit) in KINETICS_CURVES.items():
         by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in _SIDES}
         known = [curve for curves in by_side.values() for curve in curves]
-        if not known or not name.startswith(shown):
+        if not known or any(text in name for text in hidden):
             continue
         percent = np.linspace(0.0, 100.0, len(known[0]))
         chart = charts.cycle_chart(

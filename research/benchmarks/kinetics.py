@@ -20,9 +20,10 @@ import gzip
 import io
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import click
 import numpy as np
@@ -45,6 +46,7 @@ from pbl_pipeline.kinetics import (
     Motion,
     contact_of,
     generalised_without,
+    ground,
     ground_reaction,
     inverse_dynamics,
     leg_moments,
@@ -59,6 +61,8 @@ FOLDER = SHARED / "real" / "gait_lab_c3d"
 TABLE = Path(__file__).parent / "data" / "gait_lab.csv"
 #: Children on whom numbers were chosen; the others are held out.
 TUNING = ("HC002D", "HC031A", "HC033A", "HC038A", "HC044A", "HC055A")
+#: Double support of a step of these children.
+DOUBLE_SUPPORT = 0.13
 #: Force below which a plate carries nothing (N).
 THRESHOLD_N = 20.0
 #: Column of the table -> bar of the issue, None where it states none.
@@ -245,6 +249,42 @@ def _step(
     )
 
 
+def transients_of(pairs: Sequence[Sequence[Step]]) -> tuple[tuple[float, ...], ...]:
+    """Return `ground.TRANSIENT` of walks, each given by its two steps in their order. Known is the whole force from the
+    other foot's leaving before the first step's to its landing after the second's."""
+    rows: list[list[np.ndarray]] = [[], []]
+    for one, two in pairs:
+        feet = np.sum(one.ours.contact == 1, axis=1)
+        needs = (one.ours.residual_n + one.ours.force_n.sum(axis=1))[:, 2]
+        lacks = (one.force + two.force)[:, 2] - needs
+        lacks /= np.subtract(*np.percentile(needs[feet > 0], [95, 5]))
+        known = np.arange(np.flatnonzero(one.alone)[0], np.flatnonzero(two.alone)[-1] + 1)
+        for n, (courses, course) in enumerate(zip(rows, ground.TRANSIENT, strict=True)):
+            for run in np.split(known, np.flatnonzero(np.diff(feet[known])) + 1):
+                if feet[run[0]] == 2 - n:
+                    phase = (np.arange(len(run)) + 0.5) / len(run)
+                    courses.append(np.interp(np.linspace(0.0, 1.0, len(course)), phase, lacks[run]))
+    double, single = (np.mean(courses, axis=0) for courses in rows)
+    weight = DOUBLE_SUPPORT * np.trapezoid(double) / (len(double) - 1)
+    weight += (1.0 - DOUBLE_SUPPORT) * np.trapezoid(single) / (len(single) - 1)
+    return tuple(double - weight), tuple(single - weight)
+
+
+def errors_without_own(fitted: Sequence[tuple[Walk, TrialFit]], cutoff_hz: float) -> dict[str, np.ndarray]:
+    """Return the differences of each measure over the steps of the tuning children, each child's with the transients
+    of the others."""
+    tuning = [(w, f) for w, f in fitted if w.name.startswith(TUNING)]
+    pairs = {w.name: sorted(steps_of(w, f, cutoff_hz), key=lambda s: s.time_s[s.stance][0]) for w, f in tuning}
+    found: dict[str, list[float]] = {name: [] for name in MEASURES}
+    for walk, fit in tuning:
+        others = transients_of([p for name, p in pairs.items() if name != walk.name])
+        with mock.patch.object(ground, "TRANSIENT", others):
+            for step in steps_of(walk, fit, cutoff_hz):
+                for name, true in step.true_measured.items():
+                    found[name].append(step.measured[name] - true)
+    return {name: np.array(off) for name, off in found.items()}
+
+
 def errors_of(step: Step) -> dict[str, float]:
     """Return the errors of one step by the names of `BARS`. The walkway of this laboratory is along y."""
     force, centre = step.ours.force_n[:, step.side], step.ours.centre_m[:, step.side]
@@ -328,13 +368,23 @@ def main(cutoffs: tuple[float, ...], figure: Path | None) -> None:
             missed |= late
             cells = "".join(f"{m:16.2f}" for m in means.values())
             click.echo(f"  {name:52}{'' if bar is None else f'{bar:g}':>8}{cells}{'  FAIL' if late else ''}")
-        click.echo("\n  difference of a measure, mean and standard deviation")
+        click.echo(
+            "\n  difference of a measure, mean and standard deviation; of the tuning children root mean square with the"
+        )
+        click.echo("  transients of the others; standard deviation between all children of the plates' measure")
+        without = errors_without_own(list(zip(walks, fits, strict=True)), cutoff)
         for name in MEASURES:
             cells = ""
             for group in groups.values():
                 off = [s.measured[name] - s.true_measured[name] for s in group if name in s.true_measured]
-                cells += f"{np.mean(off):10.3f}{np.std(off, ddof=1):8.3f}" if len(off) > 1 else f"{'-':>18}"
-            click.echo(f"  {name:52}{cells}")
+                cells += f"{np.mean(off):10.3f}{np.std(off, ddof=1):8.3f}"
+            children = [[s.true_measured[name] for s in steps if s.walk == w.name] for w in walks]
+            between = np.std([np.mean(c) for c in children], ddof=1)
+            click.echo(f"  {name:52}{cells}{np.sqrt(np.mean(without[name] ** 2)):10.4f}{between:10.4f}")
+        click.echo("\n  transients of the tuning children")
+        of_walk = [[s for s in steps if s.walk == w.name] for w in walks if w.name.startswith(TUNING)]
+        for course in transients_of([sorted(p, key=lambda s: s.time_s[s.stance][0]) for p in of_walk]):
+            click.echo("  " + ", ".join(f"{value:.2f}" for value in course))
     if figure is not None:
         draw([s for s in steps if not s.walk.startswith(TUNING)][:6], figure)
     sys.exit(int(missed))

@@ -18,6 +18,7 @@ _METHODS = {
     "fit_method": "fit",
     "index": "gdi",
     "norm": "norm",
+    "kinetics_method": "kinetics",
 }
 
 
@@ -108,6 +109,7 @@ _METHODS = {
 @click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: what suits the keypoints).")
 @click.option("--index", metavar="NAME", help="Gait Deviation Index: pbl-2025-three-angles (default) or gillette-2008.")
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
+@click.option("--kinetics-method", metavar="NAME", help="Method of forces and joint moments (else: the default).")
 def ingest(
     videos: tuple[Path, ...],
     sheet: Path | None,

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from .. import fit, gait, gdi, lab, qc, session, study, tracking, validation, video
+from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
 from ..stored_files import file_ref, stored_file
 
@@ -119,6 +119,19 @@ def frame_of(query: Any) -> Any:
     import pandas as pd
 
     return pd.DataFrame(list(query.cursor().fetchall()), columns=list(query.heading.names))
+
+
+def force_frame(restriction: Any = True) -> pd.DataFrame:
+    """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
+    the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
+    null with the reason in `force_missing`."""
+    from pbl_pipeline.kinetics.types import WIDTH_SD
+
+    forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
+    found = frame_of(current_sets() * forces * kinetics.Kinetics.Measure & restriction)
+    half = WIDTH_SD * found["force_sd"].astype(float)
+    found = found.assign(force_low=found["force_mean"] - half, force_high=found["force_mean"] + half)
+    return found.sort_values(["session_id", "force_measure"], kind="stable", ignore_index=True)
 
 
 def index_frame() -> pd.DataFrame:

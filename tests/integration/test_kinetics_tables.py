@@ -10,11 +10,14 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.kinetics
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.kinetics import MEASURES, METHODS, REASONS, Kinetics
+from pbl_pipeline.kinetics import MEASURES, METHODS, REASONS, TOO_UNCERTAIN, Kinetics
+from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.visit import Visit
 from schemas import capture, gait, gdi, kinetics, load_visit, session
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.intake.conditions import set_condition
+from schemas.method_rows import insert_methods
+from schemas.reading import frames
 from schemas.reading.status import pipeline_status
 from schemas.reading.visit_progress import visit_progress
 from schemas.reading.why import why
@@ -75,21 +78,21 @@ def test_rows_say_what_forces_were_computed_from(walk: Path):
     assert 0 < row["forces_residual"] < 1
     measures = {r["force_measure"]: r for r in kinetics.Kinetics.Measure.to_dicts()}
     assert measures.keys() == set(MEASURES)
-    peak = measures["vertical_peak_loading_bw"]
-    assert peak["force_left"] < 2
-    assert peak["force_sd"] > 0
-    moment = measures["knee_extension_moment_peak_nm_per_kg"]
-    assert (moment["force_mean"], moment["force_n"]) == (None, 0)
-    assert "one camera" in moment["force_missing"]
+    impulse = measures["vertical_impulse_bw_s"]
+    assert impulse["force_left"] < 2
+    assert impulse["force_sd"] > 0
+    power = measures["ankle_push_off_power_w_per_kg"]
+    assert (power["force_mean"], power["force_n"]) == (None, 0)
+    assert power["force_missing"] == TOO_UNCERTAIN
     # Every cycle has a row, with a column for each measure, and the visit's mean is that of its used ones.
     names = set(kinetics.Kinetics.Cycle.heading.names)
     assert set(MEASURES) == names - set(kinetics.Kinetics.Cycle.primary_key) - {"forces_missing"}
     of_cycles = (kinetics.Kinetics.Cycle * gait.GaitCycle.Cycle).to_dicts()
     assert len(of_cycles) == len(gait.GaitCycle.Cycle())
-    used = [r["vertical_peak_loading_bw"] for r in of_cycles if r["cycle_used"] and r["cycle_side"] == "left"]
+    used = [r["vertical_impulse_bw_s"] for r in of_cycles if r["cycle_used"] and r["cycle_side"] == "left"]
     known = [v for v in used if v is not None]
     assert known
-    assert peak["force_left"] == pytest.approx(sum(known) / len(known))
+    assert impulse["force_left"] == pytest.approx(sum(known) / len(known))
     assert {r["forces_check"] for r in kinetics.Kinetics.Check.to_dicts()} == {"kinetics_residual", "kinetics_scale"}
 
 
@@ -226,7 +229,7 @@ def test_forces_are_of_the_trials_that_the_index_pools(upright: None, tmp_path: 
     populate()
     n = {
         r["gdi_method"].split("-v")[0]: r["force_n"]
-        for r in (kinetics.Kinetics.Measure & {"force_measure": "vertical_peak_loading_bw"}).to_dicts()
+        for r in (kinetics.Kinetics.Measure & {"force_measure": "vertical_impulse_bw_s"}).to_dicts()
     }
     assert n.pop("paper-2025") > max(n.values()) > 0
     # A pace that is stated later pools another recording, and forces of it.
@@ -236,7 +239,29 @@ def test_forces_are_of_the_trials_that_the_index_pools(upright: None, tmp_path: 
     populate()
     own = load_visit({**VISIT, "gdi_method": default}).kinetics
     assert own is not None
-    assert own.measures["vertical_peak_loading_bw"].n > n[default]
+    assert own.measures["vertical_impulse_bw_s"].n > n[default]
+
+
+def test_the_frame_of_forces_has_a_row_per_measure_with_its_interval(walk: Path):
+    frame = frames.force_frame({"subject": "P001"}).set_index("force_measure")
+    assert set(frame.index) == set(MEASURES)
+    impulse, stored = frame.loc["vertical_impulse_bw_s"], found().measures["vertical_impulse_bw_s"]
+    assert (impulse["force_low"], impulse["force_high"]) == pytest.approx(stored.interval)
+    assert (impulse["subject"], impulse["kinetics_method"]) == ("P001", METHODS.find().key)
+    power = frame.loc["ankle_push_off_power_w_per_kg"]
+    assert power[["force_mean", "force_low", "force_high"]].isna().all()
+    assert power["force_missing"] == TOO_UNCERTAIN
+    assert len(frames.force_frame({"subject": "P002"})) == 0
+
+
+def test_a_method_of_forces_is_chosen_at_ingest(upright: None, tmp_path: Path):
+    video = chain.small_video(tmp_path, "walk")
+    asked = ("ingest", video, "--subject", "P001", "--session", "2026-01-10", "--kinetics-method")
+    assert pbl(*asked, "by-eye").error_code == "SOLVER_UNKNOWN"
+    params = {"family": "newton-euler", **METHODS.find().paramset.params, "samples": 3}
+    insert_methods(kinetics.KineticsMethod, [METHODS.of(Paramset("kinetics", "few", 1, params))])
+    assert pbl(*asked, "few").code == 0
+    assert kinetics.KineticsPlan.fetch1("kinetics_method") == "few-v1"
 
 
 def test_visits_of_before_get_forces_on_request(upright: None, tmp_path: Path):
@@ -262,7 +287,7 @@ def test_the_page_of_a_visit_shows_forces_in_both_languages(walk: Path):
     assert "1 BW is 686 N." in page
     assert page.count("over the gait cycle, in BW") == 3
     about = browser.get("/visits/1.json").json()["forces"]["found"]
-    peak = found().measures["vertical_peak_loading_bw"]
-    assert about["measures"]["vertical_peak_loading_bw"]["mean"] == pytest.approx(peak.mean)
+    impulse = found().measures["vertical_impulse_bw_s"]
+    assert about["measures"]["vertical_impulse_bw_s"]["mean"] == pytest.approx(impulse.mean)
     german = browser.get("/visits/1", headers={"accept-language": "de"}).text
     assert "Vertikale Kraft, Spitze der Lastübernahme" in german
