@@ -505,7 +505,7 @@ def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
     work()
     assert why(good).verdict == "everything is computed"
     assert {s.table for s in why(good).steps if s.what == "done"} >= {"VideoInfo", "SessionFit", "SessionQc"}
-    assert why(bad).verdict.startswith("VideoInfo failed (VIDEO_NOT_A_VIDEO")
+    assert why(bad).verdict.startswith("reading of the video failed (VIDEO_NOT_A_VIDEO")
     alike = chain.small_video(tmp_path, "two", people="two alike")
     (waiting,) = register(alike, session_label="2")
     work()
