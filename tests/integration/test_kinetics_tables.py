@@ -265,4 +265,4 @@ def test_the_page_of_a_visit_shows_forces_in_both_languages(walk: Path):
     peak = found().measures["vertical_peak_loading_bw"]
     assert about["measures"]["vertical_peak_loading_bw"]["mean"] == pytest.approx(peak.mean)
     german = browser.get("/visits/1", headers={"accept-language": "de"}).text
-    assert "Vertikale Kraft, Spitze der Lastübernahme" in german
+    assert "Vertikale Kraft, Spitze der Lastübernahme" in german.replace("\u00ad", "")

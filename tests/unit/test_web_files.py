@@ -119,6 +119,11 @@ def test_no_text_of_a_page_names_a_command():
 
 def test_words_of_the_library_are_marked_where_they_stay_english():
     assert texts.library("de", "Cadence") == "Kadenz"
+    reason = "walk1: no complete gait cycle; walk2: no complete gait cycle"  # of two recordings
+    assert (
+        texts.library("de", reason)
+        == "walk1: kein vollständiger Doppelschritt; walk2: kein vollständiger Doppelschritt"
+    )
     assert texts.library("en", "a < b") == "a &lt; b"
     assert texts.library("de", "a < b") == '<span lang="en">a &lt; b</span>'
 
