@@ -69,6 +69,8 @@ def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
     assert len(tracking.SubjectChoice()) == 0
     history = second.get("/visits/1").text
     assert history.index("B. Second") < history.index("A. First")
+    assert "NEEDS_CHOICE" not in history[history.index("Decisions") :]
+    assert "No one is chosen yet" in history
     listed = json.loads(pbl("list", "decisions", "--session", "2026-01-10", "--json").out)
     assert [(row["by"], row["what"], row["session_id"], json.loads(row["after"])) for row in listed] == [
         ("B. Second", "person", 1, {"person": 1}),
@@ -184,6 +186,7 @@ def test_a_warning_is_accepted_with_a_name_until_it_is_computed_anew(warned: dic
     assert accept(web.client(name="B. Second"), warned).status_code == 303  # accepted already
     page = browser.get("/visits/1").text
     assert "accepted by A. First" in page
+    assert re.search(r"<td>attention\s*</td><td>accepted\s*</td>", page)
     assert "&lt;b&gt;looked at the overlay" in page
     (row,) = Decision().to_dicts()
     assert (row["session_id"], row["video_id"], row["decision_before"]) == (1, None, {"outcome": "WARN"})
