@@ -501,7 +501,7 @@ def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
     good, bad = register(*videos(tmp_path, "walk"), tmp_path / "bad.mp4")
     assert "not queued" in why(good).verdict
     refresh.refresh()
-    assert why(good).verdict.startswith("VideoInfo waits for a worker")
+    assert why(good).verdict.startswith("reading of the video waits for a worker")
     work()
     assert why(good).verdict == "everything is computed"
     assert {s.table for s in why(good).steps if s.what == "done"} >= {"VideoInfo", "SessionFit", "SessionQc"}
