@@ -1,5 +1,5 @@
-"""What every form over the stored values of a visit does: checks of its fields, that nothing else was stored meanwhile,
-and which values are others."""
+"""Checks of every form over the stored values of a visit: its fields, whether something else was stored meanwhile, and
+which values differ."""
 
 from __future__ import annotations
 
