@@ -5,6 +5,24 @@ from __future__ import annotations
 import functools
 import math
 
+#: Computed tables, in the order of the chain -> what is computed, for people who know no table.
+STAGES = {
+    "VideoInfo": "reading of the video",
+    "Tracking": "search for people",
+    "SubjectChoice": "choice of the person",
+    "Keypoints": "detection of body points",
+    "TrialInput": "preparation of the recording",
+    "SessionFit": "fit of the body",
+    "GaitEvents": "detection of gait events",
+    "GaitCycle": "division into gait cycles",
+    "Spatiotemporal": "measures of the recording",
+    "GDI": "index of the recording",
+    "SessionGdi": "measures and index of the visit",
+    "SessionQc": "quality checks of the visit",
+    "Kinetics": "forces and joint moments",
+    "KinematicError": "comparison with a reference",
+    "Deidentified": "copy with hidden heads",
+}
 #: Ends of the names of measures and their units, longer ones before those that they end with.
 _UNITS = (
     ("_nm_per_kg", "Nm/kg"),

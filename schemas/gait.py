@@ -13,6 +13,7 @@ from .checks import check_columns, check_row, check_values
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .review import Decision
 from .rows import Rows, number, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
@@ -104,6 +105,19 @@ def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
         args=(*of_trial.values(), *measured_person(key)),
     ).fetchone()
     return None if row is None or row[1] else {**of_trial, "correction_no": int(row[0])}
+
+
+def accepted_cadence(key: Mapping[str, Any]) -> float | None:
+    """Return the cadence (steps/min) of a trial (key of GaitEvents) that a person accepted last; None where no one did.
+
+    `decisions.review_decisions.accept_check` writes it. Call it after `correction_of`, which waits for a decision that
+    is being written.
+    """
+    of_trial = {k: key[k] for k in ("fit_set", "fit_method", "gait_method")}
+    found = Decision & {"session_id": fit.session_of_set(key), "decision_what": "check"}
+    decided = [r["decision_about"] for r in found.to_dicts(order_by="decision_id DESC")]
+    cadences = [about.get("cadence", {}) for about in decided if of_trial.items() <= about.items()]
+    return next((float(of[video]) for of in cadences if (video := str(key["video_id"])) in of), None)
 
 
 def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -253,7 +267,8 @@ class GaitCycle(dj.Computed):
     def make_fetch(self, key: dict) -> tuple:
         correction = correction_of(key)
         events = events_of(one(GaitEvents & key), correction)
-        return events, file_ref(one(fit.SessionFit.Trial & key, "trial_file")), fit.fit_checks(key), correction
+        ref = file_ref(one(fit.SessionFit.Trial & key, "trial_file"))
+        return events, ref, fit.fit_checks(key), correction, accepted_cadence(key)
 
     @computes
     def make_compute(
@@ -263,14 +278,17 @@ class GaitCycle(dj.Computed):
         ref: dict,
         checks: Sequence[tuple],
         correction: Mapping[str, Any] | None,
+        accepted: float | None,
     ) -> tuple[tuple[lib.GaitCycle, ...], int | None]:
         from pbl_pipeline.fit import TrialFit
-        from pbl_pipeline.gait import find_cycles
+        from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
         from pbl_pipeline.qc import Check
 
         with stored_file(ref) as path:
             trial = TrialFit.load(path)
         cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
+        if accepted is not None and refused_cadence(cycles) == accepted:
+            cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
 
     def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:

@@ -146,8 +146,7 @@ def check_score(value: Any, instrument: Mapping[str, Any], key: object = None) -
         "SCORE_RANGE",
         found=f"{instrument['instrument']} of {value!r}",
         expected=f"{kind}{' of ' if bounds else ''}{bounds} {instrument['instrument_unit']}".rstrip(),
-        next_step="correct the score at its source; leave out one that was not taken. The ranges are the rows of "
-        "ClinicalInstrument",
+        next_step="correct the score at its source; leave out one that was not taken",
         key=key,
     )
 

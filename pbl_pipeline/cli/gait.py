@@ -33,6 +33,11 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
     help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file, "
     "else by --method).",
 )
+@click.option(
+    "--accept-cadence",
+    is_flag=True,
+    help="Also measure recordings whose cadence is unusual (below 60 or over 150 steps/min): you counted the steps.",
+)
 @MASS
 def gait(
     files: tuple[Path, ...],
@@ -41,6 +46,7 @@ def gait(
     norm: str | None,
     method: str,
     event_files: tuple[Path, ...],
+    accept_cadence: bool,
     mass_kg: float | None,
 ) -> None:
     """Events, cycles, spatiotemporal measures and GDI of one session.
@@ -78,7 +84,8 @@ def gait(
         visit = visit_of_fits(files, measures=False)
         fits = [r.fit for r in visit.fitted if r.fit is not None]
         of_fit = visit.fit_checks
-        metrics = gait_metrics(fits, norm, params, of_fit, model=index).with_checks(of_fit)
+        metrics = gait_metrics(fits, norm, params, of_fit, model=index, accept_cadence=accept_cadence)
+        metrics = metrics.with_checks(of_fit)
         save_beside(metrics.trials, files, out)
         if all(path.resolve().parent == out.resolve().parent for path in files):
             known = load_kinetics(out.parent, [])

@@ -10,7 +10,7 @@ from ._camera_side import camera_side, mostly
 from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
 from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
 from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles
-from ._exclusion import Exclusion
+from ._exclusion import CADENCE, Exclusion
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -74,5 +74,6 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .outliers import refused_cadence, with_cadence_accepted
 from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, task_motion
 from .types import GaitCycle, Lengths

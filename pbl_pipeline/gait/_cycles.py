@@ -19,7 +19,7 @@ from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
-from .outliers import without_missed_steps, without_odd_curves
+from .outliers import without_missed_steps, without_odd_curves, without_unusual_cadence
 from .types import NO_POSITIONS, GaitCycle, Lengths
 
 if TYPE_CHECKING:
@@ -61,7 +61,8 @@ def find_cycles(
     `series` and `feet` stand for the fit's angles and feet where there is none (a laboratory's recording; positions in
     metres in a world that stands still).
 
-    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`).
+    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Of a
+    fit none is used either where the cadence is unusual for walking (`with_cadence_accepted` takes that back).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
@@ -120,6 +121,8 @@ def find_cycles(
     cycles = without_odd_curves(without_missed_steps(where_feet_stand(cycles, slides), feet))
     if checks := failed(fit_checks):
         cycles = [dataclasses.replace(c, exclusion=Exclusion(failed_checks=checks)) for c in cycles]
+    elif fit is not None:
+        cycles = without_unusual_cadence(cycles)
     cycles.sort(key=lambda c: c.start_s)
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+#: Name of the check that leaves out all cycles of a recording until a person accepts it.
+CADENCE = "cadence_plausible"
+
 
 @dataclasses.dataclass(frozen=True)
 class Exclusion:
@@ -12,7 +15,7 @@ class Exclusion:
     `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
     the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known,
     so that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the `n_curves` cycles
-    of its side, where that is far. `failed_checks`: checks of the fit that FAIL.
+    of its side, where that is far. `failed_checks`: checks of the fit that FAIL, or `CADENCE`.
     """
 
     first_step: bool = False
@@ -29,7 +32,9 @@ class Exclusion:
 
     @property
     def text(self) -> str:
-        """The reasons in words, empty where there is none. A fit that failed is reason enough."""
+        """The reasons in words, empty where there is none. A check that failed is reason enough."""
+        if CADENCE in self.failed_checks:
+            return "the cadence is unusual for walking, and no one has accepted it"
         if self.failed_checks:
             return f"the fit failed its check {', '.join(self.failed_checks)}"
         reasons = ["first step of the bout"] if self.first_step else []

@@ -466,7 +466,7 @@ def _model_of(norm: NormativeSet, model: str | None) -> str:
 
 
 def _too_few(cycles: Sequence[GaitCycle], n_left: int, n_right: int, params: GdiParams) -> str:
-    if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
+    if failed := next((c.excluded for c in cycles if c.check_failed), ""):
         return failed
     text = (
         f"the GDI needs {2 * params.min_cycles_per_side} complete gait cycles with curves, "

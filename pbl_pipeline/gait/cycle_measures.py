@@ -42,6 +42,8 @@ SIDED = (
     "single_support_percent",
     "step_length_m",
 )
+#: Cadences (steps/min) that are usual for walking.
+CADENCE_PER_MIN = (60.0, 150.0)
 #: Key of `Spatiotemporal.reasons` that says why the measures have no spread.
 SPREAD = "spread"
 NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
@@ -175,6 +177,12 @@ def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
     return mostly(np.array([c.far_leg for c in cycles if c.used]))
 
 
+def unusual_bound(cadence_per_min: float) -> float | None:
+    """Return which of the bounds `CADENCE_PER_MIN` a cadence is beyond; None where it is usual for walking."""
+    low, high = CADENCE_PER_MIN
+    return low if cadence_per_min < low else high if cadence_per_min > high else None
+
+
 def cycle_measures(c: GaitCycle) -> dict[str, float]:
     """The measures of one cycle by name (`MEASURES`) but its step times, which belong to two cycles; those that are not
     known are left out."""
@@ -203,7 +211,7 @@ def cycle_measures(c: GaitCycle) -> dict[str, float]:
 def _none_used(cycles: Sequence[GaitCycle]) -> str:
     if not cycles:
         return "no complete gait cycle"
-    if failed := next((c.excluded for c in cycles if c.fit_failed), ""):
+    if failed := next((c.excluded for c in cycles if c.check_failed), ""):
         return failed
     found = "only one gait cycle" if len(cycles) == 1 else f"{len(cycles)} gait cycles"
     odd = ", and so are strides of odd length" if any(c.odd_length for c in cycles) else ""

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, Check, in_session, warn_if, worst
+from pbl_pipeline.qc import EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
 from ._condition import Condition
 from ._cycles import find_cycles
+from ._exclusion import CADENCE
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -30,12 +31,22 @@ from ._gdi import (
     score_gdi,
     worth_of_one_more,
 )
-from .cycle_measures import LENGTHS, MEASURES, Z90, Spatiotemporal, far_leg_of, spatiotemporal
+from .cycle_measures import (
+    CADENCE_PER_MIN,
+    LENGTHS,
+    MEASURES,
+    Z90,
+    Spatiotemporal,
+    far_leg_of,
+    spatiotemporal,
+    unusual_bound,
+)
 from .events import METHODS, GaitEvents, detect_events
 from .laboratory import LabTrial
 from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
+from .outliers import refused_cadence, with_cadence_accepted
 from .tasks import TASK_MEASURES, task_measures, task_motion
 from .types import GaitCycle
 
@@ -187,12 +198,14 @@ def gait_metrics(
     model: Method[GdiParams] | str | None = None,
     version: int | None = None,
     conditions: Sequence[Condition] | None = None,
+    accept_cadence: bool = False,
 ) -> GaitMetrics:
     """Measures of the trials of one session and of the session: events, cycles and measures of each trial, then
     `pool_trials`.
 
     Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
-    those of `score_gdi`, `conditions` those of `pool_trials`.
+    those of `score_gdi`, `conditions` those of `pool_trials`. `accept_cadence`: a person counted the
+    steps of trials whose cadence is unusual (`find_cycles`).
 
     A trial without walking has status EMPTY and takes no part in the session. Where one of `fit_checks`, the checks of
     the session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError`
@@ -207,7 +220,9 @@ def gait_metrics(
     index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
     given = [Condition()] * len(trials) if conditions is None else conditions
     done = tuple(
-        dataclasses.replace(_trial(t, params.events, index, fit_checks, c), pooled=c.pooled(params.gdi.pace))
+        dataclasses.replace(
+            _trial(t, params.events, index, fit_checks, c, accept_cadence), pooled=c.pooled(params.gdi.pace)
+        )
         for t, c in zip(trials, given, strict=True)
     )
     return GaitMetrics(**vars(pool_trials(done, basis, params, model, version, given)), trials=done)
@@ -283,6 +298,7 @@ def _trial(
     index: dict[str, Any],
     fit_checks: Sequence[Check],
     condition: Condition,
+    accept_cadence: bool,
 ) -> TrialMetrics:
     task: tuple[dict[str, Any], dict[str, str]] = {}, {}
     if isinstance(trial, LabTrial):
@@ -291,6 +307,8 @@ def _trial(
     else:
         poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
+        if accept_cadence:
+            cycles = with_cadence_accepted(cycles)
         if condition.activity in TASK_MEASURES:
             task = task_measures(task_motion(trial, poses), condition.activity, fit_checks)
     measures, gdi = spatiotemporal(cycles).with_task(*task), score_gdi(cycles, **index)
@@ -328,8 +346,9 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
     unlike = sum(c.odd_curves for c in cycles)
     far_off = "their angles are far from those of the other cycles: left out of the measures, see the overlay"
     curves = warn_if(unlike, "cycles_of_odd_curves", float(unlike), 0.0, far_off)
+    cadence = _cadence_check(measures, cycles)
     if measures.status == EMPTY:
-        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()))
+        return (Check("cycles_used", EMPTY, 0.0, 1.0, measures.reason), *((lengths,) if odd else ()), *cadence)
     n = measures.n_cycles_used
     few = "few cycles: film a longer stretch, or several passes"
     checks = [warn_if(n < 4, "cycles_used", float(n), 4.0, few), lengths, curves]
@@ -341,12 +360,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
             "not to be compared. Film a pass in each direction"
         )
         checks.append(warn_if(far, "legs_seen_alike", None, None, advice))
-    cadence = measures["cadence_steps_per_min"]
-    if cadence is not None:
-        odd_one = not 60.0 <= cadence.mean <= 150.0
-        bound = 60.0 if cadence.mean < 60.0 else 150.0
-        advice = "unusual for walking: count the steps in the overlay"
-        checks.append(warn_if(odd_one, "cadence_plausible", round(cadence.mean, 2), bound, advice))
+    checks += cadence
     if measures["stride_length_m"] is not None:
         guessed = any(c.used and c.lengths.stride_length_m is not None and not c.lengths.metric for c in cycles)
         advice = (
@@ -355,6 +369,22 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
         )
         checks.append(warn_if(guessed, "lengths_scale", None, None, advice))
     return tuple(checks)
+
+
+def _cadence_check(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
+    """Return `CADENCE` as a tuple: FAIL where cycles are left out for it, empty where no cadence is known."""
+    if (refused := refused_cadence(cycles)) is not None:
+        advice = (
+            "unusual for walking, so that measures and index are withheld: count the steps in the overlay; where they "
+            "are right, accept it with a reason"
+        )
+        return (Check(CADENCE, FAIL, refused, unusual_bound(refused), advice),)
+    cadence = measures["cadence_steps_per_min"]
+    if cadence is None:
+        return ()
+    bound = unusual_bound(cadence.mean)
+    advice = "unusual for walking: count the steps in the overlay"
+    return (warn_if(bound, CADENCE, round(cadence.mean, 2), bound or CADENCE_PER_MIN[1], advice),)
 
 
 def _odd_lengths(cycles: Sequence[GaitCycle]) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ._exclusion import CADENCE, Exclusion
+from .cycle_measures import unusual_bound
 from .motion import FootTrajectories
 from .types import GaitCycle
 
@@ -92,6 +94,27 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
             if distance > limit:
                 out[i] = not_used(out[i], curve_distance_deg=float(distance), n_curves=len(chosen))
     return out
+
+
+def without_unusual_cadence(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
+    """Return the cycles of a recording, none used where their mean cadence is unusual for walking: steps counted twice
+    or missed, or left and right that the detector exchanged at each step, make every measure another one."""
+    own = [120.0 / c.stride_time_s for c in cycles if c.used]
+    if not own or unusual_bound(float(np.mean(own))) is None:
+        return list(cycles)
+    return [not_used(c, failed_checks=(CADENCE,)) for c in cycles]
+
+
+def refused_cadence(cycles: Sequence[GaitCycle]) -> float | None:
+    """Return the mean cadence (steps/min, to 0.01) of the cycles that `without_unusual_cadence` left out; None where it
+    left out none."""
+    own = [120.0 / c.stride_time_s for c in cycles if c.exclusion == Exclusion(failed_checks=(CADENCE,))]
+    return round(float(np.mean(own)), 2) if own else None
+
+
+def with_cadence_accepted(cycles: Sequence[GaitCycle]) -> tuple[GaitCycle, ...]:
+    """Return the cycles, those used again that only `without_unusual_cadence` left out: a person counted the steps."""
+    return tuple(not_used(c, failed_checks=()) if CADENCE in c.exclusion.failed_checks else c for c in cycles)
 
 
 def not_used(cycle: GaitCycle, **reasons: Any) -> GaitCycle:

@@ -38,7 +38,7 @@ class GaitCycle:
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
     `used` is False for the cycles that touch the first or last step of their walking bout, for those that are far
     longer or shorter than the others and not one stride (`odd_length`) or whose curves are far from the others'
-    (`odd_curves`), and for all of a fit that failed; `exclusion` says why, `excluded` in words.
+    (`odd_curves`), and for all of a recording of which a check failed; `exclusion` says why, `excluded` in words.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
     no fit or frames are missing (`curves_missing` says which); `curves_sd` maps them to their standard deviation (deg),
     where it is known. `angle_model` says how the angles are defined.
@@ -86,8 +86,8 @@ class GaitCycle:
         return self.exclusion.curve_distance_deg is not None
 
     @property
-    def fit_failed(self) -> bool:
-        """Whether the cycle is left out because the fit failed."""
+    def check_failed(self) -> bool:
+        """Whether the cycle is left out because a check of its recording failed."""
         return bool(self.exclusion.failed_checks)
 
     @property

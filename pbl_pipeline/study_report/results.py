@@ -47,14 +47,12 @@ COLUMNS = {
 class CurveResult:
     """A comparison of mean curves of an angle."""
 
-    #: What and between whom; "change" or two names.
-    angle: str
-    comparison: str
+    angle: str  # name
+    comparison: str  # between whom: "change", or two names
     test: CurveTest | PblError  # the test, or why there is none
     left_out: int  # persons whose curves have unknown points
-    #: (N, 101), (M, 101) curves of the persons tested; of "change" a is after and b before.
-    a: np.ndarray
-    b: np.ndarray
+    a: np.ndarray  # (N, 101) curves of the persons tested; of "change" those after
+    b: np.ndarray  # (M, 101) likewise; of "change" those before
     names: tuple[str, str]  # of a and b
 
 

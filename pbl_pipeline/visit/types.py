@@ -41,22 +41,19 @@ class Recording:
 
     name: str  # of its files: the video's name without its ending, distinct within the visit
     path: Path | None = None  # the video; None where it is not known (results alone, markers of a laboratory)
-    #: Facts of the video; the choice of the person who is measured.
-    video: VideoInfo | None = None
-    choice: SubjectChoice | None = None
+    video: VideoInfo | None = None  # facts of the video
+    choice: SubjectChoice | None = None  # of the person who is measured
     condition: Condition = dataclasses.field(default_factory=Condition)  # activity and pace
-    #: Gait events and cycles; those of `measured` where there is one.
-    events: GaitEvents | None = None
-    cycles: tuple[GaitCycle, ...] = ()
+    events: GaitEvents | None = None  # those of `measured` where there is one
+    cycles: tuple[GaitCycle, ...] = ()  # likewise
     measured: TrialMetrics | None = None  # all of the gait: events, cycles, measures and index
     problem: str = ""  # why there is no fit, in a sentence; empty where there is one
     shown: Path | None = None  # the recording whose pictures may be shown: `path`, or a copy with hidden heads
     markers: MarkerSet | None = None  # the marker table of the fit, where the lab has its own
     number: int | None = None  # in the tables the `video_id`
-    #: Load the arrays when they are asked for; None where there are none.
-    load_keypoints: Callable[[], Keypoints | None] | None = None
-    load_fit: Callable[[], TrialFit] | None = None
-    load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None
+    load_keypoints: Callable[[], Keypoints | None] | None = None  # loads `keypoints`; None where there are none
+    load_fit: Callable[[], TrialFit] | None = None  # loads `fit`; None where there is none
+    load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None  # loads `log`; None where there is none
 
     @classmethod
     def of(cls, name: str, fit: TrialFit | None = None, keypoints: Keypoints | None = None, **fields: Any) -> Recording:
@@ -135,15 +132,12 @@ class Visit:
     """A visit: whose, when, by which methods, and what was computed."""
 
     recordings: tuple[Recording, ...]  # in the order of the fit, those without a fit after them
-    #: How the body was fitted and how well; None where the chain ended before. The trials of `measures` are the fitted
-    #: recordings in their order.
-    solution: Solution | None = None
-    fit_checks: tuple[Check, ...] = ()
-    measures: GaitMetrics | None = None
-    #: Code of the person (never a name), label and day of the visit (YYYY-MM-DD, empty where unknown).
-    subject: str = "-"
-    label: str = ""
-    date: str = ""
+    solution: Solution | None = None  # how the body was fitted; None where the chain ended before
+    fit_checks: tuple[Check, ...] = ()  # how well it was fitted
+    measures: GaitMetrics | None = None  # its trials are the fitted recordings in their order
+    subject: str = "-"  # code of the person, never a name
+    label: str = ""  # of the visit
+    date: str = ""  # of the visit, YYYY-MM-DD; empty where unknown
     kind: str = "single"  # "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's)
     #: Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)

@@ -10,15 +10,18 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import UNUSABLE
 
-from .. import fit, qc, tracking, video
+from .. import fit, gait, qc, tracking, video
 from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
 from ..review import Decision
-from ..rows import utc_now
+from ..rows import delete_below, utc_now
 from ..transactions import next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
+
+#: The check that can be accepted although it failed (`pbl_pipeline.gait.CADENCE`).
+CADENCE = "cadence_plausible"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,9 +181,11 @@ def _said(mark: Unusable | None) -> dict[str, str]:
 
 @repeated
 def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> None:
-    """Accept a check of a visit that asks for attention, with one's name and a reason; nothing is computed anew.
+    """Accept a check of a visit that asks for attention, with one's name and a reason.
 
     It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
+    An unusual cadence is accepted although it failed: the cycles that it left out are deleted with what was computed
+    from them, and the next populate uses them; it holds while the recordings have this cadence.
 
     Raises `PblError` DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without
     a reason or with one of more than 500 characters.
@@ -212,34 +217,63 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
                 next_step="load the page again: it may have been computed anew",
                 key=f"session_id={session_id}",
             )
-        if rows[0]["qc_check_outcome"] != "WARN":
+        outcome, check = rows[0]["qc_check_outcome"], rows[0]["qc_check"]
+        if not may_be_accepted(check, outcome):
             raise PblError(
                 "USAGE",
-                found=f"{rows[0]['qc_check']} is {rows[0]['qc_check_outcome']}",
+                found=f"{check} is {outcome}",
                 expected="a check that asks for attention (WARN)",
                 next_step="what failed is not accepted: it is recorded or computed again",
                 key=f"session_id={session_id}",
             )
         if number in accepted(key):
             return
-        about = {**key, "computed": str(rows[0]["qc_computed"]), "qc_no": number, "check": rows[0]["qc_check"]}
-        after = {"outcome": "accepted"}
-        record("check", by, about, {"outcome": "WARN"}, after, reason, session_id=session_id)
+        about = {**key, "computed": str(rows[0]["qc_computed"]), "qc_no": number, "check": check}
+        refused = _refused_cadences(key) if outcome == "FAIL" else {}
+        if refused:
+            about["cadence"] = {str(trial["video_id"]): cadence for trial, cadence in refused}
+        record("check", by, about, {"outcome": outcome}, {"outcome": "accepted"}, reason, session_id=session_id)
+        delete_below(gait.GaitCycle, [trial for trial, _ in refused])
+
+
+def may_be_accepted(check: str, outcome: str) -> bool:
+    """Return whether a person can accept a check: one that asks for attention, and an unusual cadence."""
+    return outcome == "WARN" or (outcome, check) == ("FAIL", CADENCE)
+
+
+def _refused_cadences(key: Mapping[str, Any]) -> list[tuple[dict[str, Any], float]]:
+    """Return the trials of a result (keys of GaitCycle) whose cycles are left out for their cadence, and that
+    cadence (steps/min)."""
+    from pbl_pipeline.gait import refused_cadence
+
+    of_result = {k: key[k] for k in gait.GaitCycle.primary_key if k in key}
+    found = []
+    for trial in (gait.GaitCycle & of_result).proj().to_dicts():
+        cycles = [gait.cycle_of_row(r, "") for r in (gait.GaitCycle.Cycle & trial).to_dicts(order_by="cycle_no")]
+        if (cadence := refused_cadence(cycles)) is not None:
+            found.append((trial, cadence))
+    return found
 
 
 def accepted(key: Mapping[str, Any]) -> dict[int, Decided]:
     """Checks of a result (key of SessionQc) that were accepted since it was computed, by `qc_no`."""
     key = {k: key[k] for k in qc.SessionQc.primary_key}
-    rows = (qc.SessionQc.proj("qc_computed") * fit.FitSet.proj("session_id") & key).to_dicts()
+    checks = qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") * fit.FitSet.proj("session_id")
+    rows = (checks & key & {"qc_check_outcome": "WARN"}).to_dicts()
     if not rows:
         return {}
-    of_result = {**key, "computed": str(rows[0]["qc_computed"])}
     found = (Decision & {"session_id": rows[0]["session_id"], "decision_what": "check"}).to_dicts()
-    return {
-        int(row["decision_about"]["qc_no"]): _decided(row)
-        for row in found
-        if all(row["decision_about"].get(k) == v for k, v in of_result.items())
-    }
+    own = [d for d in found if key.items() <= d["decision_about"].items()]
+    return {int(row["qc_no"]): _decided(d) for row in rows for d in own if is_accepted(row, d["decision_about"])}
+
+
+def is_accepted(row: Mapping[str, Any], about: Mapping[str, Any]) -> bool:
+    """Return whether a check that asks for attention (row of SessionQc.Check with `qc_computed`) is the one that a
+    decision about the same result accepted. An unusual cadence that does not fail was accepted, also before the checks
+    were computed."""
+    if CADENCE == row["qc_check"] == about["check"] and "cadence" in about:
+        return True
+    return (str(row["qc_computed"]), int(row["qc_no"])) == (about["computed"], int(about["qc_no"]))
 
 
 def record(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:

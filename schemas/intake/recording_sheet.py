@@ -68,13 +68,14 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
         with line.about():  # the file also of a row that is refused: all that is wrong is found at once
             one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
             one.read()
+            sha256, file = one.files[0].sha256, row.cells["file"]
+            if (first := seen.setdefault(sha256, row.where)) != row.where:
+                error = conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
+                line.errors.append(error.with_key(line.where))
             if visit is None or line.errors:
                 one.complete(chosen)
                 continue
             _check_day(one, line)
-            sha256, file = one.files[0].sha256, row.cells["file"]
-            if (first := seen.setdefault(sha256, row.where)) != row.where:
-                raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
             if known := registered(one.files):
                 _check_place(one, known)
                 line.kept = f"{file}: video_id {known[sha256]['video_id']}: registered already, left as it is"
@@ -176,23 +177,25 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
         if visit is None:
             continue
         key, whose = (visit.subject, visit.session_label), f"{visit.subject}, {visit.session_label}"
-        with line.about():
-            if others := similar.get(visit.subject):
-                raise conflict(
-                    f"the codes {visit.subject} and {', '.join(others)}",
-                    "one code for one person, or codes that differ by more than case, zeros and hyphens",
-                    "write the same code",
-                )
-            if visit.date is not None and dates.get(key) not in (None, visit.date):
-                raise conflict(
-                    f"date {visit.date} of {whose}, registered with {dates[key]}",
-                    "one day for one visit",
-                    "two visits need two labels; a wrong day is corrected by `pbl study import`",
-                )
-            for what in ("date", "population", "project", "height_m", "mass_kg"):
-                value = getattr(visit, what)
-                if value is not None:
-                    of = (*key, what) if what in ("date", "mass_kg") else (visit.subject, what)
+        if others := similar.get(visit.subject):
+            error = conflict(
+                f"the codes {visit.subject} and {', '.join(others)}",
+                "one code for one person, or codes that differ by more than case, zeros and hyphens",
+                "write the same code",
+            )
+            line.errors.append(error.with_key(line.where))
+        if visit.date is not None and dates.get(key) not in (None, visit.date):
+            error = conflict(
+                f"date {visit.date} of {whose}, registered with {dates[key]}",
+                "one day for one visit",
+                "two visits need two labels; a wrong day is corrected by `pbl study import`",
+            )
+            line.errors.append(error.with_key(line.where))
+        for what in ("date", "population", "project", "height_m", "mass_kg"):
+            value = getattr(visit, what)
+            if value is not None:
+                of = (*key, what) if what in ("date", "mass_kg") else (visit.subject, what)
+                with line.about():
                     check_same(first.setdefault(of, value), value, what, whose, _ONE_VISIT)
 
 

@@ -51,13 +51,13 @@ class VisitRecord:
         """Raise `PblError` USAGE for a code that could be a name or a label too long; FIT_INPUT for height or mass."""
         check_subject(self.subject, "pass such a code with --subject", key)
         for what, text, longest in (
-            ("session", self.session_label, 64),
+            ("visit", self.session_label, 64),
             ("project", self.project, 32),
             ("activity", self.activity, 32),
             ("pace", self.pace, 32),
             ("population", self.population, 32),
         ):
-            check_label(f"--{what}", text or "", longest)
+            check_label(what, text or "", longest)
         check_height(self.height_m)
         check_mass(self.mass_kg)
 

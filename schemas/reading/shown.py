@@ -13,6 +13,7 @@ from pbl_pipeline.words import NOT_COMPUTED
 
 from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
+from ..decisions.review_decisions import may_be_accepted
 from . import registered
 from .visit_list import Result, VisitRow, results_of, visits_of
 from .visits import load_recording, load_visit
@@ -31,6 +32,11 @@ class ShownCheck:
     number: int  # of its row (`qc_no`), by which it is accepted
     check: Check
     recording: int | None  # number of the recording that it is about; None: the visit
+
+    @property
+    def may_be_accepted(self) -> bool:
+        """Whether a person can accept it (`review_decisions.may_be_accepted`)."""
+        return may_be_accepted(self.check.check, self.check.outcome)
 
 
 @dataclasses.dataclass(frozen=True)

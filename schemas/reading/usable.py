@@ -53,7 +53,8 @@ def usable(video_id: int) -> Usable:
     if cycles is None and not found.waits:  # it failed after its keypoints
         return Usable(UNUSABLE, (*said, found.verdict))
     if cycles is not None and not any(cycles):
-        return Usable(UNUSABLE, said, cycles)
+        reasons = (gait.Spatiotemporal & key).to_arrays("measures_reason")
+        return Usable(UNUSABLE, tuple(dict.fromkeys((*map(str, reasons), *said))), cycles)
     return Usable(REMARKS if said else USABLE, said, cycles)
 
 

@@ -19,6 +19,7 @@ from pbl_pipeline.filming import VIEW, Difference, Filming, differences
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..datajoint_setup import dj
+from ..decisions.review_decisions import CADENCE, is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision
@@ -79,7 +80,7 @@ class Result:
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
 #: and index are others.
-DOUBTS = frozenset({"cadence_plausible"})
+DOUBTS = frozenset({CADENCE})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,18 +298,16 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
     """Checks that ask for attention and that nobody accepted, by the key of a result of these visits of which somebody
     accepted one since it was computed."""
-    accepted: dict[tuple[str, ...], set[int]] = {}
+    accepted: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
         about = row["decision_about"]
-        of = tuple(str(about[k]) for k in (*_RESULT, "computed"))
-        accepted.setdefault(of, set()).add(int(about["qc_no"]))
+        accepted.setdefault(tuple(str(about[k]) for k in _RESULT), []).append(about)
     found: dict[tuple[str, ...], set[str]] = {}
-    for of, numbers in accepted.items():
-        key = {**dict(zip(_RESULT, of, strict=False)), "qc_computed": of[-1]}
-        checks = qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & key & {"qc_check_outcome": "WARN"}
-        rows = checks.to_dicts()
-        if rows:
-            found[of[:-1]] = {r["qc_check"] for r in rows if int(r["qc_no"]) not in numbers}
+    for of, decided in accepted.items():
+        key = {**dict(zip(_RESULT, of, strict=True)), "qc_check_outcome": "WARN"}
+        rows = (qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & key).to_dicts()
+        if any(is_accepted(r, about) for r in rows for about in decided):
+            found[of] = {r["qc_check"] for r in rows if not any(is_accepted(r, about) for about in decided)}
     return found
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from pbl_pipeline.words import STAGES
+
 from .. import computed_tables, fit, tracking, video
 from ..chain import ON_REQUEST, before, followers
 from ..decisions.not_usable import unusable
@@ -122,7 +124,9 @@ def _method(row: dict[str, Any], table: Any) -> str:
 def _verdict(steps: list[Step], in_a_set: bool) -> str:
     go_on = {t.__name__ for t in computed_tables() if followers(t)}
     for step in steps:
-        stage = step.table if step.camera is None else f"{step.table} of its camera, video_id {step.camera},"
+        stage = STAGES.get(step.table, step.table)  # a laboratory adds tables
+        if step.camera is not None:
+            stage += f" of its camera, video_id {step.camera},"
         if step.what == ERROR:
             return f"{stage} failed ({step.note}); next: {step.next_step}, then pbl retry"
         if step.next_step:

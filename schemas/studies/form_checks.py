@@ -1,12 +1,15 @@
-"""Checks of every form over the stored values of a visit: its fields, and that nothing else was stored meanwhile."""
+"""Checks of every form over the stored values of a visit: its fields, whether something else was stored meanwhile, and
+which values differ."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
+from typing import Any
 
 from pbl_pipeline.errors import PblError
 
 from ..decisions.review_decisions import Decided, decisions
+from ..intake.sheets import Row, number_of
 
 
 def check_fields(session_id: int, given: Iterable[str], known: Collection[str], expected: str) -> None:
@@ -36,3 +39,18 @@ def decided_meanwhile(session_id: int, last: Decided | None, did: str) -> PblErr
         next_step="load the form again, look at what is stored, and enter then",
         key=f"session_id={session_id}",
     )
+
+
+def is_stored(text: str, stored: str, numeric: bool) -> bool:
+    """Return whether a text is what is stored, of a number also written otherwise: 1,80 or 1.80 for 1.8."""
+    if text == stored or not (numeric and text and stored):
+        return text == stored
+    try:
+        return number_of(Row("", {}), "", text) == float(stored)
+    except PblError:
+        return False
+
+
+def stored_value(text: str, numeric: bool) -> Any:
+    """Return what is stored of a field, None where there is nothing."""
+    return number_of(Row("", {}), "", text) if text and numeric else text or None

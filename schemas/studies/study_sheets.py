@@ -194,8 +194,13 @@ class _Plan:
         code = needed(row, "subject")
         stated = self.people.setdefault(code, _Stated(row, {}))
         if population := row.cells.get("population"):
-            check_same(stated.values.setdefault("population", population), population, "population", code)
+            self._same(row, stated, "population", population, "population", code)
         return code
+
+    def _same(self, row: Row, stated: _Stated, name: str, value: Any, what: str, whose: str) -> None:
+        """State a value; another one that was stated before is an error of the row, whose rest is read all the same."""
+        with self._line(row).about():
+            check_same(stated.values.setdefault(name, value), value, what, whose)
 
     def _session(self, row: Row, code: str) -> tuple[str, str]:
         label = needed(row, "visit")
@@ -203,8 +208,9 @@ class _Plan:
         day = day_of(label)
         if "date" in row.cells:
             date = date_of(row, "date")
-            check_same(day or date, date, "date of the visit", f"{code}, {label}")
-            check_same(stated.values.setdefault("session_date", date), date, "date of the visit", f"{code}, {label}")
+            with self._line(row).about():
+                check_same(day or date, date, "date of the visit", f"{code}, {label}")
+            self._same(row, stated, "session_date", date, "date of the visit", f"{code}, {label}")
         return code, label
 
     def _visit(self, row: Row) -> None:
@@ -219,29 +225,35 @@ class _Plan:
             return
         key = self._session(row, code)
         if stated:
-            if key in self.visits:
-                raise conflict(
-                    f"visit {key[1]} of {code} also in {self.visits[key].row.where}",
-                    "one row for each visit of a person",
-                    "remove one, or correct its label",
-                )
-            self.visits[key] = _Stated(row, {VISIT_COLUMNS[c]: _visit_value(row, c) for c in stated})
+            with self._line(row).about():
+                if key in self.visits:
+                    raise conflict(
+                        f"visit {key[1]} of {code} also in {self.visits[key].row.where}",
+                        "one row for each visit of a person",
+                        "remove one, or correct its label",
+                    )
+                self.visits[key] = _Stated(row, {VISIT_COLUMNS[c]: _visit_value(row, c) for c in stated})
         for name in scores:
-            self._score(row, key, name, cells[name])
+            with self._line(row).about():
+                self._score(row, key, name, cells[name])
 
     def _identity(self, row: Row, code: str) -> None:
         """Compare what identifies a person, and store none of it."""
+        line = self._line(row)
         if record := row.cells.get("record"):
-            if (first := self.records.setdefault(record, code)) != code:
-                found = f"the codes {first} and {code} for record {record}"
-                raise conflict(found, "one code for one person", "write the same code in all rows")
-            mine = [r for r, c in self.records.items() if c == code]
-            if len(mine) > 1:
-                raise conflict(f"{len(mine)} records of {code}", "one record for a person", "correct code or record")
+            with line.about():
+                if (first := self.records.setdefault(record, code)) != code:
+                    found = f"the codes {first} and {code} for record {record}"
+                    raise conflict(found, "one code for one person", "write the same code in all rows")
+                mine = [r for r, c in self.records.items() if c == code]
+                if len(mine) > 1:
+                    found = f"{len(mine)} records of {code}"
+                    raise conflict(found, "one record for a person", "correct code or record")
         if "birth_date" in row.cells:
             day = _day(row, "birth_date")
             text = str(day.year) if len(row.cells["birth_date"]) == 4 else day.isoformat()
-            check_same(self.births.setdefault(code, (text, day))[0], text, "birth date", code)
+            with line.about():
+                check_same(self.births.setdefault(code, (text, day))[0], text, "birth date", code)
 
     def _member(self, row: Row, code: str) -> None:
         cohort = needed(row, "cohort")
@@ -252,7 +264,7 @@ class _Plan:
             value: Any = row.cells[column]
             if column == "included":
                 value = _flag(row, column)
-            check_same(stated.values.setdefault(name, value), value, f"{column} in {cohort}", code)
+            self._same(row, stated, name, value, f"{column} in {cohort}", code)
 
     def _long_score(self, row: Row) -> None:
         key = self._session(row, self._person(row))

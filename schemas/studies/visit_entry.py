@@ -17,7 +17,7 @@ from .. import session, study
 from ..decisions.review_decisions import record
 from ..intake.sheets import Row, Sheet, refused, with_point
 from ..transactions import in_transaction
-from .form_checks import check_fields, decided_meanwhile, last_decision
+from .form_checks import check_fields, decided_meanwhile, is_stored, last_decision, stored_value
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
 
 #: Name of the field of the role; the others are named by their instruments.
@@ -95,7 +95,7 @@ def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reaso
         raise decided_meanwhile(session_id, last, did)
     given = {name: text.strip()[:200] for name, text in values.items()}
     given = {name: text if name == ROLE else with_point(text) for name, text in given.items()}
-    changed = {name: text for name, text in given.items() if not _same(text, now.values[name])}
+    changed = {name: text for name, text in given.items() if not is_stored(text, now.values[name], name != ROLE)}
     errors: dict[str, PblError] = {}
     if changed.get(ROLE) == "":
         errors[ROLE] = refused(ROLE, "no role", f"a role, such as {', '.join(USUAL_ROLES[:3])}", "write it")
@@ -115,27 +115,10 @@ def _enter(session_id: int, values: Mapping[str, str], by: str, seen: str, reaso
     for name, text in changed.items():
         is_role = name == ROLE
         about = {} if is_role else {"instrument": name}
-        before, after = ({"value": _stored(v, is_role)} for v in (now.values[name], text))
+        before, after = ({"value": stored_value(v, not is_role)} for v in (now.values[name], text))
         record("role" if is_role else "score", by, about, before, after, reason, session_id=session_id)
     return Entered(tuple(changed), {})
 
 
 def _score(name: str, text: str) -> dict[str, str]:
     return {"instrument": name, "value": text or CLEAR}
-
-
-def _same(text: str, stored: str) -> bool:
-    """Whether a text is what is stored, also written otherwise: 12.0 for 12."""
-    if text == stored:
-        return True
-    try:
-        return "_" not in text and float(text) == float(stored)
-    except ValueError:
-        return False
-
-
-def _stored(text: str, is_role: bool) -> Any:
-    """What is stored of a field: a number of a score, None where there is nothing."""
-    if not text:
-        return None
-    return text if is_role else float(text)

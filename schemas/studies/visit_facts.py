@@ -18,7 +18,7 @@ from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..intake.visits import replace_height, replace_mass, set_population
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
-from .form_checks import check_fields, decided_meanwhile, last_decision
+from .form_checks import check_fields, decided_meanwhile, is_stored, last_decision, stored_value
 from .study_sheets import CLEAR, COLUMNS, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
@@ -99,7 +99,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)
     before = facts(number).values
-    if "height_m" in given and not _same("height_m", given["height_m"], before["height_m"]):
+    if "height_m" in given and not is_stored(given["height_m"], before["height_m"], numeric=True):
         _write(number, given["subject"], {"height_m": given["height_m"]}, by, before, "")
     return number, {}
 
@@ -163,7 +163,7 @@ def _correct(
     if now.seen != seen:
         last = last_decision(session_id, _KINDS.values())
         raise decided_meanwhile(session_id, last, "" if last is None else f"changed the {last.what}")
-    changed = {name: text for name, text in given.items() if not _same(name, text, now.values[name])}
+    changed = {name: text for name, text in given.items() if not is_stored(text, now.values[name], name in _NUMBERS)}
     checks: dict[str, Callable[[str], Any]] = {
         "height_m": _height,
         "mass_kg": _mass,
@@ -198,7 +198,7 @@ def _write(
             set_population(subject, text or "unknown")
         elif number:
             set_condition(int(number), **{kind: text or "unknown"})
-        was, after = ({"value": _stored(name, v)} for v in (before[name], text))
+        was, after = ({"value": stored_value(v, name in _NUMBERS)} for v in (before[name], text))
         of = {"video_id": int(number)} if number else {"session_id": session_id}
         record(_KINDS[kind], by, {}, was, after, reason, **of)
 
@@ -238,20 +238,5 @@ def _mass(text: str) -> float:
     return value
 
 
-def _stored(name: str, text: str) -> Any:
-    """Return what is stored of a field, None where there is nothing."""
-    return number_of(Row(name, {}), name, text) if text and name in _NUMBERS else text or None
-
-
 def _text(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
-
-
-def _same(name: str, text: str, stored: str) -> bool:
-    """Return whether a text is what is stored, also written otherwise: 1,80 for 1.8."""
-    if text == stored or name not in _NUMBERS or not (text and stored):
-        return text == stored
-    try:
-        return number_of(Row(name, {}), name, text[:40]) == float(stored)
-    except PblError:
-        return False

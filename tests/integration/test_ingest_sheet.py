@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from pathlib import Path
 
 import av
@@ -122,26 +123,30 @@ def test_one_bad_row_and_nothing_is_registered(tables, recordings, row, code, wo
 
 
 def test_all_errors_of_all_rows_at_once(tables, recordings):
-    rows = (
-        "nobody.mp4,Anna Meier,1,03/02/2026,,,,flying,,,1.7 m",
-        "empty.mp4,P003,,,,,,,,,",
-        "three.mp4,P003,1,,,,no.toml,,,,172",
-        ",,,2.13.2026,,,,,,,",
-        "one.mp4,P004,1,,,,,,,,1,72",
-    )
+    """Wrong, empty, too long, out of range, of another language, twice, contradicting, of one row and of several."""
+    long = [letter * n for letter, n in (("P", 33), ("v", 65), ("f", 33), ("a", 33), ("x", 33), ("y", 33))]
+    subject, visit, pace, activity, population, project = long
+    rows = {
+        "nobody.mp4,Anna Meier,1,03/02/2026,,,,flying,,,1.7 m": "USAGE VIDEO_MISSING" + 3 * " SHEET_FORMAT",
+        "empty.mp4,P003,,,,,,,,,": "SHEET_FORMAT VIDEO_EMPTY",
+        "three.mp4,P003,1,,,,no.toml,,,,172": "FIT_INPUT CAMERA_INVALID",
+        ",,,2.13.2026,,,,,,,": 4 * " SHEET_FORMAT",
+        "one.mp4,P004,1,,,,,,,,1,72": "SHEET_FORMAT",
+        f'one.mp4,{subject},{visit},,{pace},{activity},,,{population},{project},"1,234"': 6 * " USAGE"
+        + " SHEET_FORMAT SHEET_CONFLICT",
+        "two.mp4,P005,1,2026-03-01,,,,,healthy,a,1.70": "SHEET_CONFLICT",
+        "copy.mp4,P005,1,2026-03-02,,,no.toml,,patient,b,1.80": "SHEET_CONFLICT " * 6 + "CAMERA_INVALID",
+        "two.mp4,P006,2,30.2.2026,,,,,,,0": "SHEET_CONFLICT SHEET_FORMAT FIT_INPUT",
+        "three.mp4,p5,3,,,,,,,,": "SHEET_CONFLICT " * 2,
+    }
     before = everything()
     done = pbl("ingest", "--sheet", sheet(recordings, *rows, name="bad.csv"))
-    said = [line.split(":")[0] for line in done.err.splitlines() if line.split(":")[0].replace("_", "").isupper()]
-    assert sorted(said) == sorted(
-        ["USAGE", "SHEET_FORMAT", "SHEET_FORMAT", "SHEET_FORMAT", "VIDEO_MISSING"]
-        + ["SHEET_FORMAT", "VIDEO_EMPTY"]
-        + ["FIT_INPUT", "CAMERA_INVALID"]
-        + ["SHEET_FORMAT"] * 4
-        + ["SHEET_FORMAT"]
-    )
-    assert all(f"bad.csv, row {n}" in done.err for n in range(2, 7))
+    where = [f"bad.csv, row {n}" for n in range(2, len(rows) + 2)]
+    said = re.findall(r"^([A-Z_]+): .*\n  about: +(bad\.csv, row \d+)", done.err, re.MULTILINE)
+    codes = {row: sorted(code for code, about in said if about == row) for row in where}
+    assert codes == {row: sorted(expected.split()) for row, expected in zip(where, rows.values(), strict=True)}
     assert "12 cells under 11 columns" in done.err
-    assert "0 videos not registered, 0 known, 5 rows refused" in done.out
+    assert "0 videos not registered, 0 known, 10 rows refused" in done.out
     assert everything() == before
 
 

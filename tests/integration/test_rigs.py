@@ -208,7 +208,9 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     assert fit.SessionFit().make_computes([key], [fit.SessionFit().make_fetch(key)]) == [None]
     assert [t.cameras for t in batch[0].trials] == [CAMERAS]
     for number in (4, 6):
-        assert why(number).verdict.startswith("SubjectChoice of its camera, video_id 5, ran well and found nothing")
+        assert why(number).verdict.startswith(
+            "choice of the person of its camera, video_id 5, ran well and found nothing"
+        )
     # Another person in one camera: what was computed of the trial goes, and the check says it.
     decide_person(3, 2)
     assert len(fit.SessionFit()) == len(fit.FitSet()) == len(fit.TrialInput()) == 0

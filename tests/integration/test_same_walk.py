@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from research.benchmarks.same_walk import VARIANTS, encoded
+from schemas import gdi, qc
 from schemas.reading import comparison
 from tests.rows import register, remove_all
 from tests.unit.test_blazepose import asset
@@ -19,6 +20,8 @@ pytestmark = [pytest.mark.machine, pytest.mark.slow]
 
 #: The variants of `research.benchmarks.same_walk`, and the picture as it is in another container.
 KINDS = (*VARIANTS, "other container")
+#: In it the detector takes one leg for the other at each step, so that every step is counted twice: no number is given.
+REFUSED = "a tenth"
 #: Root mean square difference (deg) of two mean curves from which on a reader would see a change.
 SEEN_DEG = 5.0
 
@@ -40,8 +43,8 @@ def test_no_pair_is_called_changed_and_curves_that_are_apart_have_their_reason(v
     called, unexplained = {}, {}
     for a, b in itertools.combinations(visits, 2):
         one, other = comparison.compare([(visits[a], None), (visits[b], None)]).compared
-        assert other.change is not None, (a, b)
-        changes = {"index": other.change, **other.changes}
+        assert (other.change is None) == (REFUSED in (a, b)), (a, b)
+        changes = {"index": other.change, **other.changes} if other.change else other.changes
         called |= {(a, b, name): change for name, change in changes.items() if change.sure}
         keys = ["angle", "side", "percent"]
         both = one.curves.merge(other.curves, on=keys, suffixes=("", "_other"))
@@ -54,3 +57,11 @@ def test_no_pair_is_called_changed_and_curves_that_are_apart_have_their_reason(v
             unexplained[a, b] = seen
     assert not called
     assert not unexplained
+
+
+def test_no_number_is_given_where_the_steps_were_counted_twice(visits: dict[str, int]):
+    about = {"session_id": visits[REFUSED]}
+    numbers = (gdi.SessionGdi & about).fetch1("session_gdi", "session_cadence", "session_gdi_reason")
+    assert numbers == (None, None, "the cadence is unusual for walking, and no one has accepted it")
+    value = (qc.SessionQc.Check * qc.SessionQc & about & {"qc_check": "cadence_plausible"}).fetch1("qc_value")
+    assert value > 150

@@ -242,23 +242,39 @@ def test_columns_that_are_unknown(empty: None, tmp_path: Path):
 
 
 def test_all_errors_of_all_rows_at_once(empty: None, tmp_path: Path):
-    wrong = "Ann Smith,a,03/04/2026,Pre Op,30.2.2026,1950-13-01,,44\nP002,,,pre,,,,\nP003,a,,pre,,,,x\n"
-    found = run(
-        sheet(tmp_path, HEAD + wrong), sheet(tmp_path, "subject,visit,instrument,value\n,,,\n,,TUG,0\n", "b.csv")
-    )
-    assert not found.done
-    said = {(str(e.key).split(":")[0], e.code, e.found.split(" ")[0]) for e in found.errors}
-    first = "visits.csv, row 2"
-    assert said == {
-        (first, "USAGE", "subject"),
-        *((first, "SHEET_FORMAT", column) for column in ("date", "role", "intervention_date", "birth_date")),
-        (first, "SCORE_RANGE", "mJOA"),
-        ("visits.csv, row 3", "SHEET_FORMAT", "no"),
-        ("visits.csv, row 4", "SHEET_FORMAT", "mJOA"),
-        ("b.csv, row 3", "SHEET_FORMAT", "no"),
-        ("b.csv, row 3", "SCORE_RANGE", "TUG"),
+    """Wrong, empty, too long, out of range, of another language, twice, contradicting, of one row and of several."""
+    head = "subject,visit,date,role,intervention_date,birth_date,record,population,note,mJOA,height\n"
+    rows = {
+        "Ann Smith,a,03/04/2026,Pre Op,30.2.2026,1950-13-01,,,,44,": "USAGE SCORE_RANGE" + 4 * " SHEET_FORMAT",
+        "P002,,,pre,,,,,,,": "SHEET_FORMAT",
+        "P003,a,,pre,,,,,,x,": "SHEET_FORMAT",
+        f'{"P" * 33},{"v" * 65},,{"r" * 33},,,{"n" * 256},{"x" * 33},{"y" * 1001},"1,234",': "USAGE " * 5
+        + 2 * "SHEET_FORMAT ",
+        "P004,a,2026-01-01,pre,,1950,4711,healthy,,12,": "",
+        "P004,a,2026-01-02,6_weeks,,1960,4712,patient,,12.5,": "SCORE_RANGE" + 5 * " SHEET_CONFLICT",
+        "P004,a,2026-01-01,pre,,,,,,12,": "SHEET_CONFLICT " * 2,
+        "P005,a,2026-01-01,pre,2025-12-01,,4711,,,,": "SHEET_CONFLICT",
+        "P006,a,2026-01-01,pre,,2027-01-01,,,,,": "SHEET_CONFLICT",
+        "P007,a,2026-01-01,pre,,,,,,1,2,3": "SHEET_FORMAT",
+        "p-8,b,2026-01-01,pre,,,,,,,": "SHEET_CONFLICT",
     }
-    assert [e.found for e in found.errors if str(e.key).startswith("b.csv")][:2] == ["no subject", "no visit"]
+    scores = {
+        ",,,": None,
+        ",,TUG,0": "SHEET_FORMAT SHEET_FORMAT SCORE_RANGE",
+        "P008,a,ABC,1": "SHEET_FORMAT SHEET_CONFLICT",
+        "P008,a,TUG,9": "",
+        "P008,a,TUG,10": "SHEET_CONFLICT",
+        f"P008,{'v' * 65},TUG,'9'": "USAGE SHEET_FORMAT",
+    }
+    long = "subject,visit,instrument,value\n" + "\n".join(scores)
+    found = run(sheet(tmp_path, head + "\n".join(rows)), sheet(tmp_path, long, "b.csv"))
+    assert not found.done
+    expected = {"visits.csv": ["SHEET_FORMAT"]}
+    for name, of_sheet in (("visits.csv", rows), ("b.csv", scores)):
+        codes = {f"{name}, row {i}": code for i, code in enumerate(of_sheet.values(), 2)}
+        expected |= {where: sorted(code.split()) for where, code in codes.items() if code is not None}
+    assert {line.where: sorted(e.code for e in line.errors) for line in found.lines} == expected
+    assert all(str(e.key).startswith(line.where) for line in found.lines for e in line.errors)
     assert not len(lab.Subject())
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import getpass
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import fit, qc, tracking
+from schemas import fit, gait, gdi, qc, tracking
 from schemas.datajoint_setup import dj
 from schemas.decisions import review_decisions
 from schemas.operations import forget
 from schemas.reading import shown, visit_list
+from schemas.reading.usable import Usable, usable
 from schemas.review import Decision
 from schemas.rows import delete_below
 from tests.command import pbl
@@ -68,6 +70,8 @@ def test_two_people_decide_at_once_and_the_second_sees_it(two_alike: int):
     assert len(tracking.SubjectChoice()) == 0
     history = second.get("/visits/1").text
     assert history.index("B. Second") < history.index("A. First")
+    assert "NEEDS_CHOICE" not in history[history.index("Decisions") :]
+    assert "No one is chosen yet" in history
     listed = json.loads(pbl("list", "decisions", "--session", "2026-01-10", "--json").out)
     assert [(row["by"], row["what"], row["session_id"], json.loads(row["after"])) for row in listed] == [
         ("B. Second", "person", 1, {"person": 1}),
@@ -183,6 +187,7 @@ def test_a_warning_is_accepted_with_a_name_until_it_is_computed_anew(warned: dic
     assert accept(web.client(name="B. Second"), warned).status_code == 303  # accepted already
     page = browser.get("/visits/1").text
     assert "accepted by A. First" in page
+    assert re.search(r"<td>attention\s*</td><td>accepted\s*</td>", page)
     assert "&lt;b&gt;looked at the overlay" in page
     (row,) = Decision().to_dicts()
     assert (row["session_id"], row["video_id"], row["decision_before"]) == (1, None, {"outcome": "WARN"})
@@ -217,6 +222,41 @@ def test_what_was_accepted_is_no_longer_open(warned: dict[str, Any]):
     assert '<span class="outcome ACCEPTED">angenommen</span>' in browser.get("/visits").text
     qc.SessionQc.update1({**key, "qc_computed": "2030-01-01 00:00:00"})  # as if computed again
     assert (listed("WARN"), listed("ACCEPTED")) == (1, 0)
+
+
+def test_an_unusual_cadence_gives_no_number_until_somebody_accepts_it(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    measures = sys.modules["pbl_pipeline.gait.cycle_measures"]  # a function of the package has its name
+    monkeypatch.setattr(measures, "CADENCE_PER_MIN", (150.0, 200.0))  # the walk's is not
+    register(small_video(tmp_path, "walk"), session_label="2026-01-10")
+    populate()
+    numbers = ("session_gdi", "session_cadence", "session_gps")
+    why = "the cadence is unusual for walking, and no one has accepted it"
+    assert gdi.SessionGdi.fetch1(*numbers, "session_gdi_reason") == (None, None, None, why)
+    assert qc.SessionQc.fetch1("qc_outcome") == "FAIL"
+    assert usable(1) == Usable("unusable", (why, *usable(1).said[1:]), (0, 0))
+    browser = web.client(name="A. First")
+    assert why in browser.get("/visits/1").text
+    cadence = {"qc_check": "cadence_plausible"}
+    row = (qc.SessionQc.proj("qc_computed") * qc.SessionQc.Check & cadence).fetch1()
+    assert row["qc_check_outcome"] == "FAIL"
+    assert accept(browser, row, reason="counted").status_code == 303
+    assert (len(gait.GaitEvents()), len(gait.GaitCycle()), len(gdi.SessionGdi())) == (1, 0, 0)
+    populate()
+    assert None not in gdi.SessionGdi.fetch1(*numbers[:2])
+    assert (qc.SessionQc.Check & cadence).fetch1("qc_check_outcome") == "WARN"
+    page = browser.get("/visits/1").text
+    assert why not in page
+    assert page.count("accepted by A. First") == 1
+    (result,) = visit_list.results_of([1])[1]
+    assert "cadence_plausible" not in result.worst
+    key = gait.GaitCycle.fetch1("KEY")
+    monkeypatch.setattr(gait, "accepted_cadence", lambda _: 1.0)  # as if the events had changed since
+    delete_below(gait.GaitCycle, [key])
+    populate()
+    assert gdi.SessionGdi.fetch1(*numbers[:2]) == (None, None)
+    assert "accepted by" not in browser.get("/visits/1").text
 
 
 @pytest.mark.parametrize("reason", ["", "  ", "x" * 501])

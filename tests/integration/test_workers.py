@@ -501,11 +501,11 @@ def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
     good, bad = register(*videos(tmp_path, "walk"), tmp_path / "bad.mp4")
     assert "not queued" in why(good).verdict
     refresh.refresh()
-    assert why(good).verdict.startswith("VideoInfo waits for a worker")
+    assert why(good).verdict.startswith("reading of the video waits for a worker")
     work()
     assert why(good).verdict == "everything is computed"
     assert {s.table for s in why(good).steps if s.what == "done"} >= {"VideoInfo", "SessionFit", "SessionQc"}
-    assert why(bad).verdict.startswith("VideoInfo failed (VIDEO_NOT_A_VIDEO")
+    assert why(bad).verdict.startswith("reading of the video failed (VIDEO_NOT_A_VIDEO")
     alike = chain.small_video(tmp_path, "two", people="two alike")
     (waiting,) = register(alike, session_label="2")
     work()

@@ -25,6 +25,10 @@ def cycle(exclusion: Exclusion) -> GaitCycle:
             "1.40 times the typical stride, without feet that show whether a step was missed",
         ),
         (Exclusion(curve_distance_deg=24.6, n_curves=8), "25 deg from the median curves of 8 cycles"),
+        (
+            Exclusion(last_step=True, failed_checks=("cadence_plausible",)),
+            "the cadence is unusual for walking, and no one has accepted it",
+        ),
         (Exclusion(first_step=True, failed_checks=("scale", "jumps")), "the fit failed its check scale, jumps"),
     ],
 )
@@ -36,6 +40,6 @@ def test_the_sentence_and_whether_the_cycle_counts(exclusion: Exclusion, text: s
 def test_each_reason_is_a_fact_of_its_own():
     """They were read out of the sentence: a check called "from the median curves" would have been odd curves."""
     found = cycle(Exclusion(failed_checks=("times the typical stride from the median curves",)))
-    assert (found.odd_length, found.odd_curves, found.fit_failed) == (False, False, True)
+    assert (found.odd_length, found.odd_curves, found.check_failed) == (False, False, True)
     found = cycle(Exclusion(length_ratio=0.5, curve_distance_deg=9.0, n_curves=6))
-    assert (found.odd_length, found.odd_curves, found.fit_failed) == (True, True, False)
+    assert (found.odd_length, found.odd_curves, found.check_failed) == (True, True, False)

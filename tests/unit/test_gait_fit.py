@@ -289,6 +289,37 @@ def test_nothing_is_measured_on_a_fit_that_failed():
     assert metrics.trials[0].events.events
 
 
+def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
+    time = np.arange(0, 6, 1 / 30)
+    usual = make_fit(time, walking(time))
+    hasty = dataclasses.replace(usual, time_s=usual.time_s * 0.6, name="hasty")
+    why = "the cadence is unusual for walking, and no one has accepted it"
+    metrics = gait_metrics([hasty])
+    content = metrics.to_dict()
+    for part in (content["session"], *content["trials"]):
+        assert part["status"] == "EMPTY"
+        assert all(part[name] is None and part["reasons"][name] == why for name in MEASURES)
+        assert (part["gdi"]["mean"], part["reasons"]["gdi"]) == (None, why)
+    (check,) = [c for c in metrics.checks if c.check == "cadence_plausible"]
+    assert (check.outcome, check.threshold, metrics.outcome) == ("FAIL", 150.0, "FAIL")
+    assert check.value is not None
+    assert check.value > 150.0
+    with_another = gait_metrics([usual, hasty])
+    cadence = with_another.spatiotemporal["cadence_steps_per_min"]
+    assert cadence is not None
+    assert cadence.mean < 150.0
+    assert (with_another.gdi.mean is None, with_another.outcome) == (False, "FAIL")
+    accepted = gait_metrics([hasty], accept_cadence=True)
+    counted = accepted.spatiotemporal["cadence_steps_per_min"]
+    assert counted is not None
+    assert round(counted.mean, 2) == check.value
+    assert accepted.gdi.mean is not None
+    assert [c.outcome for c in accepted.checks if c.check == "cadence_plausible"] == ["WARN"]
+    assert [c.exclusion for c in accepted.trials[0].cycles] == [
+        dataclasses.replace(c.exclusion, failed_checks=()) for c in metrics.trials[0].cycles
+    ]
+
+
 def test_the_outcome_counts_what_came_before():
     time = np.arange(0, 6, 1 / 30)
     metrics = gait_metrics([make_fit(time, walking(time))])

@@ -11,7 +11,7 @@ from pbl_pipeline.temporary import new_folder
 from schemas import video
 from schemas.decisions import candidates, review_decisions
 
-from ..refresh import queue_visit_of
+from ..refresh import queue_visit, queue_visit_of
 from .access import Refused, Session, form_of
 from .address import Address, number_of, whole_number
 from .pages import Pages
@@ -52,6 +52,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             review_decisions.accept_check(about.key, number_of_check, session.name, fields.get("reason", ""))
 
         await tables.ask(write)
+        await tables.ask(queue_visit, number)
         return RedirectResponse(f"/visits/{number}?result={shown}", 303)
 
     async def people(request: Request) -> Response:

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.words import ANGLES, MEASURES, TASKS, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, check_words, number, significant
 
 from . import texts
 from .access import HEADERS, HOURS, Session
@@ -51,6 +51,7 @@ class Pages:
             has_text=lambda name: name in texts.catalogue(),
             significant=significant,
             check_words=check_words,
+            stage_words=STAGES,
             measure_words=MEASURES | TASKS,
             angle_words=[title for title, _ in ANGLES.values()],
         )

@@ -52,7 +52,10 @@ def _library_words(language: str, english: str) -> str | None:
         return own
     for joint in (": ", "; "):
         for at in (m.start() for m in re.finditer(joint, english)):
-            parts = _library_words(language, english[:at]), _library_words(language, english[at + len(joint) :])
+            first, rest = english[:at], _library_words(language, english[at + len(joint) :])
+            # Before a colon a single word may be the name of a recording.
+            name = first if joint == ": " and " " not in first else None
+            parts = _library_words(language, first) or name, rest
             if parts[0] is not None and parts[1] is not None:
                 return joint.join(p for p in parts if p is not None)
     best = None
