@@ -78,7 +78,7 @@ def test_comparisons_that_a_change_touches():
     assert found.to_records(index=False).tolist() == [("P1", "v1", "v2", "across"), ("P1", "v3", "v4", "old")]
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_frozen_set_by_two_methods_of_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     first = dict(list(bridge_module.BRIDGE_SET.items())[:3])

@@ -267,7 +267,7 @@ def test_the_files_of_a_report(written):
     assert float(found[0]["low"]) < made.INDEX.srm < float(found[0]["high"])
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_script_of_a_folder_makes_the_same_tables(written):
     """In a process that cannot import the tables of the database."""
@@ -347,7 +347,7 @@ def test_what_is_not_defined_is_a_code_and_never_a_number(change):
     assert number_of_codes(study_results(less, plan(less), permutations=200)) or change is no_index
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_page_says_once_per_table_why_something_is_not_defined(change, tmp_path):
