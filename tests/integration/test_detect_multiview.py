@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
     # behind.
     [
         ("cam02", "blazepose-33", (20, 45)),
-        ("cam02", "blazepose-heavy", (0, 0)),
+        pytest.param("cam02", "blazepose-heavy", (0, 0), marks=pytest.mark.long),
         pytest.param("cam04", "blazepose-heavy", (0, 0), marks=pytest.mark.long),
     ],
 )

@@ -231,6 +231,7 @@ PARAMS = GaussNewtonParams(
 )
 
 
+@pytest.mark.long
 def test_the_markers_are_the_same_by_mjx_forward_and_reverse():
     body, markers = load_body(), few_markers()
     rng = np.random.default_rng(8)

@@ -40,7 +40,11 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(
     "name",
-    ["blazepose_detector", "blazepose_landmarks", pytest.param("blazepose_landmarks_heavy", marks=pytest.mark.long)],
+    [
+        "blazepose_detector",
+        pytest.param("blazepose_landmarks", marks=pytest.mark.long),
+        pytest.param("blazepose_landmarks_heavy", marks=pytest.mark.long),
+    ],
 )
 def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
