@@ -40,7 +40,7 @@ _LEFT_OUT = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark `database` and `browser` by the fixtures; skip what is left out unless it is asked for."""
+    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for."""
     for item in items:
         names = getattr(item, "fixturenames", ())
         if "database" in names:

@@ -45,8 +45,8 @@ def keep_programs() -> None:
 
 @functools.cache
 def configure() -> None:
-    """Set JAX up for the fit: `keep_programs`, XLA's flags. Call before the first array;
-    idempotent. Precision stays JAX's default, float32.
+    """Set JAX up for the fit: `keep_programs`, XLA's flags. Call before the first array; idempotent. Precision stays
+    JAX's default, float32.
     """
     keep_programs()
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
@@ -79,7 +79,7 @@ def _default(option: str, value: float) -> None:
 
 
 def import_mjx() -> Any:
-    """Import MuJoCo's kinematics in JAX, which takes half a second and which one solver alone needs.
+    """Return the module of MuJoCo's kinematics in JAX, imported where it is needed: by one solver.
 
     It prints two lines on stdout where NVIDIA's optional warp is absent, which would end up in the output of a command.
     Only those lines are dropped; whatever else is printed meanwhile is passed on.

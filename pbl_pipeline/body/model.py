@@ -60,7 +60,7 @@ class Body:
     @functools.cached_property
     def mjx_model_and_data(self) -> tuple[mjx.Model, mjx.Data]:
         """The model for MJX, and an empty state to start kinematics from."""
-        # Whoever asks first may be tracing: what is cached must be arrays, not that trace's constants.
+        # The first caller may be tracing: the cache must hold arrays, not constants of that trace.
         with jax.ensure_compile_time_eval():
             module = import_mjx()
             return module.put_model(self.mj_model, impl="jax"), module.make_data(self.mj_model, impl="jax")
