@@ -48,6 +48,5 @@ def test_plates_of_another_sign_or_unit_are_refused(shared_data) -> None:
     plate = kinetics.read_walk(path).plates[0]
     for factor in (-1.0, 0.001, 9.81):
         wrong = dataclasses.replace(plate, force=factor * plate.force)
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
             kinetics.check_plates(path, (wrong,))
-        assert error.value.code == "FILE_FORMAT"

@@ -128,9 +128,8 @@ def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monk
     assert "the GPU does not compute it" in network.note
     assert all(np.allclose(before[s].ravel(), after[s].ravel(), atol=0.01) for s in after)
     monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^DEVICE_UNAVAILABLE: "):
         asked(picture)
-    assert caught.value.code == "DEVICE_UNAVAILABLE"
 
 
 def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(

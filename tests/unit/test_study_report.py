@@ -374,13 +374,11 @@ def test_what_is_compared_can_be_chosen(study):
     assert (other.change_from, other.change_to, other.groups[0]) == ("6_weeks", "6_months", made.CONTROLS)
     assert len(pairs(visit_table(study), other, "gdi")) <= 20
     for wrong in ({"change_from": "week 9"}, {"change_group": "knee"}, {"change_from": "pre", "change_to": "pre"}):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^USAGE: "):
             plan(study, **wrong)
-        assert error.value.code == "USAGE"
     none = dataclasses.replace(study, visits=study.visits.assign(included=False, reason="left"))
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^STUDY_INVALID: "):
         plan(none)
-    assert error.value.code == "STUDY_INVALID"
 
 
 def test_without_a_description_roles_and_group_follow_from_the_visits(study):
