@@ -7,9 +7,9 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             if command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
             then echo $$p; break; fi; done)
 OUT    ?= pbl_demo
-JOBS   ?= 2# test processes, a file of tests at a time
+JOBS   ?= 2# test processes, a file of tests at a time, in the order of the folders: the longest come first
 # Whatever the shell says, compiled modules are kept: tests start many processes that import them.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo docs test test-fast lint format lock clean help
 

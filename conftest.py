@@ -32,9 +32,15 @@ _NO_BROWSER = " and ".join(
     if not there
 )
 
+#: Markers of tests that run only where they are asked for, and why.
+_LEFT_OUT = {
+    "machine": "starts services, fetches a gigabyte or needs two idle cores",
+    "long": "takes tens of seconds for what few changes touch",
+}
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The markers `database` and `browser` follow from the fixtures; `machine` runs only where it is asked for."""
+    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for."""
     for item in items:
         names = getattr(item, "fixturenames", ())
         if "database" in names:
@@ -43,8 +49,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.browser)
             if _NO_BROWSER:
                 item.add_marker(pytest.mark.skip(reason=f"browser: {_NO_BROWSER}"))
-        if item.get_closest_marker("machine") and "machine" not in config.option.markexpr:
-            item.add_marker(pytest.mark.skip(reason="takes long or starts services: pytest -m machine"))
+        for marker, reason in _LEFT_OUT.items():
+            if item.get_closest_marker(marker) and marker not in config.option.markexpr:
+                item.add_marker(pytest.mark.skip(reason=f"{reason}: pytest -m {marker}"))
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import io
 import os
 import sys
 import warnings
+from typing import Any
 
 import jax
 
@@ -43,8 +45,8 @@ def keep_programs() -> None:
 
 @functools.cache
 def configure() -> None:
-    """Set JAX up for the fit: `keep_programs`, XLA's flags, MJX imported quietly. Call before the first array;
-    idempotent. Precision stays JAX's default, float32.
+    """Set JAX up for the fit: `keep_programs`, XLA's flags. Call before the first array; idempotent. Precision stays
+    JAX's default, float32.
     """
     keep_programs()
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
@@ -55,7 +57,6 @@ def configure() -> None:
         flags = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()
-    _import_mjx()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 
 
@@ -77,13 +78,16 @@ def _default(option: str, value: float) -> None:
         jax.config.update(option, value)
 
 
-def _import_mjx() -> None:
-    # MJX prints two lines on stdout when NVIDIA's optional warp is absent, which would end up in the output of every
-    # command. Only those lines are dropped; whatever else is printed meanwhile is passed on.
+def import_mjx() -> Any:
+    """Return the module of MuJoCo's kinematics in JAX, imported where it is needed: by one solver.
+
+    It prints two lines on stdout where NVIDIA's optional warp is absent, which would end up in the output of a command.
+    Only those lines are dropped; whatever else is printed meanwhile is passed on.
+    """
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):
-            import mujoco.mjx  # noqa: F401
+            return importlib.import_module("mujoco.mjx")
     finally:
         for line in printed.getvalue().splitlines(keepends=True):
             if not _is_absent_warp(line):

@@ -11,6 +11,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 from pbl_pipeline.errors import PblError
@@ -31,6 +32,7 @@ with warnings.catch_warnings():
             expected="values of the DJ_ variables as DataJoint knows them (DJ_PORT: a number)",
             next_step="correct the variable, or unset it",
         ) from error
+from datajoint import table as datajoint_table
 from datajoint.adapters import ADAPTERS, MySQLAdapter
 from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError, MissingTableError
 from datajoint.hash_registry import get_store_backend
@@ -47,6 +49,7 @@ __all__ = [
     "RightMissing",
     "backend_of",
     "build_object_path",
+    "columns_read_once",
     "datajoint",
     "dj",
     "full_path",
@@ -146,3 +149,29 @@ def inserting(table: Any) -> Iterator[None]:
 def read_heading_again(cls: Any) -> None:
     """Read the columns of a table (class) anew: DataJoint keeps those that it read first."""
     cls._heading = type(cls._heading)(table_info=cls._heading.table_info)
+
+
+#: Columns by the table's full name that `columns_read_once` has read; None outside of it.
+_columns: ContextVar[dict[str, Any] | None] = ContextVar("columns", default=None)
+
+
+class _FreeTable(datajoint_table.FreeTable):
+    """A table as DataJoint's cascades make it, anew for each of its parents."""
+
+    def __init__(self, conn: Any, full_table_name: str) -> None:
+        super().__init__(conn, full_table_name)
+        if (read := _columns.get()) is not None:
+            self._heading = read.setdefault(full_table_name, self._heading)
+
+
+setattr(datajoint_table, "FreeTable", _FreeTable)  # noqa: B010
+
+
+@contextmanager
+def columns_read_once() -> Iterator[None]:
+    """Let cascades in this block read the columns of a table once; DataJoint reads them for each foreign key."""
+    before = _columns.set({})
+    try:
+        yield
+    finally:
+        _columns.reset(before)

@@ -11,7 +11,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .datajoint_setup import REPEAT, dj
+from .datajoint_setup import REPEAT, columns_read_once, dj
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -155,6 +155,7 @@ def counted(deleted: Mapping[str, int]) -> str:
 _DELETES = 5
 
 
+@columns_read_once()
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
     """Delete the rows with these keys and all that was computed from them, in one transaction.
 

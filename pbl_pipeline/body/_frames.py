@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from pbl_pipeline.body.model import Body
+from pbl_pipeline.jax_setup import import_mjx
 
 
 class Frames(NamedTuple):
@@ -28,10 +28,11 @@ def mjx_frames(body: Body, qpos: Float[Array, "N Q"], body_pos: Float[Array, "B 
     `mjx.kinematics`, never `mjx.forward`, which would also compute the dynamics.
     """
     world = jnp.zeros((1, 3), body_pos.dtype)
-    model = body.mjx_model.replace(body_pos=jnp.concatenate([world, body_pos]))
+    (model, state), mjx = body.mjx_model_and_data, import_mjx()
+    model = model.replace(body_pos=jnp.concatenate([world, body_pos]))
 
     def one(q: Array) -> Frames:
-        data = mjx.kinematics(model, body.mjx_data.replace(qpos=q))
+        data = mjx.kinematics(model, state.replace(qpos=q))
         return Frames(data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3), data.xaxis, data.xanchor)
 
     return jax.vmap(one)(qpos)

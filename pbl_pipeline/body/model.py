@@ -9,12 +9,16 @@ import dataclasses
 import functools
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import mujoco
 import numpy as np
-from mujoco import mjx
+
+from pbl_pipeline.jax_setup import import_mjx
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 _MJCF = Path(__file__).parent / "data" / "pbl_body_40.xml"
 _GROUP_PREFIX = "scale_group/"
@@ -33,10 +37,8 @@ class Body:
     root, the pelvis: MuJoCo's world is left out.
     """
 
-    #: The model for C MuJoCo and for MJX, and an empty state of the latter to start kinematics from.
+    #: The model for C MuJoCo.
     mj_model: mujoco.MjModel
-    mjx_model: mjx.Model
-    mjx_data: mjx.Data
     #: OpenSim's, in the order of `qpos`. The slides are pelvis_tx (forward), pelvis_tz (right), pelvis_ty (up).
     joint_names: tuple[str, ...]
     joint_range_rad: np.ndarray  # (Q, 2) limits, radians (metres for slides); -inf, inf where unlimited
@@ -55,6 +57,14 @@ class Body:
     name: str
     version: str
 
+    @functools.cached_property
+    def mjx_model_and_data(self) -> tuple[mjx.Model, mjx.Data]:
+        """The model for MJX, and an empty state to start kinematics from."""
+        # The first caller may be tracing: the cache must hold arrays, not constants of that trace.
+        with jax.ensure_compile_time_eval():
+            module = import_mjx()
+            return module.put_model(self.mj_model, impl="jax"), module.make_data(self.mj_model, impl="jax")
+
 
 @functools.cache
 def load_body(path: Path = _MJCF) -> Body:
@@ -65,10 +75,6 @@ def load_body(path: Path = _MJCF) -> Body:
     """
     xml, model = _c_model(path)
     texts = _texts(model)
-    # Whoever asks first may be tracing: what is cached must be arrays, not that trace's constants.
-    with jax.ensure_compile_time_eval():
-        mjx_model = mjx.put_model(model, impl="jax")
-        mjx_data = mjx.make_data(model, impl="jax")
     limited = np.asarray(model.jnt_limited, bool)[:, None]
     names = tuple(model.body(i).name for i in range(1, model.nbody))
     groups = _scale_groups(texts)
@@ -80,8 +86,6 @@ def load_body(path: Path = _MJCF) -> Body:
             above[i] += above[p]
     return Body(
         mj_model=model,
-        mjx_model=mjx_model,
-        mjx_data=mjx_data,
         joint_names=tuple(model.joint(i).name for i in range(model.njnt)),
         joint_range_rad=_frozen(np.where(limited, model.jnt_range, np.array([-np.inf, np.inf]))),
         joint_body=_frozen(joint_body),

@@ -150,6 +150,7 @@ def _jax_cache() -> Finding:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what it would warn of is the finding below
             jax_setup.configure()
+        jax_setup.import_mjx()
         folder = getattr(jax.config, "jax_compilation_cache_dir", None)
         if not folder:
             return Finding("compile cache", NOTE, "off: every start compiles anew", "make PBL_CACHE a writable folder")

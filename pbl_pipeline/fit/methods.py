@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pbl_pipeline.methods import Stage
 
-from .implicit import solve_sessions
 from .params import BLAZEPOSE, GAUSS_NEWTON, MARKERS, PAPER_2025, PAPER_GAUSS_NEWTON, Params
 from .per_frame import solve_per_frame
 
 #: A family is a solver: a function from sessions that are packed to the same sizes, its parameters and the sessions'
 #: starts to a `Solution` of each, or the `PblError` of one that cannot be solved.
 METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
-METHODS.register("paper-2025", 2, PAPER_2025, solve_sessions)
+METHODS.register("paper-2025", 2, PAPER_2025, "pbl_pipeline.fit.implicit:solve_sessions")
 METHODS.register("gauss-newton", 4, GAUSS_NEWTON, solve_per_frame)
 METHODS.register("paper-gauss-newton", 2, PAPER_GAUSS_NEWTON)
 METHODS.register("blazepose", 7, BLAZEPOSE)

@@ -92,6 +92,7 @@ def test_the_table_of_the_comparison_has_the_camera_of_a_held_phone_only():
     assert "the paper's objective" in text
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_batch_of_the_comparison_is_measured_and_compared_with_the_sessions_alone(tmp_path):
     fit_data.write(tmp_path, fit_data.WalkerData(n_frames=64, n_sessions=2, motion="handheld"))
@@ -104,6 +105,7 @@ def test_a_batch_of_the_comparison_is_measured_and_compared_with_the_sessions_al
     assert 1 < got["paper_loss"] < 100
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_fewer_steps_are_another_method_of_its_own_process(tmp_path):
     """Twenty frames are under a second: the fit refuses them."""

@@ -72,7 +72,7 @@ def test_phases_are_whole_at_the_events():
     assert np.isnan(phase[~walks]).all()
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_an_example_is_what_the_model_takes():
     s = next(s for s in (scene(i) for i in range(50)) if s.kind == "walk")

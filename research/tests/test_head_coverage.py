@@ -44,7 +44,7 @@ def test_located_heads_are_boxes_of_heads():
     np.testing.assert_allclose(sts[5], sts[0] + (sts[15] - sts[0]) / 3)
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_heads_of_two_real_people_are_covered(tmp_path):
     """Some frames of the demo: one walks in the foreground, one stands on a wall behind."""

@@ -19,7 +19,7 @@ def steps(shared_data) -> list[kinetics.Step]:
     return [s for w in walks for s in kinetics.steps_of(w, kinetics.fit_walk(w), 6.0)]
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_forces_meet_the_bars_on_held_out_children(steps: list[kinetics.Step]) -> None:
     assert not any(name.startswith(kinetics.TUNING) for name in HELD_OUT)
     assert len(steps) == 6
@@ -36,7 +36,7 @@ def test_forces_meet_the_bars_on_held_out_children(steps: list[kinetics.Step]) -
     assert mean["hip flexion (Nm/kg)"] < 0.35
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_impulses_are_those_of_the_plates(steps: list[kinetics.Step]) -> None:
     for step in steps:
         for name, within in (("vertical_impulse_bw_s", 0.04), ("propulsion_impulse_bw_s", 0.012)):
@@ -48,6 +48,5 @@ def test_plates_of_another_sign_or_unit_are_refused(shared_data) -> None:
     plate = kinetics.read_walk(path).plates[0]
     for factor in (-1.0, 0.001, 9.81):
         wrong = dataclasses.replace(plate, force=factor * plate.force)
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
             kinetics.check_plates(path, (wrong,))
-        assert error.value.code == "FILE_FORMAT"

@@ -82,9 +82,8 @@ def test_a_file_that_contradicts_its_row_is_refused(tmp_path, walk, change, code
     if code == "none read":
         assert read_motions(folder) == []
         return
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=rf"^{code}: "):
         read_motions(folder)
-    assert error.value.code == code
 
 
 @pytest.mark.parametrize(
@@ -98,9 +97,8 @@ def test_a_pelvis_or_foot_that_no_walker_has_is_refused(tmp_path, walk, joint, d
         qpos *= deg  # degrees that are called radians
     else:
         qpos[:, [i for n, i in COLUMN.items() if n.startswith(joint)]] += np.radians(deg)
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=rf"^{code}: "):
         read_motions(_folder(tmp_path, time, qpos))
-    assert error.value.code == code
 
 
 def test_a_locked_joint_is_not_known(tmp_path, walk):
@@ -181,6 +179,5 @@ def test_real_files_with_another_sign_or_unit_are_refused(shared_data):
         (isb, {"knee_sign": "+flex"}, "REFERENCE_INPUT"),
         (walk, {"units": "rad"}, "ANGLE_UNITS"),
     ):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=rf"^{code}: "):
             read_motion(folder, row | change)
-        assert error.value.code == code

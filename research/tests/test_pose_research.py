@@ -14,7 +14,7 @@ from tests import SHARED
 MOTIONS = SHARED / "real" / "motions"
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.skipif(not MOTIONS.is_dir(), reason="the recordings of other laboratories are not here")
 def test_the_shipped_prior_made_again():
     made = learn([m for m in read_motions(MOTIONS) if not is_held_out(m.person)])

@@ -71,18 +71,16 @@ def test_leave_one_out_judges_by_the_others():
 def test_too_few_points_and_two_detectors_are_refused():
     one = made(100, lambda c: c)
     for errors in ([one], [made(500, lambda c: c), dataclasses.replace(made(500, lambda c: c), detector="other")]):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^REFERENCE_INPUT: "):
             fit_curve(errors, "t")
-        assert error.value.code == "REFERENCE_INPUT"
 
 
 def test_a_saved_curve_never_changes(tmp_path):
     curve = fit_curve([made(5_000, lambda c: c)], "test-v1")
     save_curve(curve, tmp_path / "curves.json")
     save_curve(curve, tmp_path / "curves.json")
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         save_curve(fit_curve([made(5_000, lambda c: c, 9)], "test-v1"), tmp_path / "curves.json")
-    assert error.value.code == "FILE_FORMAT"
 
 
 def test_without_noise_the_points_are_where_they_are(trial):
@@ -91,9 +89,8 @@ def test_without_noise_the_points_are_where_they_are(trial):
     assert errors.error_px.max() < 0.01
     assert errors.error_3d_cm.max() < 0.01
     assert 0.3 < np.median(truth.trunk_m) < 0.7
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^REFERENCE_INPUT: "):
         truth_of_synthetic(person(), trial.truth)
-    assert error.value.code == "REFERENCE_INPUT"
 
 
 def test_errors_are_counted_in_trunks(trial):
@@ -126,9 +123,8 @@ def test_a_camera_is_found_from_what_it_saw(trial):
     assert np.percentile(off, 95) < 0.05 * np.nanmedian(truth.trunk_px)
     lag_ms = float(truth.note.split("lag ")[1].split(" ")[0])
     assert abs(lag_ms - 40) <= 20
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^REFERENCE_INPUT: "):
         resect(seen, keypoints.time_s + 100.0, room)
-    assert error.value.code == "REFERENCE_INPUT"
 
 
 def test_markers_of_other_cameras(trial, tmp_path):
@@ -158,9 +154,8 @@ def test_markers_of_other_cameras(trial, tmp_path):
     # Without a pose it is found; four points of a walk are enough where they lie exactly right.
     found = point_errors(keypoints, truth_of_trc(keypoints, path, keypoints.camera), "synth", "walk", "r")
     assert found.error_px.max() < 1.0
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^REFERENCE_INPUT: "):
         truth_of_trc(person(7), path, keypoints.camera, pose)
-    assert error.value.code == "REFERENCE_INPUT"
 
 
 def test_the_table_by_hand():

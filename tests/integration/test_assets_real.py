@@ -9,7 +9,7 @@ from pbl_pipeline import assets, settings
 from pbl_pipeline.keypoints import MarkerAugmenter
 from pbl_pipeline.video import load_camera, probe
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.machine, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -99,7 +99,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert everything_but_refreshes() == kept
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_a_backup_of_an_older_version_is_restored_and_migrated(database: Path):
     """Made at commit 2e66321: one visit through the stand-ins of the chain, the tables alone."""
     with installation() as home:

@@ -113,7 +113,7 @@ def test_landmarks_are_on_her_in_98_percent_of_these_frames(keypoints):
     assert (np.hypot(hips[:, 0] - x, hips[:, 1] - y) < 60).mean() >= 0.98
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_looking_where_it_is_needed_is_as_good_as_looking_in_every_frame(demo, tracking, tmp_path):
     """Body circles of the walker, against the whole frame and all tiles searched in each of 40 frames."""
     everywhere = WatchParams(

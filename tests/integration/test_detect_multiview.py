@@ -20,8 +20,8 @@ pytestmark = pytest.mark.slow
     # behind.
     [
         ("cam02", "blazepose-33", (20, 45)),
-        ("cam02", "blazepose-heavy", (0, 0)),
-        pytest.param("cam04", "blazepose-heavy", (0, 0), marks=pytest.mark.machine),
+        pytest.param("cam02", "blazepose-heavy", (0, 0), marks=pytest.mark.long),
+        pytest.param("cam04", "blazepose-heavy", (0, 0), marks=pytest.mark.long),
     ],
 )
 def test_points_lie_where_four_cameras_see_them_and_sides_stay(shared_data, camera, method, exchanged):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ CAMERAS = ("cam_01", "cam_02", "cam_03")
 REFUSED = PblError("FIT_INPUT", found="x", expected="y", next_step="z")
 
 
+@functools.cache
 def rig_views(n_frames: int, backwards: bool = False) -> MultiView:
     """The walk of the stand-in's fit of a video, seen by three cameras without noise; or somebody who goes its way the
     other way round."""

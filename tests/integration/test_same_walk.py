@@ -16,7 +16,7 @@ from tests.rows import register, remove_all
 from tests.unit.test_blazepose import asset
 from workers.populate import populate
 
-pytestmark = [pytest.mark.machine, pytest.mark.slow]
+pytestmark = [pytest.mark.long, pytest.mark.slow]
 
 #: The variants of `research.benchmarks.same_walk`, and the picture as it is in another container.
 KINDS = (*VARIANTS, "other container")

@@ -1,6 +1,6 @@
 """An upgrade over all migrations whose process is killed at random statements, and begun again, loses no number.
 
-pytest -m machine tests/integration/test_upgrade_killed.py -s         # minutes; prints the statements it was killed at
+pytest -m long tests/integration/test_upgrade_killed.py -s         # minutes; prints the statements it was killed at
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from schemas import connection, migrations
 from tests.database import embedded_only, installation, keep, put_back
 from tests.rows import everything
 
-pytestmark = [pytest.mark.machine, pytest.mark.database, embedded_only]
+pytestmark = [pytest.mark.long, pytest.mark.database, embedded_only]
 
 #: Statements at which the upgrade is killed; the longest time (s) from the statement's begin to the kill.
 KILLS, LATEST_S = 20, 0.03

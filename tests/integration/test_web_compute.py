@@ -47,7 +47,7 @@ def visits(folder: Path) -> None:
     assert len(qc.SessionQc()) == 2
 
 
-def until(holds: Callable[[], bool], seconds: float = 60.0) -> None:
+def until(holds: Callable[[], bool], seconds: float = 300.0) -> None:
     end = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < end
@@ -197,6 +197,6 @@ def test_from_the_button_to_the_result(visits: None, chromium: Any, hold: Path):
         page.wait_for_timeout(2000)
         assert page.evaluate("window.loaded") == "once"  # it asks without loading the page
         (hold / "hold").unlink()
-        page.get_by_text("This visit is being computed").wait_for(state="detached", timeout=60_000)
+        page.get_by_text("This visit is being computed").wait_for(state="detached", timeout=300_000)
         page.wait_for_function("window.loaded === undefined")
     assert len(qc.SessionQc & fit.current()) == 2

@@ -1,5 +1,5 @@
 """From an empty database to two visits compared, in a Chromium, with nothing typed into a terminal. The stages that
-need a model's weights are stand-ins; with `-m machine` all stages run, on the demo recording."""
+need a model's weights are stand-ins; with `-m long` all stages run, on the demo recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.unit.test_blazepose import asset
 from workers.web.computing import compute_visit
 
 
-@pytest.fixture(params=["stand-ins", pytest.param("real", marks=[pytest.mark.machine, pytest.mark.slow])])
+@pytest.fixture(params=["stand-ins", pytest.param("real", marks=[pytest.mark.long, pytest.mark.slow])])
 def real(request: pytest.FixtureRequest) -> bool:
     return request.param == "real"
 

@@ -151,7 +151,7 @@ def test_german_fits_on_a_phone(chromium: Any, visits: None):
     assert not any(found.values()), {kind: bad for kind, bad in found.items() if bad}
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_pictures_of_every_page(chromium: Any, visits: None, tmp_path: Path):
     """At two widths, in both languages, light and dark: into the folder PBL_TEST_PICTURES, to be looked at."""
     folder, found = Path(os.environ.get("PBL_TEST_PICTURES", tmp_path)), {}

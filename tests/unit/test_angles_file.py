@@ -69,6 +69,5 @@ def test_a_straight_knee_is_not_minus_zero(walk, tmp_path: Path) -> None:
 
 
 def test_damaged_fit_is_refused(walk) -> None:
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         angles_table(dataclasses.replace(walk, qpos=walk.qpos[:, :39]))
-    assert caught.value.code == "FILE_FORMAT"

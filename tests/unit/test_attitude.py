@@ -53,18 +53,16 @@ BAD_PHONES = {
 @pytest.mark.parametrize("what", BAD_PHONES)
 def test_phone_arrays_that_cannot_be(tmp_path, what):
     time_s, quat = BAD_PHONES[what]
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         keypoints(phone_time_s=time_s, phone_quat_wxyz=quat)
-    assert code_of(error) == "PHONE_LOG"
     # The same in a file.
     keypoints().save(tmp_path / "k.npz")
     with np.load(tmp_path / "k.npz") as f:
         fields = {k: f[k] for k in f.files}
     fields |= {k: v for k, v in (("phone_time_s", time_s), ("phone_quat_wxyz", quat)) if v is not None}
     np.savez(tmp_path / "bad.npz", **fields)
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         Keypoints.load(tmp_path / "bad.npz")
-    assert code_of(error) == "PHONE_LOG"
 
 
 # --- the log of --attitude --------------------------------------------------------------------------------------
@@ -163,16 +161,13 @@ HEADER = "time_s,qw,qx,qy,qz"
 )
 def test_logs_that_cannot_be(tmp_path, text):
     (tmp_path / "log").write_text(text)
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         load_attitude(tmp_path / "log")
-    assert code_of(error) == "PHONE_LOG"
 
 
 def test_logs_that_are_no_text_or_not_there(tmp_path):
     (tmp_path / "log").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         load_attitude(tmp_path / "log")
-    assert code_of(error) == "PHONE_LOG"
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_MISSING: "):
         load_attitude(tmp_path / "none")
-    assert code_of(error) == "FILE_MISSING"

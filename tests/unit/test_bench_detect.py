@@ -37,6 +37,7 @@ def test_growth_of_memory():
     assert (growth(np.linspace(0, 1e9, 101)) or 0) > 3e8
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_command_on_a_short_video(tmp_path):
     for name in ("blazepose_detector", "blazepose_landmarks_heavy"):

@@ -100,9 +100,8 @@ def test_weighted_suppression_by_hand():
 
 def test_another_file_than_the_pinned_model_is_refused(tmp_path):
     (tmp_path / "model.tflite").write_bytes(b"not the model")
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^ASSET_CHECKSUM: "):
         BlazePoseDetector(tmp_path / "model.tflite")
-    assert error.value.code == "ASSET_CHECKSUM"
 
 
 def test_a_network_that_this_version_does_not_know_is_refused():

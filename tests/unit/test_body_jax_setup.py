@@ -18,6 +18,7 @@ SHOW = (
     "import pbl_pipeline.body, jax\n"
     "from pbl_pipeline import jax_setup\n"
     "jax_setup.configure()\n"
+    "jax_setup.import_mjx()\n"
     "c = jax.config\n"
     "print(c.jax_compilation_cache_dir, c.jax_persistent_cache_min_compile_time_secs,\n"
     "      c.jax_persistent_cache_min_entry_size_bytes, jax.numpy.zeros(1).dtype, sep='|')\n"
@@ -62,6 +63,6 @@ def test_load_body_may_be_called_first_inside_a_trace():
     from pbl_pipeline.body import model
 
     def height(x):
-        return x + model.load_body.__wrapped__().mjx_model.body_pos[1, 2]
+        return x + model.load_body.__wrapped__().mjx_model_and_data[0].body_pos[1, 2]
 
     assert jax.jit(height)(0.0) == jax.numpy.float32(0.975)

@@ -53,16 +53,13 @@ def test_folders_by_the_command(tmp_path: Path):
 
 def test_what_cannot_be_bridged(tmp_path: Path):
     old = folder_values(visits(tmp_path / "old", {"a": 90.0}))
-    with pytest.raises(PblError) as few:
+    with pytest.raises(PblError, match=r"^STATS_INPUT: "):
         bridge_table(bridge_pairs(old, old), ("x", "y"))
-    assert few.value.code == "STATS_INPUT"
     (tmp_path / "empty").mkdir()
-    with pytest.raises(PblError) as empty:
+    with pytest.raises(PblError, match=r"^FILE_MISSING: "):
         folder_values(tmp_path / "empty")
-    assert empty.value.code == "FILE_MISSING"
-    with pytest.raises(PblError) as unknown:
+    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
         bridge_module.refit_bridge_set("blazepose-v1", tmp_path)
-    assert unknown.value.code == "SOLVER_UNKNOWN"
     assert pbl("validate", "bridge", "blazepose").code == 2
 
 
@@ -78,7 +75,7 @@ def test_comparisons_that_a_change_touches():
     assert found.to_records(index=False).tolist() == [("P1", "v1", "v2", "across"), ("P1", "v3", "v4", "old")]
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_frozen_set_by_two_methods_of_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     first = dict(list(bridge_module.BRIDGE_SET.items())[:3])

@@ -102,9 +102,8 @@ def test_corners_counted_instead_of_squares(videos):
 
 
 def test_the_wrong_kind_of_board(videos):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^CALIBRATION_NO_BOARD: "):
         calibrate_video(videos["checkerboard"], BOARDS["charuco"])
-    assert error.value.code == "CALIBRATION_NO_BOARD"
 
 
 # --- views that do not determine a lens

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import inspect
+import types
 from pathlib import Path
+from typing import Any
 
 import pytest
-from datajoint import adapters, autopopulate, connection, heading, jobs, storage, table, user_tables
+from datajoint import adapters, autopopulate, connection, diagram, heading, jobs, storage, table, user_tables
 
-from schemas.datajoint_setup import MySQLOrMariaDB, datajoint
+from schemas.datajoint_setup import MySQLOrMariaDB, columns_read_once, datajoint
 
 ROOT = Path(__file__).resolve().parents[2]
 FACE = ROOT / "schemas" / "datajoint_setup.py"
@@ -75,6 +77,22 @@ def test_no_other_file_touches_a_private_name():
             if not (of_self and node.attr in own):
                 found.append(f"{file.relative_to(ROOT)}:{node.lineno} {node.attr}")
     assert not found
+
+
+def test_cascades_read_columns_once_where_they_are_told_to():
+    """`Diagram` makes its tables by the name that is replaced; the columns are shared inside of the block alone."""
+    assert "from .table import FreeTable" in inspect.getsource(diagram.Diagram._restricted_table)
+    server: Any = types.SimpleNamespace(adapter=adapters.get_adapter("mysql"))
+
+    def columns(name: str) -> object:
+        return table.FreeTable(server, f"`s`.`{name}`").heading
+
+    with columns_read_once():
+        assert columns("a") is (first := columns("a"))
+        assert columns("b") is not first
+    assert columns("a") is not first
+    with columns_read_once():
+        assert columns("a") is not first
 
 
 def test_no_delete_of_ours_asks():

@@ -334,9 +334,8 @@ def test_nothing_is_overwritten_unless_asked_and_the_recording_never(tmp_path):
     path = a_video(tmp_path / "walk.mp4")
     deidentify(path, tmp_path / "out.mp4", heads=one_head(12))
     for out, overwrite in ((tmp_path / "out.mp4", False), (path, True)):
-        with pytest.raises(PblError) as refused:
+        with pytest.raises(PblError, match=r"^FILE_UNWRITABLE: "):
             deidentify(path, out, heads=one_head(12), overwrite=overwrite)
-        assert refused.value.code == "FILE_UNWRITABLE"
     again = deidentify(path, tmp_path / "out.mp4", "pixelate", heads=one_head(12), overwrite=True)
     assert json.loads(again.sidecar.read_text())["how"] == "pixelate"
 
@@ -344,9 +343,8 @@ def test_nothing_is_overwritten_unless_asked_and_the_recording_never(tmp_path):
 def test_a_failure_leaves_no_file(tmp_path):
     path = a_video(tmp_path / "walk.mp4")
     info = dataclasses.replace(probe(path), n_frames=11)
-    with pytest.raises(PblError) as changed:
+    with pytest.raises(PblError, match=r"^VIDEO_CHANGED: "):
         deidentify(path, tmp_path / "out.mp4", heads=one_head(12), info=info)
-    assert changed.value.code == "VIDEO_CHANGED"
     assert [p.name for p in tmp_path.iterdir()] == ["walk.mp4"]
 
 
@@ -354,9 +352,8 @@ def test_calls_that_cannot_work(tmp_path):
     path = a_video(tmp_path / "walk.mp4")
     wrong: list[dict[str, Any]] = [{"how": "mosaic"}, {"keep": ["name"]}, {"out": tmp_path / "out.mov"}]
     for arguments in wrong:
-        with pytest.raises(PblError) as usage:
+        with pytest.raises(PblError, match=r"^USAGE: "):
             deidentify(path, **({"out": tmp_path / "out.mp4"} | arguments), heads=one_head(12))
-        assert usage.value.code == "USAGE"
     (tmp_path / "text.mp4").write_text("not a video")
     assert pbl("deidentify", tmp_path / "text.mp4").error_code == "VIDEO_NOT_A_VIDEO"
     assert pbl("deidentify", tmp_path / "none.mp4").error_code == "VIDEO_MISSING"

@@ -127,9 +127,8 @@ def test_a_visit_of_its_own_is_in_the_folder_bids(visit: Visit, tmp_path: Path):
 @pytest.mark.parametrize(("subject", "label"), [("P001", "20260301"), ("---", "a")])
 def test_labels_that_are_alike_or_empty_are_refused(visit: Visit, dataset: Path, tmp_path: Path, subject, label):
     before = sorted(dataset.rglob("*"))
-    with pytest.raises(PblError) as refused:
+    with pytest.raises(PblError, match=r"^EXPORT_INPUT: "):
         write_export(visit, ["bids"], tmp_path / "new", ExportOptions(bids=(dataset, Labels.of(subject, label))))
-    assert refused.value.code == "EXPORT_INPUT"
     assert sorted(dataset.rglob("*")) == before
 
 

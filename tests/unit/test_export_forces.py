@@ -89,9 +89,8 @@ def test_forces_are_in_newtons_in_opensims_ground(visit: Visit, tmp_path: Path) 
 
 def test_without_mass_or_forces_nothing_is_written(visit: Visit, tmp_path: Path) -> None:
     for kinetics in (None, dataclasses.replace(of(visit), mass_kg=None)):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^EXPORT_INPUT: "):
             write_export(dataclasses.replace(visit, kinetics=kinetics), ["forces"], tmp_path / "out")
-        assert error.value.code == "EXPORT_INPUT"
         assert not (tmp_path / "out").exists()
 
 

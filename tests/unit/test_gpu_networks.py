@@ -40,7 +40,11 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize(
     "name",
-    ["blazepose_detector", "blazepose_landmarks", pytest.param("blazepose_landmarks_heavy", marks=pytest.mark.machine)],
+    [
+        "blazepose_detector",
+        pytest.param("blazepose_landmarks", marks=pytest.mark.long),
+        pytest.param("blazepose_landmarks_heavy", marks=pytest.mark.long),
+    ],
 )
 def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
@@ -124,9 +128,8 @@ def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monk
     assert "the GPU does not compute it" in network.note
     assert all(np.allclose(before[s].ravel(), after[s].ravel(), atol=0.01) for s in after)
     monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^DEVICE_UNAVAILABLE: "):
         asked(picture)
-    assert caught.value.code == "DEVICE_UNAVAILABLE"
 
 
 def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(

@@ -204,7 +204,7 @@ def packed_larger(monkeypatch, *trials, motion: str) -> Session:
     return session_of(*trials, motion=motion)
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_padding_changes_nothing(monkeypatch):
     motion = "handheld"  # which has all that a standing camera has
     trials = [observe(walk_qpos(TIME_S, seed=i), TIME_S, seed=i, camera_motion=motion).keypoints for i in (3, 4)]
@@ -248,7 +248,7 @@ def test_frames_and_phone_samples_are_drawn_from_those_that_count(handheld):
     np.testing.assert_allclose(np.abs(quat[1, 5] @ k2.phone_quat_wxyz[at]), 1, atol=1e-9)
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_a_held_phone_is_recovered(handheld):
     qpos, seen, session = handheld
     solution = solve_implicit(session, quick(1500, start="keypoints"))
@@ -310,7 +310,7 @@ def test_the_papers_total_of_markers_in_the_world_is_not_centred():
     assert objective_of(session, at, *zero) == pytest.approx(2.0 * weight.sum(axis=1).mean(), rel=0.01)
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["markers", "views"])
 def test_markers_in_the_world_and_several_cameras_are_fitted(kind):
     q = walk_qpos(TIME_S, seed=6, path="treadmill")

@@ -64,9 +64,8 @@ def test_markers_go_through_a_file(tmp_path):
     ],
 )
 def test_markers_that_cannot_be(changes):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         markers(**changes)
-    assert code_of(error) == "FILE_FORMAT"
 
 
 @pytest.mark.parametrize("lost", ["time_s", "names", "marker_set", "xyz_world_m", "confidence"])
@@ -88,9 +87,8 @@ def test_markers_are_put_into_the_order_of_a_set():
     np.testing.assert_array_equal(chosen.xyz_world_m[:, 2], markers().xyz_world_m[:, 0])
     assert np.isnan(chosen.xyz_world_m[:, 1]).all()
     assert chosen.confidence.tolist() == [[1, 0, 1]] * T
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^MARKER_SET_UNKNOWN: "):
         markers().select(("X", "Y"))
-    assert code_of(error) == "MARKER_SET_UNKNOWN"
 
 
 # --- TRC --------------------------------------------------------------------------------------------------------
@@ -154,12 +152,10 @@ def test_files_that_are_no_trc(tmp_path):
         "empty": "FILE_FORMAT",
         "no": "FILE_MISSING",
     }.items():
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=rf"^{code}: "):
             WorldMarkers.from_trc(tmp_path / f"{name}.trc", "lab")
-        assert code_of(error) == code
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^USAGE: "):
         trc(tmp_path, ROWS, up="x")
-    assert code_of(error) == "USAGE"
 
 
 @pytest.mark.parametrize("units", ["m", "mm"])
@@ -210,9 +206,8 @@ def test_views_of_one_trial():
     ],
 )
 def test_views_that_do_not_belong_together(other, code):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=rf"^{code}: "):
         MultiView((keypoints(), keypoints(**other)), (POSE, POSE))
-    assert code_of(error) == code
 
 
 def looking(x: float, z: float, distance: float = 4.0) -> tuple[Keypoints, CameraPose]:
@@ -255,12 +250,10 @@ def test_rays_that_meet_and_rays_that_miss():
 
 
 def test_too_few_views_or_poses():
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FIT_INPUT: "):
         MultiView((keypoints(),), (POSE,))
-    assert code_of(error) == "FIT_INPUT"
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
         MultiView((keypoints(), keypoints()), (POSE,))
-    assert code_of(error) == "CAMERA_INVALID"
     shorter = {k: getattr(keypoints(), k)[:-1] for k in ("time_s", "xy_px", "xyz_cam_m", "confidence", "box_px")}
     with pytest.raises(PblError) as error:
         MultiView((keypoints(), keypoints(**shorter)), (POSE, POSE))
@@ -282,9 +275,8 @@ def test_too_few_views_or_poses():
     ],
 )
 def test_poses_that_cannot_be(R, p):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
         CameraPose(R, p)
-    assert code_of(error) == "CAMERA_INVALID"
 
 
 def test_poses_by_hand(calibration):
@@ -310,9 +302,8 @@ def test_poses_by_hand(calibration):
 )
 def test_calibrations_that_cannot_be(calibration, old, new):
     calibration.write_text(CALIBRATION.replace(old, new))
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
         load_camera_poses(calibration)
-    assert code_of(error) == "CAMERA_INVALID"
 
 
 def test_files_find_their_cameras(calibration):
@@ -320,9 +311,8 @@ def test_files_find_their_cameras(calibration):
     assert cameras_of_files(["walk.cam_01", "walk.cam_02"], calibration) == ("walk", ["cam_01", "cam_02"])
     assert cameras_of_files(["left", "right"], calibration) == ("trial", ["cam_01", "cam_02"])
     for stems in (["cam_01", "right"], ["cam_01", "cam_01"], ["a", "b", "c"], ["a"]):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
             cameras_of_files(stems, calibration)
-        assert code_of(error) == "CAMERA_INVALID"
 
 
 def test_lenses_come_from_the_calibration(calibration):
@@ -331,9 +321,8 @@ def test_lenses_come_from_the_calibration(calibration):
     )
     assert [v.camera.matrix[0, 2] for v in views.views] == [250, 500]
     assert views.poses[0].p_nc.tolist() == [0, 0, -2]
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
         MultiView.from_calibration([keypoints(), keypoints()], calibration, ["cam_01", "cam_09"])
-    assert code_of(error) == "CAMERA_INVALID"
 
 
 #: Column of each marker of the TRC file (hips and legs right, left; neck, head, nose; arms right, left) in OpenPose's

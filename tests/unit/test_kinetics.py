@@ -385,9 +385,8 @@ def test_mujoco_is_asked_without_joint_limits() -> None:
 
 @pytest.mark.parametrize("mass_kg", [0.07, 4.0, 700.0, float("nan")])
 def test_a_mass_that_no_person_has_is_refused(mass_kg: float) -> None:
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FIT_INPUT: "):
         check_mass(mass_kg)
-    assert error.value.code == "FIT_INPUT"
     check_mass(None)
     check_mass(68.5)
 
@@ -408,9 +407,8 @@ def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(walk: Trial
 
 def test_kinetics_of_other_recordings_are_refused(walk: TrialFit, tmp_path: Path) -> None:
     save_kinetics(kinetics_of(walk), tmp_path)
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         load_kinetics(tmp_path, ["another"])
-    assert error.value.code == "FILE_FORMAT"
     assert load_kinetics(tmp_path / "empty", ["walk"]) is None
 
 

@@ -348,9 +348,8 @@ def test_several_frames_in_one_call_are_the_same_as_one_by_one(tmp_path):
 
 
 def test_a_model_without_spread_has_no_confidence(tmp_path):
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^USAGE: "):
         detector(tmp_path, "crop3d", dot_models.crop3d(person()), 1)
-    assert caught.value.code == "USAGE"
 
 
 def test_another_model_than_the_method_froze(tmp_path):
@@ -361,9 +360,8 @@ def test_another_model_than_the_method_froze(tmp_path):
         ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2),
         ModelParams(spec.name, spec.sha256, "0" * 64, spec.licence, 2),
     ):
-        with pytest.raises(PblError) as caught:
+        with pytest.raises(PblError, match=r"^MODEL_CHECKSUM: "):
             OnnxKeypoints(params, "cpu", tmp_path)
-        assert caught.value.code == "MODEL_CHECKSUM"
 
 
 class BlazePoseAsCropModel:
@@ -526,9 +524,8 @@ def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
 
 def test_the_detector_onnx_without_a_model(video):
     path, tracking = video
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
         detect_keypoints(path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
-    assert caught.value.code == "SOLVER_UNKNOWN"
 
 
 def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered, tmp_path, monkeypatch):

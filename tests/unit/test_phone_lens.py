@@ -203,15 +203,13 @@ def test_the_first_picture_says_what_the_whole_video_does(tmp_path):
 def test_files_that_name_no_phone(tmp_path, changes):
     path = tmp_path / "camera.json"
     path.write_text(json.dumps({**FIELDS, **changes}))
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
         load_lens_calibration(path)
-    assert caught.value.code == "CAMERA_INVALID"
 
 
 def test_recordings_and_texts_that_name_no_phone(tmp_path):
     (tmp_path / "camera.json").write_text(json.dumps(FIELDS))
     (tmp_path / "camera.toml").write_text("[a]\nsize = [1920, 1080]\n")
     for file, like in (("camera.json", small(tmp_path / "copy.mp4")), ("camera.toml", None), ("none.json", None)):
-        with pytest.raises(PblError) as caught:
+        with pytest.raises(PblError, match=r"^CAMERA_INVALID: "):
             load_lens_calibration(tmp_path / file, like)
-        assert caught.value.code == "CAMERA_INVALID"

@@ -153,9 +153,8 @@ def test_broken_exports(tmp_path, folder):
     for text in ('[{"sensor": "Orientation", "time": "x"', '[{"sensor":' * 20_000, '{"a":' * 20_000):
         (tmp_path / "b.json").write_text(text)
         error_of(read_phone_log, tmp_path / "b.json")
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_MISSING: "):
         read_phone_log(tmp_path / "none.zip")
-    assert error.value.code == "FILE_MISSING"
 
 
 def test_an_archive_with_wrong_bytes(folder, tmp_path):

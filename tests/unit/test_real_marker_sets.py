@@ -133,7 +133,7 @@ def test_a_second_of_walking_from_laboratory_markers(walk):
         assert [n for n in marker_ik.JUDGED if not found[n].passed] == []
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_second_of_balancing_from_four_cameras(shared_data):
     trial = multiview.multi_view()

@@ -227,9 +227,8 @@ def test_the_picture_survives_the_file(tmp_path):
     np.testing.assert_allclose(again.detail, CLEAN.detail)
     data = dict(np.load(tmp_path / "k.npz"))
     np.savez(tmp_path / "bad.npz", **{k: v for k, v in data.items() if k != "picture_luma"})
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         Keypoints.load(tmp_path / "bad.npz")
-    assert error.value.code == "FILE_FORMAT"
 
 
 # --- whole-body visibility --------------------------------------------------------------------------------------

@@ -197,6 +197,5 @@ TIED[:, 0] = 0.0
     ],
 )
 def test_what_cannot_be_tested_is_refused(a, b, options):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^STATS_INPUT: "):
         curve_test(a, b, **options)
-    assert error.value.code == "STATS_INPUT"

@@ -286,6 +286,5 @@ FLAT = [2.0] * 5
     ],
 )
 def test_what_supports_no_number_is_refused(call):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^STATS_INPUT: "):
         call()
-    assert error.value.code == "STATS_INPUT"

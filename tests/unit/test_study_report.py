@@ -267,7 +267,7 @@ def test_the_files_of_a_report(written):
     assert float(found[0]["low"]) < made.INDEX.srm < float(found[0]["high"])
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_script_of_a_folder_makes_the_same_tables(written):
     """In a process that cannot import the tables of the database."""
@@ -347,7 +347,7 @@ def test_what_is_not_defined_is_a_code_and_never_a_number(change):
     assert number_of_codes(study_results(less, plan(less), permutations=200)) or change is no_index
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_page_says_once_per_table_why_something_is_not_defined(change, tmp_path):
@@ -374,13 +374,11 @@ def test_what_is_compared_can_be_chosen(study):
     assert (other.change_from, other.change_to, other.groups[0]) == ("6_weeks", "6_months", made.CONTROLS)
     assert len(pairs(visit_table(study), other, "gdi")) <= 20
     for wrong in ({"change_from": "week 9"}, {"change_group": "knee"}, {"change_from": "pre", "change_to": "pre"}):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^USAGE: "):
             plan(study, **wrong)
-        assert error.value.code == "USAGE"
     none = dataclasses.replace(study, visits=study.visits.assign(included=False, reason="left"))
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^STUDY_INVALID: "):
         plan(none)
-    assert error.value.code == "STUDY_INVALID"
 
 
 def test_without_a_description_roles_and_group_follow_from_the_visits(study):

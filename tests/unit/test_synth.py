@@ -193,7 +193,7 @@ def test_standing_feet_neither_slide_nor_sink(spec: dict):
         assert in_room(truth)[..., 2].min() > -0.002
 
 
-@pytest.mark.machine
+@pytest.mark.long
 def test_feet_stand_and_joints_keep_their_ranges_in_every_impairment_and_task():
     low, high = load_body().joint_range_rad.T
     for name in IMPAIRMENTS:

@@ -129,7 +129,7 @@ def test_a_change_of_the_pixel_changes_nothing(fitted, factor):
     np.testing.assert_allclose(other.residual_2d_px, factor * own.residual_2d_px, rtol=1e-3, atol=factor * 1e-2)
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_paper_in_a_picture_of_another_size_means_the_same():
     few = dataclasses.replace(METHODS["paper-2025"].params, steps=200, hidden=(32,), n_skip=1)

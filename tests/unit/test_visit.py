@@ -603,9 +603,8 @@ def test_measures_of_an_earlier_fit_are_refused(two: Visit, saved: Path) -> None
 
 def test_measures_of_other_recordings_do_not_make_a_visit(two: Visit) -> None:
     for others in ([stand("stand")], [walk("back"), walk("walk")], [walk("walk")]):
-        with pytest.raises(PblError) as caught:
+        with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
             two.with_measures(gait_metrics(others))
-        assert caught.value.code == "FILE_FORMAT"
 
 
 @pytest.mark.parametrize("change", [{"params_hash": "of another fit"}, {"trials": ["another"]}])

@@ -161,7 +161,7 @@ def changed(folder: Path, **fields) -> Path:
     return folder
 
 
-@pytest.mark.machine
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_walker_of_a_real_clip(folder, registry, shared_data, tmp_path):
     models.add(folder)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
@@ -53,6 +52,8 @@ def detect_by_foot_velocity(feet: FootTrajectories, method: Method[FootVelocityP
     lowest, highest = np.nanpercentile(heel, [2, 98], axis=0)
 
     def extrema(segment: Segment) -> list[Extremum]:
+        from scipy.signal import find_peaks  # takes longer to import than most commands run
+
         found = []
         step = segment.time_s[1] - segment.time_s[0]
         window = int(2 * 60 / p.min_cadence_per_min * p.grid_hz) | 1

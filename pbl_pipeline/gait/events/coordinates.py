@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
@@ -165,6 +164,8 @@ def forward_signals(feet: FootTrajectories, p: EventParams) -> tuple[np.ndarray,
 
 def _candidates(segment: Segment, leg: float, p: EventParams) -> list[Extremum]:
     """All extrema of one segment that pass the absolute threshold."""
+    from scipy.signal import find_peaks  # takes longer to import than most commands run
+
     window = int(2 * 60 / p.min_cadence_per_min * p.grid_hz) | 1
     found = []
     for s, side in enumerate(SIDES):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
-from scipy.signal import butter, sosfiltfilt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +37,8 @@ def uniform_segments(
     Butterworth run forward and backward: `filter_order` counts both passes, and its cut-off is corrected so that
     the two passes together are at -3 dB at `cutoff_hz`.
     """
+    from scipy.signal import butter, sosfiltfilt  # takes longer to import than most commands run
+
     seen = np.flatnonzero(np.all(np.isfinite(values), axis=1))
     if len(seen) < 2:
         return []
