@@ -9,11 +9,10 @@ from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
-from .checks import check_columns, check_row, check_values
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import Rows, number, one, row_of, stored_rows
+from .rows import Rows, check_columns, check_row, check_values, number, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -12,15 +12,14 @@ from scipy.interpolate import PchipInterpolator
 from pbl_pipeline.qc import Check, failed
 
 from ._angles import AngleSeries, angle_series
-from ._camera_side import far_leg, mostly
-from ._exclusion import Exclusion
+from .cycle_measures import far_leg, mostly
 from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 from .outliers import without_missed_steps, without_odd_curves
-from .types import NO_POSITIONS, GaitCycle, Lengths
+from .types import NO_POSITIONS, Exclusion, GaitCycle, Lengths
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

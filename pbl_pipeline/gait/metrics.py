@@ -15,7 +15,6 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
-from ._condition import Condition
 from ._cycles import find_cycles
 from ._gdi import (
     GDI_METHODS,
@@ -37,7 +36,7 @@ from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
 from .tasks import TASK_MEASURES, task_measures, task_motion
-from .types import GaitCycle
+from .types import Condition, GaitCycle
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

@@ -10,12 +10,12 @@ from pbl_pipeline.qc import EMPTY, PASS, Check
 
 from ._cycles import GaitCycle
 from ._gdi import Gdi, GdiCycle
-from ._profile import MovementProfile
 from .curves_file import Curves
 from .cycle_measures import MEASURES, Measure, Spatiotemporal
 from .events import GaitEvent, GaitEvents
 from .metrics import GaitMetrics, TrialMetrics
 from .tasks import TRIAL_MEASURES
+from .types import MovementProfile
 
 #: Checks of the index among the checks of a trial or session; the others are of its measures.
 INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")

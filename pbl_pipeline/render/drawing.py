@@ -1,4 +1,6 @@
-"""Capsules and keypoints drawn into one picture with OpenCV."""
+"""World points projected into one picture; capsules, keypoints and skeletons drawn there with OpenCV.
+
+Colours are blue and vermilion of Okabe and Ito (2008), which differ for every colour vision."""
 
 from __future__ import annotations
 
@@ -6,10 +8,113 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.render.colours import SIDE_COLOUR, bgr, side_of
-from pbl_pipeline.render.projection import NEAR_M, to_camera, to_pixels
 from pbl_pipeline.video import Camera
+
+#: Nothing nearer to the camera than this is drawn (m): the pinhole equations grow without bound there.
+NEAR_M = 0.1
+
+
+def rotation_matrix(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order w, x, y, z (normalised here).
+
+    For `phone_quat_wxyz` this is R_nc: it takes camera vectors to the world.
+    """
+    q = np.asarray(quat_wxyz, float)
+    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
+
+
+def to_camera(points_world_m: np.ndarray, quat_wxyz: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+    """Points (..., 3) of the world in the frame of the camera at `position_m` (3,): x right, y down, z forward (m)."""
+    # x_cam = R_nc^T (x_world - p_nc); with row vectors that is a product from the right by R_nc.
+    return (np.asarray(points_world_m, float) - np.asarray(position_m, float)) @ rotation_matrix(quat_wxyz)
+
+
+def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (..., 2) of camera-frame points (..., 3).
+
+    Pinhole with OpenCV's radial-tangential distortion (k1, k2, p1, p2, k3). NaN for points nearer than `NEAR_M` or
+    behind the camera, and for points so far off the axis that the radial polynomial turns back: beyond that angle the
+    polynomial is no lens, and it would fold the point into the picture.
+    """
+    p = np.asarray(points_cam_m, float)
+    depth = np.where(p[..., 2] >= NEAR_M, p[..., 2], np.nan)
+    x, y = p[..., 0] / depth, p[..., 1] / depth
+    k1, k2, p1, p2, k3 = np.asarray(camera.distortion, float)
+    r2 = x * x + y * y
+    r2 = np.where(r2 < turning_radius2(camera), r2, np.nan)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    m = np.asarray(camera.matrix, float)
+    return np.stack([m[0, 0] * xd + m[0, 1] * yd + m[0, 2], m[1, 1] * yd + m[1, 2]], axis=-1)
+
+
+def scaled_camera(camera: Camera, factor_x: float, factor_y: float) -> Camera:
+    """The camera of a picture resized by these factors. Pixel centres are whole numbers, hence the half pixels."""
+    m = np.array(camera.matrix, float)
+    m[0] *= factor_x
+    m[1] *= factor_y
+    m[0, 2] += 0.5 * (factor_x - 1)
+    m[1, 2] += 0.5 * (factor_y - 1)
+    return Camera(m, camera.distortion, camera.source)
+
+
+def turning_radius2(camera: Camera) -> float:
+    """Squared normalised radius where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it never does."""
+    k1, k2, _, _, k3 = np.asarray(camera.distortion, float)
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = roots[np.abs(roots.imag) < 1e-12].real
+    return float(min(real[real > 0], default=np.inf))
+
+
+#: side -> "#rrggbb". Left is the warm colour, as in most gait laboratories.
+SIDE_COLOUR: dict[str, str] = {"right": "#0072b2", "left": "#d55e00", "middle": "#8a8f98"}
+
+
+def bgr(colour: str) -> tuple[int, int, int]:
+    """OpenCV's order of a "#rrggbb" colour."""
+    value = int(colour.lstrip("#"), 16)
+    return value & 255, (value >> 8) & 255, value >> 16
+
+
+def side_of(name: str) -> str:
+    """ "right", "left" or "middle" of a body part, joint or capsule by its OpenSim name (`femur_r`, `femur_r_2`)."""
+    parts = name.lower().split("_")[1:]
+    if "r" in parts or "right" in name.lower().split("_"):
+        return "right"
+    if "l" in parts or "left" in name.lower().split("_"):
+        return "left"
+    return "middle"
+
+
+#: Joints from the trunk outwards; a line joins those that a marker set has.
+_LIMB = (("shoulder", "elbow"), ("elbow", "wrist"), ("wrist", "index"), ("hip", "knee"), ("knee", "ankle"))
+_FOOT = (("ankle", "heel"), ("heel", "foot_index"), ("ankle", "foot_index"))
+_ACROSS = ("shoulder", "hip")
+
+
+def skeleton_lines(names: Sequence[str]) -> list[tuple[int, int, str]]:
+    """Indices of the two ends and the side ("left", "right", "middle") of each line of a marker set whose names are
+    `left_knee`, `right_knee` and so on (`blazepose_33`)."""
+    at = {name: i for i, name in enumerate(names)}
+    pairs = [(f"{side}_{a}", f"{side}_{b}", side) for side in ("left", "right") for a, b in (*_LIMB, *_FOOT)]
+    pairs += [(f"{side}_shoulder", f"{side}_hip", "middle") for side in ("left", "right")]
+    pairs += [(f"left_{joint}", f"right_{joint}", "middle") for joint in _ACROSS]
+    return [(at[a], at[b], side) for a, b, side in pairs if a in at and b in at]
+
+
+def draw_skeleton(image: np.ndarray, names: Sequence[str], xy_px: np.ndarray) -> None:
+    """Draw the lines between known points (J, 2) in px into `image` (H, W, 3) uint8 BGR, in place; nothing of a
+    face."""
+    known = np.asarray(np.isfinite(xy_px).all(axis=1), bool)
+    width = max(2, round(max(image.shape[:2]) / 320))
+    for a, b, side in skeleton_lines(names):
+        if known[a] and known[b]:
+            start, end = ((round(float(x)), round(float(y))) for x, y in (xy_px[a], xy_px[b]))
+            cv2.line(image, start, end, bgr(SIDE_COLOUR[side]), width, cv2.LINE_AA)
+
 
 _CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 24, endpoint=False)) for f in (np.cos, np.sin)], axis=-1)
 _SHIFT = 4  # OpenCV's polygon corners carry this many fractional bits

@@ -14,8 +14,7 @@ from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.render.drawing import capsule_outline, draw_body, draw_keypoints
-from pbl_pipeline.render.projection import scaled_camera, to_camera
+from pbl_pipeline.render.drawing import capsule_outline, draw_body, draw_keypoints, scaled_camera, to_camera
 from pbl_pipeline.render.strip import Event, Strip
 from pbl_pipeline.video import read_frames, write_h264
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline.body import joint_angles
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.render.colours import SIDE_COLOUR, bgr
+from pbl_pipeline.render.drawing import SIDE_COLOUR, bgr
 from pbl_pipeline.runs import runs
 
 _INK, _FAINT, _GRID, _PAPER = (51, 46, 42), (120, 112, 104), (232, 228, 224), (255, 255, 255)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.video import Camera
 
-from .curves import wander
+from .plan import wander
 
 #: An upright phone video: focal length about 1500 px, principal point in the middle (pixel centres count from 0).
 PHONE_SIZE_PX = (1080, 1920)

@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline.errors import PblError
 
 from .camera import HeldPhone, camera_turn
-from .curves import wander, within
-from .plan import GRID_STEP_S, Plan
+from .plan import GRID_STEP_S, Plan, wander, within
 
 #: Direction that the person faces at the start, against the phone's line of sight (deg): 180 comes towards it, 90 shows
 #: the left side. With "follow" the phone is carried behind the person.

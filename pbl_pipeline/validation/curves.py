@@ -15,8 +15,7 @@ from pbl_pipeline.gait import GaitCycle
 
 from .align import MAX_GAP_S, unwrapped
 from .compare import KinematicErrors, compare
-from .joints import split_side
-from .reference import Reference
+from .reference import Reference, split_side
 from .sources import fit_angles
 
 #: Phases of the curves in percent of the cycle: 101 points, as SPM1D's examples have.

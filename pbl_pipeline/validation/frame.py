@@ -8,8 +8,7 @@ from collections.abc import Iterable
 import pandas as pd
 
 from .compare import JointError, KinematicErrors
-from .joints import split_side
-from .view import CONTRALATERAL, IPSILATERAL, LATERAL
+from .reference import CONTRALATERAL, IPSILATERAL, LATERAL, split_side
 
 STATIC, HANDHELD, SEVERAL = "static", "handheld", "several"
 _JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError))

@@ -15,12 +15,21 @@ from scipy import stats
 
 from pbl_pipeline.errors import PblError
 
+from .compare import median_niqr, niqr, normality_p
 from .frame import COLUMNS, KEY
-from .joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
-from .paper import paper_cells
-from .statistics import median_niqr, niqr, normality_p
-from .table import Cell, Table
-from .view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
+from .reference import (
+    BACK,
+    CONTRALATERAL,
+    FRONT,
+    IPSILATERAL,
+    JOINTS_OPENCAP,
+    JOINTS_PAPER,
+    LATERAL,
+    MIXED,
+    ROWS_PAPER,
+    split_side,
+)
+from .table import Cell, Table, paper_cells
 
 #: Level of significance (the paper, Statistics).
 ALPHA = 0.05

@@ -17,8 +17,8 @@ from .. import session, study
 from ..decisions.review_decisions import record
 from ..intake.sheets import Row, Sheet, refused, with_point
 from ..transactions import in_transaction
-from .form_checks import check_fields, decided_meanwhile, last_decision
 from .study_sheets import CLEAR, SCORE_COLUMNS, import_rows
+from .visit_facts import check_fields, decided_meanwhile, last_decision
 
 #: Name of the field of the role; the others are named by their instruments.
 ROLE = "role"

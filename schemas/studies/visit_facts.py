@@ -5,21 +5,49 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label, check_mass
 
 from .. import lab, session, study, video
-from ..decisions.review_decisions import record
-from ..intake.conditions import set_condition
+from ..decisions.review_decisions import Decided, decisions, record
+from ..intake.records import replace_height, replace_mass, set_condition, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
-from ..intake.visits import replace_height, replace_mass, set_population
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
-from .form_checks import check_fields, decided_meanwhile, last_decision
 from .study_sheets import CLEAR, COLUMNS, import_rows
+
+
+def check_fields(session_id: int, given: Iterable[str], known: Collection[str], expected: str) -> None:
+    """Raise `PblError` USAGE for a field that the form does not have."""
+    if unknown := sorted(set(given) - set(known)):
+        raise PblError(
+            "USAGE",
+            found=f"a field {unknown[0][:64]!r}",
+            expected=expected,
+            next_step="load the form again",
+            key=f"session_id={session_id}",
+        )
+
+
+def last_decision(session_id: int, kinds: Collection[str]) -> Decided | None:
+    """Return the newest decision of these kinds about a visit; None where there is none."""
+    return next((d for d in decisions(session_id) if d.what in kinds), None)
+
+
+def decided_meanwhile(session_id: int, last: Decided | None, did: str) -> PblError:
+    """DECIDED_MEANWHILE for a form that was loaded before `last`, whose person `did` that; None: an import."""
+    who = "it was imported" if last is None else f"{last.by} {did} at {last.at} UTC"
+    return PblError(
+        "DECIDED_MEANWHILE",
+        found=f"since this form was loaded something else is stored: {who}",
+        expected="what the form showed; nothing of yours was written",
+        next_step="load the form again, look at what is stored, and enter then",
+        key=f"session_id={session_id}",
+    )
+
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
 NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}

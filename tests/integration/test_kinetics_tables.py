@@ -14,7 +14,7 @@ from pbl_pipeline.kinetics import MEASURES, METHODS, REASONS, Kinetics
 from pbl_pipeline.visit import Visit
 from schemas import capture, gait, gdi, kinetics, load_visit, session
 from schemas.intake import Methods, VisitRecord, ingest
-from schemas.intake.conditions import set_condition
+from schemas.intake.records import set_condition
 from schemas.reading.status import pipeline_status
 from schemas.reading.visit_progress import visit_progress
 from schemas.reading.why import why

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from pbl_pipeline.memory import return_large_blocks
+from pbl_pipeline.resources import return_large_blocks
 
 #: After the first picture was freed: does the next one lie in the heap, where it leaves a hole?
 PROGRAM = """

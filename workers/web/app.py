@@ -37,7 +37,6 @@ from . import (
     recordings,
     registration,
     reports,
-    sign_in,
     texts,
     trend,
     visits,
@@ -85,7 +84,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     if sessions is None and accounts is not None:
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    way = sign_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    way = accounts.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
     computing = ProcessQueue(most=50, kept=50)
 
@@ -159,7 +158,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     ]
     routes: list[Address] = [
         Address("/", home, OPEN),
-        *sign_in.routes(pages, way, link_used),
+        *accounts.routes(pages, way, link_used),
         Address("/language", language, "", methods=["POST"]),
         *parts,
         _files("static", "no-store"),

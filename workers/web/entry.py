@@ -8,7 +8,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
-from schemas.studies import own_instruments
+from schemas.studies import study_sheets
 from schemas.studies import visit_entry as enter
 
 from .access import Session, form_of
@@ -57,14 +57,14 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def add_instrument(request: Request) -> Response:
         fields = await form_of(request)
         session: Session = request.state.session
-        errors = await tables.ask(own_instruments.add_instrument, fields, session.name)
+        errors = await tables.ask(study_sheets.add_instrument, fields, session.name)
         if errors:
             return await instrument_page(request, fields, errors)
         return RedirectResponse("/instruments", 303)
 
     async def instrument_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
         rows = await tables.ask(enter.instruments)
-        fields = (*own_instruments.TEXTS, *own_instruments.NUMBERS, *own_instruments.FLAGS)
+        fields = (*study_sheets.TEXTS, *study_sheets.NUMBERS, *study_sheets.FLAGS)
         known = {name: values.get(name, "") for name in fields}
         return pages.show(
             request,
@@ -72,9 +72,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             instruments=rows,
             values=known,
             errors=errors,
-            texts=own_instruments.TEXTS,
-            numbers=own_instruments.NUMBERS,
-            flags=own_instruments.FLAGS,
+            texts=study_sheets.TEXTS,
+            numbers=study_sheets.NUMBERS,
+            flags=study_sheets.FLAGS,
         )
 
     return [
