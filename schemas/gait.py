@@ -17,7 +17,7 @@ from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
-    from pbl_pipeline.gait.curves_file import Curves
+    from pbl_pipeline.gait.metrics_file import Curves
 
 schema = dj.Schema()
 
@@ -273,7 +273,7 @@ class GaitCycle(dj.Computed):
         return cycles, None if correction is None else correction["correction_no"]
 
     def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:
-        from pbl_pipeline.gait.curves_file import save_curves
+        from pbl_pipeline.gait.metrics_file import save_curves
 
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
@@ -531,7 +531,7 @@ def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_row
 
 def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
-    from pbl_pipeline.gait.curves_file import load_curves
+    from pbl_pipeline.gait.metrics_file import load_curves
 
     with stored_file(ref) as path:
         curves = load_curves(path)

@@ -1,11 +1,9 @@
-"""Tables of columns that know their units, written as CSV and Parquet; 2D keypoints in DeepLabCut's form."""
+"""Tables of columns that know their units, and the two ways to write them: CSV and Parquet."""
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
-import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,39 +12,9 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.csv_cells import quoted
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
 
 from .text import lines, number_cells, text_cells
-from .trial import ExportTrial
-
-
-def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:
-    """Write pixels of the upright picture (x right, y down, origin at its upper left corner) and the confidence as the
-    detector states it (`likelihood`). One row per frame, number first; a point that was not seen has empty cells.
-
-    Raises `PblError` EXPORT_INPUT where the trial's keypoints are not at hand.
-    """
-    points = trial.keypoints
-    if points is None:
-        raise PblError(
-            "EXPORT_INPUT",
-            found="a fit without its keypoints",
-            expected="the keypoints.npz of the trial beside the fit, named alike",
-            next_step="put the keypoints of `pbl detect` or `pbl run` beside the fit, or leave out --to dlc",
-            key=trial.name,
-        )
-    n, j = points.xy_px.shape[:2]
-    scorer = f"pbl_{points.marker_set}"
-    head = [
-        ["scorer", *[scorer] * (3 * j)],
-        ["bodyparts", *(quoted(name) for name in points.names for _ in range(3))],
-        ["coords", *["x", "y", "likelihood"] * j],
-    ]
-    table = np.concatenate([points.xy_px, points.confidence[..., None]], axis=2).reshape(n, 3 * j)
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(head)
-    path.write_bytes(text.getvalue().encode() + lines([number_cells(np.arange(n), 0), number_cells(table, 4)], ","))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,8 +26,9 @@ from pbl_pipeline.visit import Visit
 
 from .bids import Labels, bids_files, check_labels, known_participants
 from .c3d import check_frames, write_c3d
-from .columns import Table, dictionary, write_csv, write_keypoints_csv, write_parquet
+from .columns import Table, dictionary, write_csv, write_parquet
 from .ground import check_forces, on_floor, taken_off, write_forces, write_mot
+from .keypoints_csv import write_keypoints_csv
 from .osim import write_osim, write_trc
 from .trial import ExportTrial, wanted_markers, with_body_points
 from .visit_tables import session_tables

@@ -23,7 +23,6 @@ from ._gdi import (
     worth_of_one_more,
 )
 from ._own_norm import norm_from_cycles
-from .change import IMPORTANT_CHANGE, Chances, chances, change_sd
 from .cycle_measures import (
     MEASURES,
     SIDED,
@@ -48,6 +47,7 @@ from .events import (
 )
 from .ground import cycle_lengths
 from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
+from .measurement import IMPORTANT_CHANGE, Chances, chances, change_sd
 from .metrics import (
     GaitMetrics,
     GaitParams,

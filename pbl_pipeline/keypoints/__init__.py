@@ -26,14 +26,15 @@ from .multi_view import (
 from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from .picture import Picture, PictureMeter
 from .protocol import KeypointDetector, KeypointParams
-from .quality_checks import check_keypoints, side_changes
-from .stated_confidence import (
+from .quality_checks import (
     BOUND_TRUNK,
     ConfidenceCurve,
+    check_keypoints,
     confidence_curve,
     confidence_curves,
     confidence_text,
     probability_within,
+    side_changes,
 )
 from .types import Keypoints, PersonKeypoints, log_shift_s
 from .virtual_camera import view_rotation

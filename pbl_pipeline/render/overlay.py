@@ -14,8 +14,15 @@ from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.render.drawing import capsule_outline, draw_body, draw_keypoints, scaled_camera, to_camera
-from pbl_pipeline.render.strip import Event, Strip
+from pbl_pipeline.render.drawing import (
+    Event,
+    Strip,
+    capsule_outline,
+    draw_body,
+    draw_keypoints,
+    scaled_camera,
+    to_camera,
+)
 from pbl_pipeline.video import read_frames, write_h264
 
 _BLOCK = 64  # frames whose capsules are computed and kept at a time

@@ -31,8 +31,8 @@ from pbl_pipeline.gait import (
 from pbl_pipeline.keypoints import confidence_text, visibility
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
 from pbl_pipeline.report import _figures
+from pbl_pipeline.report._figures import Picture
 from pbl_pipeline.report.forces import forces_section
-from pbl_pipeline.report.types import Picture
 from pbl_pipeline.report.words import (
     HEADLINES,
     OUTCOME_WORDS,

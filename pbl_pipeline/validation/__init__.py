@@ -4,8 +4,7 @@ from .align import align_path, best_lag
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
 from .compare import JointError, KinematicErrors, compare, compare_angles, median_niqr, niqr
 from .curves import CURVE_COLUMNS, cycle_curves, save_curves
-from .frame import COLUMNS, TrialErrors, error_frame
-from .paper_tables import paper_tables
+from .paper_tables import COLUMNS, TrialErrors, error_frame, paper_tables
 from .reference import (
     BODY_ROTATIONS,
     CONVENTIONS,
@@ -25,5 +24,15 @@ from .sources import (
     reference_of_mot,
     reference_of_qpos,
 )
-from .table import Cell, Table, paper_figures
-from .write import INDEX_COLUMNS, html, index_agreement, index_pairs, latex, print_tables, write_tables
+from .write import (
+    INDEX_COLUMNS,
+    Cell,
+    Table,
+    html,
+    index_agreement,
+    index_pairs,
+    latex,
+    paper_figures,
+    print_tables,
+    write_tables,
+)

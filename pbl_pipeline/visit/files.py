@@ -20,8 +20,7 @@ from pbl_pipeline.files import load_npz
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.angles_file import write_angles_csv
 from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
-from pbl_pipeline.gait.curves_file import Curves, load_curves, save_curves
-from pbl_pipeline.gait.metrics_file import metrics_of
+from pbl_pipeline.gait.metrics_file import Curves, load_curves, metrics_of, save_curves
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.kinetics.kinetics_file import kinetics_of, load_arrays, save_arrays, save_content

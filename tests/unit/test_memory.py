@@ -13,7 +13,7 @@ from pbl_pipeline.resources import return_large_blocks
 PROGRAM = """
 import sys
 import numpy as np
-from pbl_pipeline.memory import return_large_blocks
+from pbl_pipeline.resources import return_large_blocks
 
 if sys.argv[1] == "fixed":
     assert return_large_blocks()

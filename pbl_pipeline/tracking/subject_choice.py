@@ -3,19 +3,125 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.video import read_frames
 
-from .contact_sheets import save_contact_sheet
 from .methods import SUBJECT_METHODS
 from .types import PersonTrack, SubjectChoice, Tracking
 from .walker_score import MOST_LISTED, SubjectParams
+
+#: Width of one moment in the sheet (px), moments at least and at most, moments side by side.
+_WIDTH, _LEAST, _MOST, _COLUMNS = 640, 4, 9, 3
+_JPEG_QUALITY = 85
+_COLOURS = ((80, 220, 80), (60, 120, 255), (255, 160, 40), (220, 80, 220), (60, 220, 255), (200, 200, 200))
+
+
+def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int] | None = None) -> np.ndarray:
+    """A picture (H, W, 3) uint8 BGR of a few moments in order of time, everybody of `persons` boxed and numbered.
+
+    `persons` (default: everybody) in order of interest: of as many as there is room for, the moment is shown in which
+    the person is seen best, then moments spread over the video in which most of them are in view. Who has no moment is
+    still boxed in those of the others.
+
+    Raises `ValueError` when nobody was tracked, and the `PblError`s of `video.read_frames`.
+    """
+    wanted = list(persons) if persons is not None else [p.person_id for p in tracking.persons]
+    people = [p for k in wanted for p in tracking.persons if p.person_id == k]
+    if not people:
+        raise ValueError("a contact sheet needs at least one person")
+    moments = _moments(people, tracking)
+    cells = []
+    for frame in read_frames(video_path, start=min(moments), stop=max(moments) + 1):
+        if frame.index in moments:
+            cells.append(_cell(frame.image, people, tracking, frame.index))
+    columns = min(math.ceil(math.sqrt(len(cells))), _COLUMNS)
+    cells += [np.zeros_like(cells[0])] * (-len(cells) % columns)
+    rows = [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]
+    return np.vstack(rows)
+
+
+def contact_sheet_jpeg(video_path: str | Path, tracking: Tracking, choice: SubjectChoice) -> bytes:
+    """The `contact_sheet` of everybody, those with the best scores first, as the bytes of a JPEG. Raises as it."""
+    ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
+    return _encoded(contact_sheet(video_path, tracking, ranked), ".jpg")
+
+
+def save_contact_sheet(
+    video_path: str | Path, tracking: Tracking, out_path: str | Path, persons: Sequence[int] | None = None
+) -> Path:
+    """Write the `contact_sheet` as PNG or JPEG, by the suffix of `out_path`.
+
+    Raises as `contact_sheet`, and OSError when the file cannot be written.
+    """
+    path = Path(out_path)
+    suffix = ".png" if path.suffix.lower() == ".png" else ".jpg"
+    path.write_bytes(_encoded(contact_sheet(video_path, tracking, persons), suffix))
+    return path
+
+
+def _encoded(sheet: np.ndarray, suffix: str) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY] if suffix == ".jpg" else []
+    done, data = cv2.imencode(suffix, sheet, options)
+    if not done:
+        raise OSError(f"a picture of {sheet.shape[1]}x{sheet.shape[0]} px could not be encoded as {suffix}")
+    return data.tobytes()
+
+
+def _moments(people: Sequence[PersonTrack], tracking: Tracking) -> set[int]:
+    """Frame numbers: the best of each person, then those in the middle of the longest stretches without one."""
+    chosen = {_best_frame(p, tracking.image_size_px) for p in people[:_MOST]}
+    in_view = np.sum([np.isfinite(p.box_px[:, 0]) for p in people], axis=0)
+    n = len(tracking.time_s)
+    while len(chosen) < min(_LEAST, n):
+        edges = [-1, *sorted(chosen), n]
+        gaps = [(b - a, a) for a, b in itertools.pairwise(edges) if b - a > 1]
+        length, start = max(gaps)
+        # In the inner third of the gap, where most people are in view.
+        inner = np.arange(start + 1 + (length - 1) // 3, start + length - (length - 1) // 3)
+        chosen.add(int(inner[np.argmax(in_view[inner])]))
+    return chosen
+
+
+def _best_frame(person: PersonTrack, size: tuple[int, int]) -> int:
+    """The frame in which the person is seen best: surely, and not cut by the picture's edge."""
+    box = person.box_px
+    inside = np.all((box > 1) & (box < np.array([*size, *size]) - 1), axis=1)
+    return int(np.argmax(np.where(np.isfinite(box[:, 0]), person.score + inside, -1.0)))
+
+
+def _cell(image: np.ndarray, people: Sequence[PersonTrack], tracking: Tracking, frame: int) -> np.ndarray:
+    scale = _WIDTH / tracking.image_size_px[0]
+    cell = cv2.resize(image, (_WIDTH, max(round(tracking.image_size_px[1] * scale), 1)), interpolation=cv2.INTER_AREA)
+    for p in sorted(people, key=lambda p: p.person_id):
+        if not np.isfinite(p.box_px[frame, 0]):
+            continue
+        x0, y0, x1, y1 = (round(float(v) * scale) for v in p.box_px[frame])
+        colour = _COLOURS[(p.person_id - 1) % len(_COLOURS)]
+        cv2.rectangle(cell, (x0, y0), (x1, y1), colour, 3 if _best_frame(p, tracking.image_size_px) == frame else 2)
+        _label(cell, str(p.person_id), (x0, y0), 0.9, colour)
+    _label(cell, f"{tracking.time_s[frame]:.2f} s", (0, cell.shape[0] - 30), 0.7, (255, 255, 255))
+    return cell
+
+
+def _label(cell: np.ndarray, text: str, corner: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
+    """Text on a black field whose upper left corner is `corner`, moved into the picture."""
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 2)
+    x = int(np.clip(corner[0], 0, max(cell.shape[1] - width - 8, 0)))
+    y = int(np.clip(corner[1], 0, max(cell.shape[0] - height - below - 8, 0)))
+    cv2.rectangle(cell, (x, y), (x + width + 8, y + height + below + 6), (0, 0, 0), -1)
+    cv2.putText(cell, text, (x + 4, y + height + 4), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 2, cv2.LINE_AA)
+
 
 #: With fewer frames nobody can be followed, whoever is in the picture.
 LEAST_FRAMES = 10
