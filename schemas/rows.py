@@ -1,4 +1,4 @@
-"""Values of columns, and rows that go with all that was computed from them."""
+"""Values of columns, quality checks as rows, and rows that go with all that was computed from them."""
 
 from __future__ import annotations
 

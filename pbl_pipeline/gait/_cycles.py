@@ -1,4 +1,4 @@
-"""Gait cycles between foot downs of one side, and the joint-angle curves over them."""
+"""Gait cycles between foot downs of one side, the joint-angle curves over them, and which are not like the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measurement model of the index: the scores of a person from fitted passes, with their error.
+"""Measurement model of the index: scores of a person, their error, how likely a change is real.
 
 A pass p in view v shows the scores y of a person's mean curves, of both sides in the components of a normative set:
 

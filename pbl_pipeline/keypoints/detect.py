@@ -26,7 +26,7 @@ from .methods import METHODS
 from .passes import BatchDetector, BatchedInference, ParallelInference, n_workers, two_passes
 from .picture import Picture, PictureMeter
 from .protocol import Inspection, KeypointDetector, KeypointParams, MirrorDetector
-from .stated_confidence import confidence_curve
+from .quality_checks import confidence_curve
 from .types import Keypoints, PersonKeypoints
 
 

@@ -1,4 +1,4 @@
-"""World points projected into one picture; capsules, keypoints and skeletons drawn there with OpenCV.
+"""World points projected into one picture; capsules, keypoints, skeletons and the strip below drawn with OpenCV.
 
 Colours are blue and vermilion of Okabe and Ito (2008), which differ for every colour vision."""
 

@@ -1,4 +1,4 @@
-"""Charts and pictures of the page, made from results."""
+"""Charts and pictures of the page, made from results, and what a report shows beside its visit."""
 
 from __future__ import annotations
 

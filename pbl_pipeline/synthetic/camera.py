@@ -1,4 +1,4 @@
-"""Cameras: a phone that stands or is held, its own orientation log, and the picture of a point."""
+"""Cameras: a phone that stands or is held, where it stands or goes, its orientation log, and the picture of a point."""
 
 from __future__ import annotations
 

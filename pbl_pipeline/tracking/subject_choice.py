@@ -1,4 +1,4 @@
-"""A decision about one tracking of a video, carried to another tracking of it: numbers are new, people are the same."""
+"""The person to measure: by a method, by a person with contact sheets, or as decided about another tracking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fit against a reference: the errors of every joint they share."""
+"""A fit against a reference: the errors of every joint they share, and their median and nIQR."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's tables from error rows: what the rows cannot fill stays empty, with n = 0."""
+"""Errors of many trials as one frame, and the paper's tables from it: what cannot be filled stays empty, with n = 0."""
 
 from __future__ import annotations
 

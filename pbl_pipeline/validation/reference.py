@@ -1,4 +1,4 @@
-"""Reference of a fit: joint angles and the path of the pelvis over time, and where they come from."""
+"""Reference of a fit: joint angles and the pelvis' path over time, by joints, rotations and the camera's view."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables as CSV, LaTeX and one HTML page."""
+"""Tables of errors with the paper's own figures beside, as CSV, LaTeX and one HTML page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intrinsics from a video of a board: sharp and different views, the lens by least squares, and what they cannot tell.
+"""Intrinsics from a video of a board: sharp and different views, the lens by least squares, and a picture of both.
 
 The formal standard deviation of a least-squares fit takes every corner for an independent measurement. They are not: a
 bent board or a lens that refocuses shifts all corners of a view together. So the views are also left out in groups and

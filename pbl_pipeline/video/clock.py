@@ -1,4 +1,4 @@
-"""The clock of a phone's log against its video's.
+"""The clock of a phone's log against its video's, from how the picture moves.
 
 A log that counts in UTC meets the time of recording in the video's file, which is rounded to seconds, and which some
 phones write for the beginning and others for the end. That is too coarse for a hand that shakes at 3 Hz, and the fit

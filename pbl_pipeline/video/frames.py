@@ -1,4 +1,4 @@
-"""Frames of a video, one after the other.
+"""Frames of a video, one after the other, upright and as regions.
 
 A region of a decoded picture, taken from its brightness and colour planes before anything is converted.
 

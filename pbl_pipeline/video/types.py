@@ -1,4 +1,4 @@
-"""What is known of a video file, and one decoded frame."""
+"""What is known of a video file, one decoded frame, and regions of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`pbl db`: the embedded database."""
+"""`pbl db`: the embedded database, its accounts, its configuration and migrations."""
 
 from __future__ import annotations
 

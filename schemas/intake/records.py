@@ -1,4 +1,4 @@
-"""The records of intake: what is to be registered, what was read of it, and what became of it."""
+"""The records of intake: what is to be registered, what was read of it, the visit it belongs to, what became of it."""
 
 from __future__ import annotations
 

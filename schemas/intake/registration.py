@@ -1,4 +1,4 @@
-"""Registration of recordings: the one way into the tables, whatever names them.
+"""Registration of recordings and their plans: the one way into the tables, whatever names them.
 
 The commands, sheets, the drop folder and archives make records (`OneCamera`, `SeveralCameras`, `LaboratoryMarkers`);
 their files are read and checked (`Recording.read`), and then written, or compared with what is registered.

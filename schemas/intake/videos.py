@@ -1,4 +1,4 @@
-"""Videos of one camera: what `pbl ingest` registers where nothing else is said."""
+"""Videos of one camera, and trials that several calibrated cameras film at once (`pbl ingest --rig`)."""
 
 from __future__ import annotations
 

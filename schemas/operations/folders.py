@@ -1,4 +1,4 @@
-"""Folders whose content only their account may read."""
+"""Folders whose content only their account may read; JSON files that are never half written; passwords from files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Visits from the tables as the library's `Visit`; nothing is computed anew."""
+"""Visits from the tables as the library's `Visit`, and their reports; nothing is computed anew."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Templates to answers."""
+"""Templates to answers, as pages or as JSON."""
 
 from __future__ import annotations
 

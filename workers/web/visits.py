@@ -1,4 +1,4 @@
-"""The list of visits with its filters, and the page of a visit."""
+"""The list of visits with its filters, and the page of a visit with its curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Content of the folder of the embedded server, and its permissions."""
+"""Content, account and port of the folder of the embedded server, and its permissions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Start, stop and inspect the embedded server."""
+"""Create, start, stop and inspect the embedded server."""
 
 from __future__ import annotations
 
