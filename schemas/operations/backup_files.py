@@ -1,4 +1,4 @@
-"""Files of a backup: listings with checksums, rows as SQL, recordings at their own path below `recordings/`, and back."""
+"""Files of a backup: listings with checksums, rows as SQL, recordings below `recordings/` at their own path, and back.
 
 All rows of the database as SQL statements, one per line, and back: the basis of `pbl db backup` and `restore`.
 
