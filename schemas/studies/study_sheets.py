@@ -35,7 +35,6 @@ from ..intake.sheets import (
 from ..rows import inside
 from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
-from . import study_sheets
 
 #: Text fields and the most characters of each; the first three are needed.
 TEXTS = {
@@ -99,7 +98,7 @@ def _value(row: Row, field: str) -> Any:
         return value
     check_label(field, text, TEXTS[field])
     if field == "instrument":
-        taken = {*study_sheets.COLUMNS, "instrument", "value", "video"}
+        taken = {*COLUMNS, "instrument", "value", "video"}
         taken |= {str(name).lower() for name in study.ClinicalInstrument().to_arrays("instrument")}
         if text.lower() in taken or text.lower().replace(" ", "_") in taken:
             raise refused(field, repr(text), "a name that no instrument and no column of a sheet has", "choose another")

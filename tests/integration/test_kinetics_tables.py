@@ -19,7 +19,7 @@ from schemas.reading.status import pipeline_status
 from schemas.reading.visit_progress import visit_progress
 from schemas.reading.why import why
 from schemas.rows import delete_below, utc_now
-from schemas.studies import visit_facts
+from schemas.studies import visit_forms
 from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
 from tests.integration import chain, web
@@ -54,7 +54,7 @@ def found() -> Kinetics:
 
 
 def correct(**values: str) -> tuple[str, ...]:
-    changed, errors = visit_facts.correct(1, values, "A. First", visit_facts.facts(1).seen)
+    changed, errors = visit_forms.correct(1, values, "A. First", visit_forms.facts(1).seen)
     assert errors == {}
     return changed
 

@@ -100,7 +100,7 @@ class TablesSource:
         return visit_progress(session_id)
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
-        from schemas.studies.visit_entry import entry
+        from schemas.studies.visit_forms import entry
 
         number = about.row.session_id
         return {
