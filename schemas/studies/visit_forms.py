@@ -130,15 +130,14 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
 
 def facts(session_id: int) -> Form:
     """Return what can be stated of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
-    rows = (session.Session * lab.Subject & {"session_id": session_id}).to_dicts()
-    if not rows:
-        raise session.unknown_visit(session_id)
+    visit = session.registered_visit(session_id)
+    person = (lab.Subject & {"subject": visit["subject"]}).fetch1()
     of_visit = (study.Visit & {"session_id": session_id}).to_dicts()
     masses = (session.BodyMass & {"session_id": session_id}).to_arrays("body_mass")
     values = {
-        "height_m": _text(rows[0]["subject_height"]),
+        "height_m": _text(person["subject_height"]),
         "mass_kg": _text(masses[0] if len(masses) else None),
-        "population": "" if rows[0]["population"] == "unknown" else rows[0]["population"],
+        "population": "" if person["population"] == "unknown" else person["population"],
         **{name: of_visit[0][name] if of_visit else "" for name in ("assistive_device", "orthosis")},
     }
     videos = (video.Video & {"session_id": session_id}).to_dicts(order_by="video_id")
@@ -148,20 +147,18 @@ def facts(session_id: int) -> Form:
         values[f"{ACTIVITY}{row['video_id']}"] = condition.activity
         values[f"{PACE}{row['video_id']}"] = condition.pace
     names = {int(row["video_id"]): row["video_name"] for row in videos}
-    return Form(session_id, rows[0]["subject"], rows[0]["session_label"], values, recordings=names)
+    return Form(session_id, visit["subject"], visit["session_label"], values, recordings=names)
 
 
 def entry(session_id: int) -> Form:
     """Return role and scores of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
-    rows = (session.Session & {"session_id": session_id}).to_dicts()
-    if not rows:
-        raise session.unknown_visit(session_id)
+    visit = session.registered_visit(session_id)
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
     scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
     stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}
     known = instruments()
     values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in known}}
-    return Form(session_id, rows[0]["subject"], rows[0]["session_label"], values, instruments=known)
+    return Form(session_id, visit["subject"], visit["session_label"], values, instruments=known)
 
 
 def instruments() -> dict[str, dict[str, Any]]:
