@@ -15,8 +15,8 @@ from pbl_pipeline.fit.problem import SOLES
 from pbl_pipeline.gait.ground import is_metric
 from pbl_pipeline.kinetics import GRAVITY
 
+from .columns import lines, number_cells
 from .osim import pelvis_rest_m
-from .text import lines, number_cells
 from .trial import ExportTrial
 
 

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import SLIDES, Y_UP_TO_Z_UP, Body, load_body
 from pbl_pipeline.kinetics import Inertia, segment_inertia
 
-from .text import lines, number_cells
+from .columns import lines, number_cells
 from .trial import ExportTrial, site_positions, wanted_markers
 
 

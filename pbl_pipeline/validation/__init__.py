@@ -2,8 +2,17 @@
 
 from .align import align_path, best_lag
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
-from .compare import JointError, KinematicErrors, compare, compare_angles, median_niqr, niqr
-from .curves import CURVE_COLUMNS, cycle_curves, save_curves
+from .compare import (
+    CURVE_COLUMNS,
+    JointError,
+    KinematicErrors,
+    compare,
+    compare_angles,
+    cycle_curves,
+    median_niqr,
+    niqr,
+    save_curves,
+)
 from .paper_tables import COLUMNS, TrialErrors, error_frame, paper_tables
 from .reference import (
     BODY_ROTATIONS,

@@ -3,8 +3,16 @@
 from .attitude import Attitude, camera_in_device, check_attitude
 from .boards import Board
 from .calibrate import Calibration, calibrate_video, draw_calibration
-from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
-from .camera_pose import CameraPose, load_camera_poses
+from .camera import (
+    CameraPose,
+    check_lens,
+    guess_camera,
+    load_camera,
+    load_camera_poses,
+    scaled_matrix,
+    undistort_px,
+    viewing_ray,
+)
 from .clock import attitude_of, load_attitude
 from .file_facts import check_timing, packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
 from .frames import read_frames

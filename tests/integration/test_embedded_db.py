@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from pbl_pipeline.errors import PblError
 from schemas.cli.db import db
 from schemas.operations import embedded
-from schemas.operations.embedded import apt, binaries, process, server
+from schemas.operations.embedded import binaries, process, server
 from schemas.operations.embedded.folder import UNPRIVILEGED, server_account
 from tests.database import new_home, remove_home
 
@@ -404,7 +404,7 @@ def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.Monk
 def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DJ_PASS", "secret")
     assert "secret" not in embedded.Binaries(Path("a"), Path("b"), Path("c")).environment().values()
-    assert apt.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
+    assert binaries.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
 
 
 # ---------------------------------------------------------------- the connection

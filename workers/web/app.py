@@ -45,9 +45,8 @@ from .accounts import routes as sign_in_routes
 from .address import OPEN, Address, own_address
 from .computing import Target, compute_visit
 from .pages import Pages
-from .source import Source, TablesSource
+from .source import Source, TablesSource, Videos
 from .tables import Asks, Files, Tables
-from .videos import Videos
 
 log = logging.getLogger(__name__)
 
