@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from pbl_pipeline.video import Camera, viewing_ray
+from pbl_pipeline.video import Camera, turning_radius2, viewing_ray
 
 
 def crop_matrix(roi_px: np.ndarray, size: int) -> np.ndarray:
@@ -193,7 +193,7 @@ def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> 
     maps = [
         cv2.initUndistortRectifyMap(matrix, distortion, v.turn, v.matrix, (width, height), cv2.CV_32FC1) for v in views
     ]
-    reach = _reach(camera)
+    reach = np.sqrt(turning_radius2(camera))  # beyond it the picture would appear a second time
     if np.isfinite(reach):
         for view, (map_x, map_y) in zip(views, maps, strict=True):
             _blank(map_x, map_y, view, reach)
@@ -224,16 +224,6 @@ def _per_pixel(roi_px: np.ndarray, camera: Camera) -> float:
     rays = viewing_ray(ends, camera) @ view_rotation(roi_px, camera)
     flat = rays[:, :2] / rays[:, 2:]
     return float(np.linalg.norm(flat[1] - flat[0])) / (2 * half)
-
-
-def _reach(camera: Camera) -> float:
-    """Undistorted radius up to which the lens model grows; beyond it the picture would appear a second time."""
-    k1, k2, _, _, k3 = np.asarray(camera.distortion, np.float64)
-    if not (k1 or k2 or k3):
-        return np.inf
-    r = np.linspace(0.0, 4.0, 4001)
-    turns = np.flatnonzero(np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) <= 0)
-    return float(r[turns[0]]) if len(turns) else np.inf
 
 
 def _blank(map_x: np.ndarray, map_y: np.ndarray, view: VirtualCamera, reach: float) -> None:

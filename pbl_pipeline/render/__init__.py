@@ -9,12 +9,10 @@ from pbl_pipeline.render.drawing import (
     draw_keypoints,
     draw_skeleton,
     rotation_matrix,
-    scaled_camera,
     side_of,
     skeleton_lines,
     stance_spans,
     to_camera,
     to_pixels,
-    turning_radius2,
 )
 from pbl_pipeline.render.overlay import overlay_frames, render_overlay, report_indices

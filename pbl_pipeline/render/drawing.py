@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import joint_angles
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.runs import runs
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, turning_radius2
 
 #: Nothing nearer to the camera than this is drawn (m): the pinhole equations grow without bound there.
 NEAR_M = 0.1
@@ -54,24 +54,6 @@ def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     m = np.asarray(camera.matrix, float)
     return np.stack([m[0, 0] * xd + m[0, 1] * yd + m[0, 2], m[1, 1] * yd + m[1, 2]], axis=-1)
-
-
-def scaled_camera(camera: Camera, factor_x: float, factor_y: float) -> Camera:
-    """The camera of a picture resized by these factors. Pixel centres are whole numbers, hence the half pixels."""
-    m = np.array(camera.matrix, float)
-    m[0] *= factor_x
-    m[1] *= factor_y
-    m[0, 2] += 0.5 * (factor_x - 1)
-    m[1, 2] += 0.5 * (factor_y - 1)
-    return Camera(m, camera.distortion, camera.source)
-
-
-def turning_radius2(camera: Camera) -> float:
-    """Squared normalised radius where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it never does."""
-    k1, k2, _, _, k3 = np.asarray(camera.distortion, float)
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    real = roots[np.abs(roots.imag) < 1e-12].real
-    return float(min(real[real > 0], default=np.inf))
 
 
 #: side -> "#rrggbb". Left is the warm colour, as in most gait laboratories.

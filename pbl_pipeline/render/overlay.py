@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,10 +21,9 @@ from pbl_pipeline.render.drawing import (
     capsule_outline,
     draw_body,
     draw_keypoints,
-    scaled_camera,
     to_camera,
 )
-from pbl_pipeline.video import read_frames, write_h264
+from pbl_pipeline.video import read_frames, scaled_matrix, write_h264
 
 _BLOCK = 64  # frames whose capsules are computed and kept at a time
 
@@ -77,7 +77,7 @@ class _Painter:
         width, height = self.fit.image_size_px
         fx, fy = image.shape[1] / width, image.shape[0] / height
         if self.known(index):
-            camera = scaled_camera(self.fit.camera, fx, fy)
+            camera = dataclasses.replace(self.fit.camera, matrix=scaled_matrix(self.fit.camera.matrix, (fx, fy)))
             quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
             draw_body(image, *self._pose(index), quat, position, camera)
         if self._keypoints is not None and index < len(self._keypoints.time_s):

@@ -10,6 +10,7 @@ from .camera import (
     load_camera,
     load_camera_poses,
     scaled_matrix,
+    turning_radius2,
     undistort_px,
     viewing_ray,
 )

@@ -237,12 +237,20 @@ def _scale(
     return scaled_matrix(matrix, factor), f", scaled by {factor:.4g} from {width:g}x{height:g} px"
 
 
-def scaled_matrix(matrix: np.ndarray, factor: float) -> np.ndarray:
-    """The camera matrix (3, 3) of the same picture with `factor` times as many pixels along each side."""
-    scaled = matrix.copy()
-    scaled[:2] *= factor
-    scaled[:2, 2] += (factor - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
+def scaled_matrix(matrix: np.ndarray, factor: float | tuple[float, float]) -> np.ndarray:
+    """The camera matrix (3, 3) of the same picture with `factor` times as many pixels, of both sides or of x, y."""
+    factors, scaled = np.broadcast_to(factor, 2), np.array(matrix, float)
+    scaled[:2] *= factors[:, None]
+    scaled[:2, 2] += (factors - 1) / 2  # coordinates count from the first pixel's centre, sizes from its edge
     return scaled
+
+
+def turning_radius2(camera: Camera) -> float:
+    """Squared normalised radius where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing; inf where it never does."""
+    k1, k2, _, _, k3 = np.asarray(camera.distortion, float)
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    real = roots[np.abs(roots.imag) < 1e-12].real
+    return float(min(real[real > 0], default=np.inf))
 
 
 def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:
