@@ -6,6 +6,7 @@ from .blazepose import BlazePoseDetector, body_box, circle_roi
 from .detection_schedule import WatchParams
 from .identity_swaps import UncrossParams
 from .methods import METHODS, SUBJECT_METHODS, detector_params
+from .params import TrackingParams
 from .reidentify import JoinParams
 from .subject_choice import (
     FILM_THE_WHOLE_BODY,
@@ -20,5 +21,5 @@ from .subject_choice import (
 from .tiling import tiles
 from .track import track_people
 from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
-from .walker_score import SubjectParams, TrackingParams, step_s, time_in_view_s
+from .walker_score import SubjectParams, step_s, time_in_view_s
 from .yolox import YoloxDetector

@@ -15,8 +15,8 @@ import numpy as np
 from pbl_pipeline import assets
 from pbl_pipeline.models import SsdLayout, SsdModel
 
+from .params import MODEL_SHA256, TrackingParams
 from .types import Detection
-from .walker_score import MODEL_SHA256, TrackingParams
 
 LAYOUT = SsdLayout(input_size=224, layers=((8, 2), (16, 2), (32, 6)), n_keypoints=4)
 #: Half width of a standing body in units of the circle's radius; arms hang within it.

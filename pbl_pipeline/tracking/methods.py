@@ -8,7 +8,8 @@ from pbl_pipeline.methods import Stage
 
 from .associate import AssociationParams
 from .blazepose import blazepose
-from .walker_score import SubjectParams, TrackingParams, choose_walker
+from .params import TrackingParams
+from .walker_score import SubjectParams, choose_walker
 from .yolox import yolox
 
 

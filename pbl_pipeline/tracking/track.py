@@ -23,10 +23,10 @@ from .blazepose import body_box
 from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
 from .methods import METHODS
+from .params import TrackingParams
 from .reidentify import backtrack, join_trails
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Tracking
-from .walker_score import TrackingParams
 
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.

@@ -19,7 +19,7 @@ from pbl_pipeline.models import OnnxModel, check_frozen, find, model_invalid
 from .types import Detection
 
 if TYPE_CHECKING:
-    from .walker_score import TrackingParams
+    from .params import TrackingParams
 
 STRIDES = (8, 16, 32)
 GREY = 114
