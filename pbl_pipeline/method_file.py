@@ -38,7 +38,7 @@ def read_method(path: Path, base: str | None = None, new_name: bool = True) -> M
         if stage not in STAGES:
             raise KeyError(f"stage {stage!r}; known: {', '.join(STAGES)}")
         methods = of_stage(stage)
-        base = about.get("base", base or methods.default)
+        base = str(about.get("base", base or methods.default))
         before = methods.registered(base)
         if before is None:
             raise KeyError(f"base {base!r}; known: {', '.join(methods)}")

@@ -283,8 +283,12 @@ def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
     """Return a fitted recording from its files; `facts`: what session.json holds of it."""
     name = name_of_fit(fit)
     points = fit.with_name(f"{name}.{KEYPOINTS}")
-    loads = {"load_keypoints": functools.partial(_keypoints_of, points, fit)}
-    return Recording(name, **_told(facts, points), **loads, load_fit=functools.partial(TrialFit.load, fit))
+    return Recording(
+        name,
+        **_told(facts, points),
+        load_keypoints=functools.partial(_keypoints_of, points, fit),
+        load_fit=functools.partial(TrialFit.load, fit),
+    )
 
 
 def _told(facts: Mapping[str, Any], points: Path | None) -> dict[str, Any]:
