@@ -11,7 +11,7 @@ from typing import Any
 
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.methods import STAGES, Method, Stage, of_stage
+from pbl_pipeline.methods import STAGES, Method, P, Stage, of_stage
 from pbl_pipeline.paramset import Paramset
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,31}")
@@ -19,14 +19,14 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,31}")
 _ABOUT = ("stage", "name", "base")
 
 
-def read_method(path: Path) -> Method[Any]:
+def read_method(path: Path, base: str | None = None, new_name: bool = True) -> Method[Any]:
     """The method that a file describes, as version 1: `stage` (else: fit), `name` (else: that of the file), `base`, the
-    method whose parameters are changed (else: the stage's default), and the changes, group by group.
+    method whose parameters are changed (else: `base`, else the stage's default), and the changes, group by group.
+    `new_name`: the name is one that can be registered.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT: no such file or JSON object, a stage, base or parameter that there is
     not, a value of another type, a name that ships or is none.
     """
-    base = "a method"
     try:
         found = read_json(path)
         if not isinstance(found, dict):
@@ -38,11 +38,13 @@ def read_method(path: Path) -> Method[Any]:
         if stage not in STAGES:
             raise KeyError(f"stage {stage!r}; known: {', '.join(STAGES)}")
         methods = of_stage(stage)
-        base = about.get("base", methods.default)
+        base = str(about.get("base", base or methods.default))
         before = methods.registered(base)
         if before is None:
             raise KeyError(f"base {base!r}; known: {', '.join(methods)}")
-        if not _NAME.fullmatch(name) or name in methods:
+        if found.get(methods.kind, before.family.name) != before.family.name:
+            raise ValueError(f"{methods.kind} {found[methods.kind]!r}, but {base} is of {before.family.name}")
+        if new_name and (not _NAME.fullmatch(name) or name in methods):
             raise ValueError(f"name {name!r}: 2 to 32 small letters, digits and hyphens, and no name that ships")
         return changed(before, name, found)
     except FileNotFoundError as error:
@@ -54,20 +56,22 @@ def read_method(path: Path) -> Method[Any]:
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
             expected='a JSON object such as {"stage": "fit", "base": "blazepose", "max_iterations": 60} with some of '
-            f"the parameters of {base}",
+            f"the parameters of {base or 'a method'}",
             next_step="correct the file; docs/files.md describes it",
             key=path,
         ) from error
 
 
-def named_or_file(stage: Stage[Any], given: str | None) -> Method[Any]:
-    """The method of a stage that a text means: a name, or the path of a JSON file; None for the default.
+def named_or_file(stage: Stage[P], given: str | None, base: str | None = None) -> Method[P]:
+    """The method of a stage that a text means: a name, or the path of a JSON file of changes (to `base` where it names
+    none); None for the default.
 
     Raises `PblError` SOLVER_UNKNOWN; what `read_method` raises; FILE_FORMAT for a method of another stage.
     """
-    if given is None or not given.endswith(".json"):
+    is_file = given is not None and (given.endswith(".json") or Path(given).is_file())
+    if given is None or not is_file or stage.registered(given) is not None:
         return stage.find(given)
-    method = read_method(Path(given))
+    method = read_method(Path(given), base, new_name=False)
     if method.stage != stage.name:
         raise PblError(
             "FILE_FORMAT",

@@ -21,7 +21,7 @@ from .datajoint_setup import IntegrityError as IntegrityError
 from .datajoint_setup import inserting as inserting
 from .operations import embedded
 from .operations.embedded import APP_USER, HOST, Folder, not_running
-from .operations.secret_files import secret
+from .operations.folders import secret
 from .store import further_stores, store_spec
 
 #: How long a server may take to answer before it counts as not running.

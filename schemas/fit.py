@@ -17,11 +17,10 @@ from pbl_pipeline.names import distinct
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
-from .checks import check_columns, check_row, check_values
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, number, one
+from .rows import InputChanged, check_columns, check_row, check_values, number, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -9,17 +9,16 @@ from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
-from .checks import check_columns, check_row, check_values
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .review import Decision
-from .rows import Rows, number, one, row_of, stored_rows
+from .rows import Rows, check_columns, check_row, check_values, number, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
-    from pbl_pipeline.gait.curves_file import Curves
+    from pbl_pipeline.gait.metrics_file import Curves
 
 schema = dj.Schema()
 
@@ -292,7 +291,7 @@ class GaitCycle(dj.Computed):
         return cycles, None if correction is None else correction["correction_no"]
 
     def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:
-        from pbl_pipeline.gait.curves_file import save_curves
+        from pbl_pipeline.gait.metrics_file import save_curves
 
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
@@ -550,7 +549,7 @@ def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_row
 
 def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
-    from pbl_pipeline.gait.curves_file import load_curves
+    from pbl_pipeline.gait.metrics_file import load_curves
 
     with stored_file(ref) as path:
         curves = load_curves(path)

@@ -9,11 +9,10 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
-from .checks import check_columns, check_row
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, Rows, number, one, row_of, stored_rows, utc_now
+from .rows import InputChanged, Rows, check_columns, check_row, number, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
-from .checks import check_columns, check_row
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import number, one
+from .rows import check_columns, check_row, number, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -11,11 +11,10 @@ from pbl_pipeline import methods
 from pbl_pipeline.temporary import new_folder
 
 from . import capture, fit, gait, gdi, session, study, video
-from .checks import check_columns, check_row
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, number
+from .rows import InputChanged, check_columns, check_row, number
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

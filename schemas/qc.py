@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from . import fit, gait, gdi, keypoints, session  # noqa: F401  a definition refers to session
-from .checks import check_values
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import one
+from .rows import check_values, one
 
 schema = dj.Schema()
 

@@ -1,10 +1,10 @@
-"""Values of columns, and rows that go with all that was computed from them."""
+"""Values of columns, quality checks as rows, and rows that go with all that was computed from them."""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymysql
@@ -12,6 +12,9 @@ import pymysql
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import REPEAT, columns_read_once, dj
+
+if TYPE_CHECKING:
+    from pbl_pipeline.qc import Check
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -179,3 +182,32 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
                 raise
     return counts
+
+
+def check_columns(prefix: str) -> str:
+    """Definition lines of a part table of quality checks; the names carry the prefix for the same reason."""
+    return f"""
+    -> master
+    {prefix}_check           : varchar(64)       # name, with its unit
+    ---
+    {prefix}_check_outcome   : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+    {prefix}_check_value=null     : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_threshold=null : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_advice    : varchar(1000)     # what to do about it
+    """
+
+
+def check_row(prefix: str, check: Check) -> dict[str, Any]:
+    """A library `Check` as values of `check_columns(prefix)`."""
+    return {
+        f"{prefix}_check": check.check,
+        f"{prefix}_check_outcome": check.outcome,
+        f"{prefix}_check_value": number(check.value),
+        f"{prefix}_check_threshold": number(check.threshold),
+        f"{prefix}_check_advice": check.advice[:1000],
+    }
+
+
+def check_values(prefix: str, row: Mapping[str, Any]) -> tuple:
+    """The arguments of the library's `Check` from a row of `check_columns(prefix)`."""
+    return tuple(row[f"{prefix}_check{end}"] for end in ("", "_outcome", "_value", "_threshold", "_advice"))

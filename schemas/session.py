@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pbl_pipeline.errors import PblError
 
 from . import lab  # noqa: F401  the definition refers to it
@@ -43,10 +45,14 @@ def lock(session_id: int) -> None:
     Session.connection.query(f"SELECT session_id FROM {table} WHERE session_id = %s FOR UPDATE", args=(session_id,))  # noqa: S608
 
 
-def unknown_visit(session_id: int) -> PblError:
-    return PblError(
-        "DB_NOT_FOUND",
-        found=f"no session_id {session_id}",
-        expected="a registered visit",
-        next_step="`pbl list visits` prints the numbers",
-    )
+def registered_visit(session_id: int) -> dict[str, Any]:
+    """Return the row of Session of a number. Raises `PblError` DB_NOT_FOUND for a number that no visit has."""
+    rows = (Session & {"session_id": session_id}).to_dicts()
+    if not rows:
+        raise PblError(
+            "DB_NOT_FOUND",
+            found=f"no session_id {session_id}",
+            expected="a registered visit",
+            next_step="`pbl list visits` prints the numbers",
+        )
+    return rows[0]

@@ -15,8 +15,7 @@ from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import full_path
 from .job_errors import store_full
-from .operations.folders import private_folder
-from .operations.secret_files import secret
+from .operations.folders import private_folder, secret
 
 #: Folder of the bucket under which everything of ours lies; the phones' uploads may have another one beside it.
 LOCATION = "arrays"

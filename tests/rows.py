@@ -10,7 +10,7 @@ from pathlib import Path
 from pbl_pipeline import settings
 from schemas import connection
 from schemas.intake import VisitRecord, ingest
-from schemas.operations import catalog, dump
+from schemas.operations import backup_files, catalog
 
 
 def register(*paths: Path, **visit) -> list[int]:
@@ -24,7 +24,7 @@ def everything() -> dict[str, list[tuple]]:
     """Every row of every table, as the server prints it."""
     with closing(connection.plain_connection(conv={})) as server:
         return {
-            f"{schema}.{table}": sorted(dump.rows_of(server, schema, table, columns), key=str)
+            f"{schema}.{table}": sorted(backup_files.rows_of(server, schema, table, columns), key=str)
             for (schema, table), columns in catalog.tables().items()
         }
 
@@ -43,11 +43,11 @@ class Saved:
         self.folder, self.copy = folder, copy
         with closing(connection.plain_connection(conv={})) as server:
             self.statements = [
-                f"INSERT INTO {catalog.quote(*table)} ({names}) VALUES ({','.join(map(dump.literal, row))})"
+                f"INSERT INTO {catalog.quote(*table)} ({names}) VALUES ({','.join(map(backup_files.literal, row))})"
                 for table, columns in catalog.tables().items()
                 if _of_tests(table[1])
                 for names in [", ".join(catalog.quote(c.name) for c in columns)]
-                for row in dump.rows_of(server, *table, columns)
+                for row in backup_files.rows_of(server, *table, columns)
             ]
         shutil.copytree(folder, copy / "videos")
         shutil.copytree(_store(), copy / "store", copy_function=_link)
@@ -55,7 +55,7 @@ class Saved:
     def put_back(self) -> None:
         """Insert the rows into tables that have none."""
         with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-            for statement in (*dump.HEADER, "START TRANSACTION", *self.statements, "COMMIT"):
+            for statement in (*backup_files.HEADER, "START TRANSACTION", *self.statements, "COMMIT"):
                 cursor.execute(statement)
         shutil.rmtree(self.folder)
         shutil.copytree(self.copy / "videos", self.folder)

@@ -46,10 +46,8 @@ class Outcome:
 
 def place(session_id: int) -> Place:
     """Return the visit. Raises `PblError` DB_NOT_FOUND."""
-    rows = (session.Session & {"session_id": session_id}).to_dicts()
-    if not rows:
-        raise session.unknown_visit(session_id)
-    return Place(session_id, rows[0]["subject"], rows[0]["session_label"])
+    visit = session.registered_visit(session_id)
+    return Place(session_id, visit["subject"], visit["session_label"])
 
 
 class Arriving:

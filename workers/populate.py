@@ -12,7 +12,7 @@ from typing import Any
 from pbl_pipeline import progress
 from schemas import computed_tables, tracking
 from schemas.jobs import jobs_of
-from schemas.reading import scope
+from schemas.reading import visit_progress
 from schemas.reading.status import empty_rows
 
 from . import queue, refresh, run_job
@@ -80,7 +80,7 @@ def populate(
     chosen = [t for t in computed_tables() if not tables or t in wanted]
     parts = {t.__name__: TableRun(t.__name__) for t in chosen}
     run = Run(list(parts.values()))
-    only = None if visit is None else functools.partial(scope.of_visit, visit)
+    only = None if visit is None else functools.partial(visit_progress.of_visit, visit)
     if retry_errors:
         of_visit = {t: True if only is None else only().where(t) for t in chosen}
         run.retried = sum(queue.reset_to_new(jobs_of(t).errors & w) for t, w in of_visit.items() if w is not None)

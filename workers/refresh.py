@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from schemas import chain, fit, review, tracking, video, worker
-from schemas.reading.scope import Scope, of_visit
+from schemas.reading.visit_progress import Scope, of_visit
 from schemas.worker import alone
 
 from . import queue, recover

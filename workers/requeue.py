@@ -11,7 +11,7 @@ from pbl_pipeline.errors import PblError
 from schemas import computed_tables, fit, gait, gdi, keypoints, kinetics, tracking, video
 from schemas.connection import dj
 from schemas.intake import Methods
-from schemas.intake.plans import resolve as resolve_ingest
+from schemas.intake.registration import resolve as resolve_ingest
 from schemas.jobs import jobs_of, keys_of
 from schemas.method_names import keys_named
 from schemas.method_rows import resolve_method

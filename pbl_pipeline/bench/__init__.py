@@ -5,5 +5,4 @@ Importing this package imports no JAX: the process that only starts others must 
 
 from .cases import METHOD, Case, Data, fit_cases
 from .detect import detect_text, run_detect
-from .run import Programs, Row, run_cases
-from .table import fit_text
+from .run import Programs, Row, fit_text, run_cases

@@ -9,7 +9,6 @@ from pbl_pipeline import jax_setup
 # Before anything below makes an array: JAX reads the cache's folder once.
 jax_setup.configure()
 
-from pbl_pipeline.body._angles import angle_of, joint_angles, joint_angles_sd, joint_of  # noqa: E402
 from pbl_pipeline.body._capsules import (  # noqa: E402
     CapsuleFrames,
     Capsules,
@@ -19,8 +18,11 @@ from pbl_pipeline.body._capsules import (  # noqa: E402
     capsules,
     stature_m,
 )
-from pbl_pipeline.body._chain import chain_frames  # noqa: E402
-from pbl_pipeline.body._frames import Frames, mjx_frames  # noqa: E402
+from pbl_pipeline.body._chain import (  # noqa: E402
+    Frames,
+    chain_frames,
+    mjx_frames,
+)
 from pbl_pipeline.body._kinematics import (  # noqa: E402
     MarkerJacobian,
     Points,
@@ -30,11 +32,15 @@ from pbl_pipeline.body._kinematics import (  # noqa: E402
     scale_multipliers,
 )
 from pbl_pipeline.body._markers import MARKER_SETS, MarkerSet, load_marker_set, marker_set  # noqa: E402
-from pbl_pipeline.body.model import (  # noqa: E402
+from pbl_pipeline.body.model import (  # noqa: E402  # noqa: E402
     PELVIS_TURNS,
     SCALE_NAMES,
     SLIDES,
     Y_UP_TO_Z_UP,
     Body,
+    angle_of,
+    joint_angles,
+    joint_angles_sd,
+    joint_of,
     load_body,
 )

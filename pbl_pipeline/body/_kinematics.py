@@ -18,8 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from pbl_pipeline.body._chain import chain_frames
-from pbl_pipeline.body._frames import Frames
+from pbl_pipeline.body._chain import Frames, chain_frames
 from pbl_pipeline.body.model import Body
 
 #: Forward kinematics: body, joint values (N, Q) and body positions (B, 3) to `Frames`.

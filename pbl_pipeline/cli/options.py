@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 
-from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 
 if TYPE_CHECKING:
@@ -105,43 +103,21 @@ def fit_paramset(solver: str | None, params: str | None, points: Sequence[Points
     `--params` is a name, or a JSON file of changes to the method that its key "base" names. Without either, and without
     "base", it is the default method; with `--solver` alone the default one of that solver.
 
-    Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_FORMAT.
+    Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_MISSING,
+    FILE_FORMAT.
     """
     from pbl_pipeline.fit import METHODS, default_fit
-    from pbl_pipeline.method_file import changed
+    from pbl_pipeline.method_file import named_or_file
 
     if solver is not None and solver not in METHODS.families:
-        raise _unknown(f"solver {solver!r}", METHODS.families)
-    base = default_fit(*points, solver=solver)
-    if params is None:
-        return METHODS[base]
-    if (method := METHODS.registered(params)) is not None:
-        return _of_solver(method, solver)
-    path = Path(params)
-    if not path.is_file():
-        raise _unknown(f"paramset {params!r}, and no such file", METHODS)
-    try:
-        changes = read_json(path)
-        if not isinstance(changes, dict):
-            raise TypeError("not an object")
-        base = changes.pop("base", base)
-        if not isinstance(base, str) or base not in METHODS:
-            raise KeyError(f"base {base!r}; known: {sorted(METHODS)}")
-        before = _of_solver(METHODS[base], solver)
-        if changes.get("solver", before.family.name) != before.family.name:
-            raise ValueError(f"solver {changes['solver']!r}, but {base} is of {before.family.name}: name another base")
-        return changed(before, path.stem, changes)
-    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
         raise PblError(
-            "FILE_FORMAT",
-            found=f"{type(error).__name__}: {error}",
-            expected=f'a JSON object with some of the parameters of {base}, such as {{"cost": {{"weight_2d": 0.05}}}}',
-            next_step='correct the file; the key "base" names the paramset that it changes',
-            key=path,
-        ) from error
-
-
-def _of_solver(method: Method[Params], solver: str | None) -> Method[Params]:
+            "SOLVER_UNKNOWN",
+            found=f"solver {solver!r}",
+            expected=f"one of {', '.join(METHODS.families)}",
+            next_step="pass one of these",
+        )
+    base = default_fit(*points, solver=solver)
+    method = named_or_file(METHODS, params or base, base)
     if solver not in (None, method.family.name):
         raise PblError(
             "SOLVER_UNKNOWN",
@@ -150,7 +126,3 @@ def _of_solver(method: Method[Params], solver: str | None) -> Method[Params]:
             next_step="leave out --solver, or name a paramset of that solver",
         )
     return method
-
-
-def _unknown(found: str, known: Iterable[str]) -> PblError:
-    return PblError("SOLVER_UNKNOWN", found=found, expected=f"one of {', '.join(known)}", next_step="pass one of these")

@@ -1,10 +1,7 @@
 """Videos without faces: heads found, held over gaps and covered (docs/privacy.md)."""
 
-from .cover_heads import cover, outline
-from .faces import FaceDetector
-from .heads_of_video import find_heads
-from .params import HeadParams
-from .types import REASONS, SOURCES, Head, Heads, ranges
+from .heads_of_video import FaceDetector, find_heads
+from .types import REASONS, SOURCES, Head, HeadParams, Heads, ranges
 from .video_copy import (
     HOW,
     KEEP,
@@ -12,9 +9,11 @@ from .video_copy import (
     STATUSES,
     Deidentified,
     check_call,
+    cover,
     covered_picture,
     deidentify,
     nothing_covered,
+    outline,
     sidecar_of,
     to_show,
 )

@@ -1,4 +1,10 @@
-"""All heads of a video: people and their keypoints, then faces that no body explains."""
+"""All heads of a video: people and their keypoints, then faces that no body explains.
+
+Faces in a picture: MediaPipe's two detectors, BlazeFace of short and of full range.
+
+Layouts: modules/face_detection of the mediapipe 0.10.21 wheel. Both give a square box from the brows to the chin and
+six points, eyes first. Their faces look into the camera; a head from behind only its body shows.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +15,219 @@ from pathlib import Path
 
 import numpy as np
 
-from pbl_pipeline import progress
-from pbl_pipeline.keypoints import detect_keypoints
+from pbl_pipeline import assets, progress
+from pbl_pipeline.keypoints import Keypoints, detect_keypoints
+from pbl_pipeline.models import SsdLayout, SsdModel, box_iou, suppress
 from pbl_pipeline.prefetch import prefetched
-from pbl_pipeline.tracking import tiles, track_people
+from pbl_pipeline.tracking import PersonTrack, tiles, track_people
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 
-from .faces import FaceDetector, same_face
-from .head_of_body import head_of_person
-from .hold import held
-from .params import HeadParams
-from .types import DISAGREE, FACE, KEYPOINTS, NONE, Head, Heads
+from .types import BODY, DISAGREE, FACE, HELD, KEYPOINTS, NONE, Head, HeadParams, Heads
+
+#: Points that make the face in the marker set `blazepose_33`.
+FACE_WORDS = ("nose", "eye", "ear", "mouth")
+#: Frames around one that say where its head should be.
+_AROUND = 3
+
+
+def is_face(name: str) -> bool:
+    """Whether a keypoint is of the face."""
+    return any(word in name.split("_") for word in FACE_WORDS)
+
+
+def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams) -> Head:
+    """The head of a tracked person in every frame in which she is in view, not yet held over gaps.
+
+    Where the points of the head were found, the circle is around the middle of the ears, or of those points of the face
+    that are in the picture. `head_radius_m` becomes pixels by the size of the body: the spread of all keypoints in the
+    picture over their spread in metres across the line of sight (a weak perspective). Elsewhere the circle is around
+    the upper end of the body.
+    """
+    from_body = body_end(track.roi_px, params)
+    circle, source = from_body.copy(), np.where(np.isfinite(from_body).all(axis=1), BODY, NONE).astype(np.uint8)
+    seen = head_circle(keypoints, params)
+    known = np.asarray(np.isfinite(seen).all(axis=1), bool)
+    circle[known], source[known] = seen[known], KEYPOINTS
+    radius = track.roi_px[:, 2] / 2
+    apart = np.linalg.norm(seen[:, :2] - from_body[:, :2], axis=1)
+    wrong = known & (apart > params.agree * radius)  # NaN compares as False: without a body nothing disagrees
+    jumped = known & (off_course(seen) > params.jump * seen[:, 2])
+    source[wrong | jumped] = DISAGREE
+    # Whom to believe is not known: the circle that holds both.
+    for t in np.flatnonzero(wrong):
+        circle[t] = around_both(seen[t], from_body[t])
+    return Head(circle, source, track.box_px, keypoints.xy_px, keypoints.names)
+
+
+def head_circle(keypoints: Keypoints, params: HeadParams) -> np.ndarray:
+    """(T, 3) the circle of the head by the keypoints, NaN where no point of the face is in the picture."""
+    names = keypoints.names
+    face = np.array([is_face(n) for n in names])
+    ears = np.array(["ear" in n.split("_") for n in names])
+    xy = keypoints.xy_px.astype(float)
+    centre = np.where(np.isfinite(mean(xy[:, ears])), mean(xy[:, ears]), mean(xy[:, face]))
+    of_face = xy[:, face]
+    apart = np.linalg.norm(of_face[:, :, None] - of_face[:, None], axis=-1).reshape(len(xy), -1)
+    largest = np.where(np.isnan(apart), 0.0, apart).max(axis=1)
+    radius = np.fmax(params.head_radius_m * px_per_m(keypoints), params.head_face * largest)
+    return np.column_stack([centre, np.where(np.isfinite(centre[:, 0]), radius, np.nan)])
+
+
+def px_per_m(keypoints: Keypoints) -> np.ndarray:
+    """(T,) pixels per metre at the person, from the spread of the points in the picture and in the camera's x and y."""
+    both = np.asarray(np.isfinite(keypoints.xy_px).all(-1) & np.isfinite(keypoints.xyz_cam_m).all(-1), bool)
+    xy = np.where(both[..., None], keypoints.xy_px, np.nan).astype(float)
+    across = np.where(both[..., None], keypoints.xyz_cam_m[..., :2], np.nan).astype(float)
+    spread = [np.nansum((a - mean(a)[:, None]) ** 2, axis=(1, 2)) for a in (xy, across)]
+    enough = (np.sum(both, axis=1) >= 4) & (spread[1] > 0)
+    return np.sqrt(np.divide(spread[0], spread[1], out=np.full(len(xy), np.nan), where=enough))
+
+
+def body_end(roi_px: np.ndarray, params: HeadParams) -> np.ndarray:
+    """(T, 3) the circle at the upper end of a region of interest (T, 4): where the head of a body is that fills it."""
+    roi = np.asarray(roi_px, float)
+    radius = roi[:, 2] / 2
+    up = np.column_stack([np.sin(roi[:, 3]), -np.cos(roi[:, 3])])
+    return np.column_stack([roi[:, :2] + params.up * radius[:, None] * up, params.body_radius * radius])
+
+
+def off_course(circle: np.ndarray) -> np.ndarray:
+    """(T,) how far (px) each centre is from the median of those around it; NaN without any."""
+    shifted = []
+    for step in (s for s in range(-_AROUND, _AROUND + 1) if s):
+        moved = np.full((len(circle), 2), np.nan)
+        if abs(step) < len(circle):
+            moved[max(0, -step) : len(circle) - max(0, step)] = circle[max(0, step) : len(circle) + min(0, step), :2]
+        shifted.append(moved)
+    around = np.stack(shifted)
+    some = np.isfinite(around[..., 0]).any(axis=0)
+    course = np.full((len(circle), 2), np.nan)
+    if some.any():
+        course[some] = np.nanmedian(around[:, some], axis=0)
+    return np.hypot(*(circle[:, :2] - course).T)
+
+
+def around_both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest circle (3,) that holds two circles (3,)."""
+    apart = float(np.hypot(*(b[:2] - a[:2])))
+    if apart + min(a[2], b[2]) <= max(a[2], b[2]):
+        return a if a[2] >= b[2] else b
+    radius = (apart + a[2] + b[2]) / 2
+    return np.array([*(a[:2] + (b[:2] - a[:2]) * (radius - a[2]) / apart), radius])
+
+
+def mean(values: np.ndarray) -> np.ndarray:
+    """Mean over the second axis of those that are known, NaN where none is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=1)
+    total = np.where(known, values, 0.0).sum(axis=1)
+    return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+
+def held(head: Head, time_s: np.ndarray, size_px: tuple[int, int], params: HeadParams) -> Head:
+    """The head with its gaps filled; where its place is in doubt, also where the sure frames around say it is.
+
+    Gaps up to `bridge_s` are interpolated. Beyond the ends, and at both sides of a longer gap, the circle stays: for
+    `hold_s`, but no longer than the head was seen (a wrong sighting is short), or `leave_s` where it touches the edge
+    of the picture, through which a head comes and goes. It grows meanwhile.
+    """
+    n_seen = int((head.source != NONE).sum())
+    seen_s = n_seen * float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    hold_s = params.leave_s if head.body_px is None else params.hold_s
+    params = dataclasses.replace(params, hold_s=min(hold_s, max(seen_s, params.leave_s)))
+    sure = (head.source == KEYPOINTS) | (head.source == FACE)
+    doubt = (head.source != NONE) & ~sure
+    also = np.full_like(head.circle_px, np.nan)
+    _fill(also, head.circle_px, np.flatnonzero(sure), np.flatnonzero(doubt), time_s, size_px, params)
+    circle = head.circle_px.copy()
+    absent = np.flatnonzero(head.source == NONE)
+    _fill(circle, head.circle_px, np.flatnonzero(head.source != NONE), absent, time_s, size_px, params)
+    # A track that goes astray before it ends leaves its head where it was last sure.
+    _fill(also, head.circle_px, np.flatnonzero(sure), absent, time_s, size_px, params)
+    source = head.source.copy()
+    filled = np.isfinite(circle[absent]).all(axis=1) | np.isfinite(also[absent]).all(axis=1)
+    source[absent[filled]] = HELD
+    return dataclasses.replace(head, circle_px=circle, source=source, also_px=also)
+
+
+def _fill(
+    out: np.ndarray,
+    circle: np.ndarray,
+    known: np.ndarray,
+    wanted: np.ndarray,
+    time_s: np.ndarray,
+    size_px: tuple[int, int],
+    params: HeadParams,
+) -> None:
+    """Write into the rows `wanted` of `out` the circles held from the rows `known` of `circle`, where any is."""
+    if not len(known):
+        return
+    for t in wanted:
+        place = int(np.searchsorted(known, t))
+        before = int(known[place - 1]) if place else None
+        after = int(known[place]) if place < len(known) else None
+        since = float(time_s[t] - time_s[before]) if before is not None else np.inf
+        until = float(time_s[after] - time_s[t]) if after is not None else np.inf
+        if before is not None and after is not None and since + until <= params.bridge_s:
+            between = circle[before] + since / (since + until) * (circle[after] - circle[before])
+            out[t] = _grown(between, min(since, until), params)
+            continue
+        near, for_s = (before, since) if since <= until else (after, until)
+        longest = params.leave_s if near is not None and _at_edge(circle[near], size_px) else params.hold_s
+        if near is not None and for_s <= longest + 1e-9:
+            out[t] = _grown(circle[near], for_s, params)
+
+
+def _at_edge(circle: np.ndarray, size_px: tuple[int, int]) -> bool:
+    x, y, r = circle
+    return bool(x < r or y < r or x > size_px[0] - r or y > size_px[1] - r)
+
+
+def _grown(circle: np.ndarray, for_s: float, params: HeadParams) -> np.ndarray:
+    return np.array([*circle[:2], circle[2] * min(1.0 + params.hold_growth * for_s, params.hold_most)])
+
+
+FULL_RANGE = SsdLayout(input_size=192, layers=((4, 1),), n_keypoints=6)
+SHORT_RANGE = SsdLayout(input_size=128, layers=((8, 2), (16, 6)), n_keypoints=6)
+#: Boxes of two windows that overlap more are of one face.
+SAME_IOU = 0.2
+
+
+class FaceDetector:
+    """Both networks. Faces from about a tenth of a window's side up. Not to be shared by threads.
+
+    Raises the `PblError`s of `assets.fetch`.
+    """
+
+    def __init__(self, min_score: float = 0.5) -> None:
+        self._full = _load("face_detector", FULL_RANGE, min_score)
+        self._short = _load("face_detector_near", SHORT_RANGE, min_score)
+        self.models = {"face_detector": self._full.sha256, "face_detector_near": self._short.sha256}
+
+    def detect(self, image: np.ndarray, windows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes (N, 4) x0, y0, x1, y1 in px and scores (N,), best first, of the faces in the `windows` (x0, y0, x1, y1)
+        of `image` (H, W, 3) uint8 BGR. The short range's network looks at the whole picture only."""
+        height, width = image.shape[:2]
+        boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
+        looks = [(self._full, w) for w in windows] + [(self._short, (0, 0, width, height))]
+        for model, (x0, y0, x1, y1) in looks:
+            points, score = model.find(image[y0:y1, x0:x1])
+            boxes.append(points[:, :2].reshape(-1, 4) + np.array([x0, y0, x0, y0]))
+            scores.append(score)
+        every, score = np.concatenate(boxes), np.concatenate(scores)
+        order = np.argsort(-score, kind="stable")
+        return suppress(every[order], score[order], SAME_IOU)
+
+
+def same_face(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(N,) overlap of a box (4,) with boxes (N, 4), 0 where they are not of one face."""
+    overlap = box_iou(box, boxes)
+    return np.where(overlap > SAME_IOU, overlap, 0.0)
+
+
+def _load(name: str, layout: SsdLayout, min_score: float) -> SsdModel:
+    return SsdModel(assets.fetch(name), assets.ASSETS[name].sha256, layout, min_score)
+
 
 _FRAMES_AHEAD = 4
 

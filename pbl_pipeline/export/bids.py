@@ -15,7 +15,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.angles_file import angles_table
 
-from .text import lines, number_cells
+from .columns import lines, number_cells
 from .trial import ExportTrial
 from .visit_tables import joint_sign
 

@@ -11,7 +11,7 @@ import numpy as np
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
 
-from .text import lines, number_cells
+from .columns import lines, number_cells
 from .trial import ExportTrial
 
 

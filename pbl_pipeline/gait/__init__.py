@@ -5,12 +5,8 @@ Each step is a function of its own with a frozen result: `feet_from_fit` or `fee
 """
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
-from ._bands import AdultRanges, NormalBands, adult_ranges, leg_length_m, normal_bands
-from ._camera_side import camera_side, mostly
-from ._condition import ACTIVITIES, ANY_PACE, PACES, SELF_SELECTED, UNKNOWN, Condition
-from ._curve_frame import CURVE_FRAME_COLUMNS, curve_frame
-from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles
-from ._exclusion import CADENCE, Exclusion
+from ._bands import CURVE_FRAME_COLUMNS, AdultRanges, NormalBands, adult_ranges, curve_frame, leg_length_m, normal_bands
+from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -27,9 +23,18 @@ from ._gdi import (
     worth_of_one_more,
 )
 from ._own_norm import norm_from_cycles
-from ._profile import MovementProfile, movement_profile, variable_scores
-from .change import IMPORTANT_CHANGE, Chances, chances, change_sd
-from .cycle_measures import MEASURES, SIDED, Z90, Measure, Spatiotemporal, cycle_measures, far_leg_of, spatiotemporal
+from .cycle_measures import (
+    MEASURES,
+    SIDED,
+    Z90,
+    Measure,
+    Spatiotemporal,
+    camera_side,
+    cycle_measures,
+    far_leg_of,
+    mostly,
+    spatiotemporal,
+)
 from .events import METHODS as EVENT_METHODS
 from .events import (
     EventParams,
@@ -42,6 +47,7 @@ from .events import (
 )
 from .ground import cycle_lengths
 from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
+from .measurement import IMPORTANT_CHANGE, Chances, chances, change_sd
 from .metrics import (
     GaitMetrics,
     GaitParams,
@@ -74,6 +80,19 @@ from .normative import (
     norm_names,
     offset_deg,
 )
-from .outliers import refused_cadence, with_cadence_accepted
 from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, task_motion
-from .types import GaitCycle, Lengths
+from .types import (
+    ACTIVITIES,
+    ANY_PACE,
+    CADENCE,
+    PACES,
+    SELF_SELECTED,
+    UNKNOWN,
+    Condition,
+    Exclusion,
+    GaitCycle,
+    Lengths,
+    MovementProfile,
+    movement_profile,
+    variable_scores,
+)

@@ -14,8 +14,6 @@ from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 
-from ._condition import ANY_PACE, SELF_SELECTED
-from ._profile import MovementProfile, movement_profile, variable_scores
 from .cycle_measures import Z90
 from .events import LEFT, RIGHT
 from .measurement import MeasurementModel, Pass, estimate, expected_index, load_model, with_one_more
@@ -28,7 +26,7 @@ from .normative import (
     load_norm,
     norm_names,
 )
-from .types import GaitCycle
+from .types import ANY_PACE, SELF_SELECTED, GaitCycle, MovementProfile, movement_profile, variable_scores
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,9 +15,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
-from ._condition import Condition
-from ._cycles import find_cycles
-from ._exclusion import CADENCE
+from ._cycles import find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -46,9 +44,8 @@ from .laboratory import LabTrial
 from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
-from .outliers import refused_cadence, with_cadence_accepted
 from .tasks import TASK_MEASURES, task_measures, task_motion
-from .types import GaitCycle
+from .types import CADENCE, Condition, GaitCycle
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

@@ -1,13 +1,168 @@
-"""A gait cycle with its curves and its lengths on the floor."""
+"""A gait cycle with its curves, lengths and exclusion; what is done in a trial; the Movement Analysis Profile."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
-from ._exclusion import Exclusion
-from .normative import BODY_ANGLES
+from pbl_pipeline.names import check_label
+
+from .events import LEFT, RIGHT, SIDES
+from .normative import BODY_ANGLES, NINE_ANGLES, NormativeSet
+
+_PELVIS = ("pelvis_tilt", "pelvis_obliquity", "pelvis_rotation")
+
+
+@dataclasses.dataclass(frozen=True)
+class MovementProfile:
+    """Gait Variable Scores (deg) per side and angle: together the Movement Analysis Profile.
+
+    A score is the root mean square, over the cycle, of the distance from the normative mean curve; of several cycles
+    their mean. `gps_left`, `gps_right` are the Gait Profile Scores of a side and `gps` that of the person, None unless
+    the norm has all nine angles (`NINE_ANGLES`). Empty sides have no scores.
+    """
+
+    left: dict[str, float]
+    right: dict[str, float]
+    gps_left: float | None
+    gps_right: float | None
+    gps: float | None
+
+    def of_side(self, side: str) -> dict[str, float]:
+        """The scores of "left" or "right"."""
+        return self.right if side == RIGHT else self.left
+
+    def to_dict(self) -> dict:
+        """`profile_deg` of metrics.json."""
+        return {k: _rounded(v) for k, v in dataclasses.asdict(self).items()}
+
+
+def variable_scores(vectors: np.ndarray, norm: NormativeSet) -> np.ndarray:
+    """Gait Variable Scores (N, V) in degrees of feature vectors (N, V * P) of the norm's angles."""
+    away = np.atleast_2d(vectors) - norm.mean_deg
+    return np.sqrt(np.mean(away.reshape(len(away), len(norm.variables), -1) ** 2, axis=2))
+
+
+def movement_profile(scores: Mapping[str, np.ndarray], norm: NormativeSet) -> MovementProfile:
+    """Profile of a person from the scores (N, V) of the cycles of each side (`variable_scores`).
+
+    Baker et al. 2009, Gait & Posture 30:265-269. The Gait Profile Score of a side is the root mean square of its nine
+    scores; that of the person is over 15: the nine of the left side and, of the right, all but those of the pelvis,
+    which both sides share.
+    """
+    means = {side: np.mean(scores[side], axis=0) for side in SIDES if side in scores and len(scores[side])}
+    named = {side: dict(zip(norm.variables, map(float, m), strict=True)) for side, m in means.items()}
+    whole = set(norm.variables) == set(NINE_ANGLES)
+    gps = {side: _rms(list(v.values())) if whole else None for side, v in named.items()}
+    both = None
+    if whole and len(named) == 2:
+        legs = [v for angle, v in named[RIGHT].items() if angle not in _PELVIS]
+        both = _rms([*named[LEFT].values(), *legs])
+    return MovementProfile(named.get(LEFT, {}), named.get(RIGHT, {}), gps.get(LEFT), gps.get(RIGHT), both)
+
+
+def _rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _rounded(value: float | dict | None) -> float | dict | None:
+    if isinstance(value, dict):
+        return {k: round(v, 3) for k, v in value.items()}
+    return None if value is None else round(value, 3)
+
+
+#: Usual activities and paces; others are allowed.
+ACTIVITIES = ("walking", "tug", "sit_to_stand", "fsst", "tandem", "standing", "stairs", "squat", "running")
+PACES = ("self_selected", "fast", "slow", "dual_task")
+SELF_SELECTED = "self_selected"
+#: As the pace of a method: walking at any pace.
+ANY_PACE = "any"
+UNKNOWN = "unknown"
+#: Words of an activity that is walking over the floor or a treadmill.
+_WALKING = ("walk", "gait", "overground")
+
+
+@dataclasses.dataclass(frozen=True)
+class Condition:
+    """Activity and pace of a trial. Unknown counts as walking, and as the pace that the person chose.
+
+    Case, spaces and hyphens make no difference: "Sit-to-stand" is "sit_to_stand". Raises `PblError` USAGE for a label
+    of more than 32 characters.
+    """
+
+    activity: str = UNKNOWN
+    pace: str = UNKNOWN
+
+    def __post_init__(self) -> None:
+        for name in ("activity", "pace"):
+            text = "_".join(str(getattr(self, name) or UNKNOWN).lower().replace("-", " ").replace("_", " ").split())
+            check_label(name, text, 32)
+            object.__setattr__(self, name, text or UNKNOWN)
+
+    @property
+    def walks(self) -> bool:
+        """Whether the activity is walking."""
+        return self.activity == UNKNOWN or any(word in self.activity for word in _WALKING)
+
+    @property
+    def pool(self) -> str:
+        """The pace under which a method pools this trial; "" where it is no walking, which none pools."""
+        if not self.walks:
+            return ""
+        return SELF_SELECTED if self.pace == UNKNOWN else self.pace
+
+    def pooled(self, pace: str) -> bool:
+        """Whether a method with this pace pools the trial."""
+        return bool(self.pool) and pace in (ANY_PACE, self.pool)
+
+    def __str__(self) -> str:
+        return self.activity if self.pace == UNKNOWN else f"{self.activity}, {self.pace}"
+
+
+#: Name of the check that leaves out all cycles of a recording until a person accepts it.
+CADENCE = "cadence_plausible"
+
+
+@dataclasses.dataclass(frozen=True)
+class Exclusion:
+    """Reasons against a cycle; none where it is used.
+
+    `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
+    the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known,
+    so that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the `n_curves` cycles
+    of its side, where that is far. `failed_checks`: checks of the fit that FAIL, or `CADENCE`.
+    """
+
+    first_step: bool = False
+    last_step: bool = False
+    length_ratio: float | None = None
+    length_unproven: bool = False
+    curve_distance_deg: float | None = None
+    n_curves: int | None = None
+    failed_checks: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        """Whether there is a reason."""
+        return self != Exclusion()
+
+    @property
+    def text(self) -> str:
+        """The reasons in words, empty where there is none. A check that failed is reason enough."""
+        if CADENCE in self.failed_checks:
+            return "the cadence is unusual for walking, and no one has accepted it"
+        if self.failed_checks:
+            return f"the fit failed its check {', '.join(self.failed_checks)}"
+        reasons = ["first step of the bout"] if self.first_step else []
+        reasons += ["last step of the bout"] if self.last_step else []
+        if self.length_ratio is not None:
+            unproven = ", without feet that show whether a step was missed" if self.length_unproven else ""
+            reasons.append(f"{self.length_ratio:.2f} times the typical stride{unproven}")
+        if self.curve_distance_deg is not None:
+            reasons.append(f"{self.curve_distance_deg:.0f} deg from the median curves of {self.n_curves} cycles")
+        return " and ".join(reasons)
+
 
 #: Why a cycle without a fit has no lengths.
 NO_POSITIONS = "no positions on the floor"

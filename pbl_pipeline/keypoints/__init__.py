@@ -1,7 +1,6 @@
 """Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
 
 from .blazepose import BlazePoseLandmarks
-from .crop_geometry import view_rotation
 from .detect import detect_keypoints
 from .in_view import (
     SEEN_SHARE,
@@ -15,22 +14,28 @@ from .in_view import (
 )
 from .marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from .methods import METHODS
-from .multi_view import SAME_TIME_S, MultiView, cameras_of_files, check_same_times
+from .multi_view import (
+    MOST_MISS_M,
+    SAME_TIME_S,
+    MultiView,
+    cameras_of_files,
+    check_same_times,
+    check_views_agree,
+    ray_miss_m,
+)
 from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
-from .params import KeypointParams
-from .phone_clock import log_shift_s
 from .picture import Picture, PictureMeter
-from .protocol import KeypointDetector
-from .quality_checks import check_keypoints, side_changes
-from .stated_confidence import (
+from .protocol import KeypointDetector, KeypointParams
+from .quality_checks import (
     BOUND_TRUNK,
     ConfidenceCurve,
+    check_keypoints,
     confidence_curve,
     confidence_curves,
     confidence_text,
     probability_within,
+    side_changes,
 )
-from .trc import read_trc
-from .types import Keypoints, PersonKeypoints
-from .view_agreement import MOST_MISS_M, check_views_agree, ray_miss_m
-from .world_markers import WorldMarkers
+from .types import Keypoints, PersonKeypoints, log_shift_s
+from .virtual_camera import view_rotation
+from .world_markers import WorldMarkers, read_trc

@@ -18,11 +18,11 @@ from pbl_pipeline.models import Network
 from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
 
-from .crop_geometry import crop_matrix, view_rotation
 from .flips import mirror_of
 from .mirrored_inference import MirroredInference
-from .params import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
+from .protocol import MARKER_SET, MODEL_SHA256, ROOT_RELATIVE, KeypointParams
 from .types import PersonKeypoints
+from .virtual_camera import crop_matrix, view_rotation
 
 HEAVY_SHA256 = assets.ASSETS["blazepose_landmarks_heavy"].sha256
 #: The networks by their SHA-256: the asset that each is. They have the same inputs and outputs.

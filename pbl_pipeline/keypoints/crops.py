@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .params import KeypointParams
+from .protocol import KeypointParams
 from .types import PersonKeypoints
 
 #: The Gaussian kernel is cut off at so many standard deviations.

@@ -20,15 +20,13 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
-from .batched import BatchDetector, BatchedInference
 from .crops import Regions, smooth_rois
 from .flips import exchange_sides, exchanged, lowered
 from .methods import METHODS
-from .params import KeypointParams
-from .passes import ParallelInference, n_workers, two_passes
+from .passes import BatchDetector, BatchedInference, ParallelInference, n_workers, two_passes
 from .picture import Picture, PictureMeter
-from .protocol import Inspection, KeypointDetector, MirrorDetector
-from .stated_confidence import confidence_curve
+from .protocol import Inspection, KeypointDetector, KeypointParams, MirrorDetector
+from .quality_checks import confidence_curve
 from .types import Keypoints, PersonKeypoints
 
 

@@ -7,7 +7,7 @@ from pbl_pipeline.methods import Stage
 
 from .blazepose import HEAVY_SHA256, blazepose
 from .onnx_keypoints import ModelKeypointParams, model_keypoint_params, onnx
-from .params import KeypointParams
+from .protocol import KeypointParams
 
 
 class RegisteredModels:

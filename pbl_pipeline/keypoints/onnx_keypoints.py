@@ -11,15 +11,112 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import ModelSpec, OnnxModel, check_frozen, find, load_spec
 from pbl_pipeline.paramset import later
-from pbl_pipeline.video import Camera
+from pbl_pipeline.video import Camera, viewing_ray
 
-from .augment import aligned, augmentations, sd_confidence, spread_mm
-from .decode_2d import edge_shift, from_heatmap, from_simcc
 from .flips import FlipParams
-from .params import KeypointParams
-from .root_position import HALF_M, absolute_root
+from .protocol import KeypointParams
 from .types import PersonKeypoints
-from .virtual_camera import crops, look_at
+from .virtual_camera import aligned, augmentations, crops, look_at, sd_confidence, spread_mm
+
+#: Fewest points that fix a place.
+MIN_POINTS = 4
+#: Distance at which a point counts half, as a length at the person's distance (m), which is the same in a picture of
+#: any size: 5 px of one of 1080 x 1920 from 4.5 m. And rounds of reweighting: first with Huber's weights, which find
+#: their way from anywhere, then with Cauchy's, which let go of points that are far off.
+HALF_M, _OLD_HALF_PX = 0.015, 5.0
+_ROUNDS = (8, 8)
+#: Nearest that a point may be to the camera (m).
+_NEAREST_M = 0.1
+
+
+def absolute_root(
+    xyz_m: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray, camera: Camera, half_m: float = HALF_M
+) -> np.ndarray:
+    """(T, 3) shift in m that puts points (T, J, 3), right but for one shift, where their pixels (T, J, 2) see them.
+
+    Least squares on ``(x + tx) - u (z + tz)`` and the same for y, u and v being the ray of the pixel without
+    distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as seen in
+    the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half
+    at `half_m`; 0: at 5 px of the file, as before 0.2). `confidence` (T, J) weighs the points. NaN where fewer than
+    four have one, or where the person would stand behind the camera.
+    """
+    xyz, weight0 = np.asarray(xyz_m, np.float64), np.asarray(confidence, np.float64)
+    known = np.isfinite(xyz).all(axis=2) & np.isfinite(xy_px).all(axis=2) & (weight0 > 0)
+    xyz, weight0 = np.where(known[..., None], xyz, 0.0), np.where(known, weight0, 0.0)
+    pixels = np.where(known[..., None], xy_px, camera.matrix[:2, 2])
+    rays = viewing_ray(pixels.reshape(-1, 2), camera).reshape(*xyz.shape)[..., :2]
+    focal = float(np.mean(camera.matrix[[0, 1], [0, 1]]))
+    out = np.full((len(xyz), 3), np.nan)
+    rows = np.flatnonzero(known.sum(axis=1) >= MIN_POINTS)
+    x, d, w = xyz[rows], rays[rows], weight0[rows]
+    shift = _solve(x, d, w)
+    for number in range(sum(_ROUNDS)):
+        z = np.maximum(x[..., 2] + shift[:, None, 2], _NEAREST_M)
+        off = focal * np.linalg.norm((x[..., :2] + shift[:, None, :2]) / z[..., None] - d, axis=-1)
+        far = off * z / (focal * half_m) if half_m else off / _OLD_HALF_PX
+        robust = np.minimum(1.0, 1 / np.maximum(far, 1e-9)) if number < _ROUNDS[0] else 1 / (1 + far**2)
+        shift = _solve(x, d, w * robust / z**2)
+    before = np.min(np.where(known[rows], x[..., 2] + shift[:, None, 2], np.inf), axis=1) > _NEAREST_M
+    out[rows[before]] = shift[before]
+    return out
+
+
+def _solve(x: np.ndarray, d: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Weighted least squares: rows (1, 0, -u) and (0, 1, -v), right sides u z - x and v z - y."""
+    normal = np.zeros((len(x), 3, 3))
+    normal[:, 0, 0] = normal[:, 1, 1] = w.sum(axis=1)
+    normal[:, :2, 2] = normal[:, 2, :2] = -np.einsum("tj,tjk->tk", w, d)
+    normal[:, 2, 2] = np.einsum("tj,tjk->t", w, d**2)
+    right = d * x[..., 2:] - x[..., :2]
+    b = np.concatenate([np.einsum("tj,tjk->tk", w, right), -np.einsum("tj,tjk,tjk->t", w, d, right)[:, None]], axis=1)
+    scale = np.maximum(w.sum(axis=1), 1e-300)[:, None, None]
+    return np.linalg.solve(normal / scale + 1e-12 * np.eye(3), (b / scale[..., 0])[..., None])[..., 0]
+
+
+_FLAT = 1e-12
+
+
+def from_simcc(x: np.ndarray, y: np.ndarray, split: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, J, 2) in px of the crop and scores (N, J) from SimCC's two profiles (N, J, width * split) and
+    (N, J, height * split): the place of the largest value on each axis, between the bins by the parabola through it
+    and its neighbours. The score is the smaller of the two values, in 0..1 (Li et al. 2022, "SimCC", ECCV)."""
+    at_x, top_x = _peak(x)
+    at_y, top_y = _peak(y)
+    return np.stack([at_x, at_y], axis=-1) / split, np.clip(np.minimum(top_x, top_y), 0.0, 1.0)
+
+
+def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, J, 2) in px of the crop of `size_px` (width, height) and scores (N, J) from heat maps (N, J, h, w):
+    the place of the largest value, between the cells by the parabola along each axis; its value in 0..1 is the score.
+
+    Cell i is at i * width / w: cells and pixels count from the centre of the first, or both from its edge less half a
+    cell (`edge_shift`)."""
+    n, j, h, w = heatmap.shape
+    best = heatmap.reshape(n, j, -1).argmax(axis=2)
+    row, column = best // w, best % w
+    a, b = np.ogrid[:n, :j]
+    at_x, top = _peak(heatmap[a, b, row])
+    at_y, _ = _peak(heatmap[a, b, :, column])
+    points = np.stack([at_x * size_px[0] / w, at_y * size_px[1] / h], axis=-1)
+    return points, np.clip(top, 0.0, 1.0)
+
+
+def edge_shift(shape: tuple[int, ...], size_px: tuple[int, int]) -> np.ndarray:
+    """Half a cell (2,) of a heat map of `shape` (..., h, w) in px: what its centre is from its edge."""
+    return np.array([size_px[0] / shape[-1], size_px[1] / shape[-2]]) / 2
+
+
+def _peak(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place (N, J), between the bins, and value (N, J) of the largest of (N, J, K)."""
+    index = profile.argmax(axis=2)
+    inner = np.clip(index, 1, profile.shape[2] - 2)
+    a, b = np.ogrid[: profile.shape[0], : profile.shape[1]]
+    left, middle, right = (profile[a, b, inner + k].astype(np.float64) for k in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    step = np.where(bend < -_FLAT, 0.5 * (left - right) / np.where(bend < -_FLAT, bend, 1.0), 0.0)
+    between = (inner == index) & (np.abs(step) <= 0.5)
+    return index + np.where(between, step, 0.0), profile.max(axis=2).astype(np.float64)
+
 
 #: Frames in one call of the network, by device.
 BATCH = {"cpu": 2, "cuda": 16}

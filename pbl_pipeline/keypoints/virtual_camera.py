@@ -4,6 +4,18 @@ A crop that is only cut out of the picture shows a person at the edge turned and
 virtual camera stands where the real one does, is turned so that the middle of the crop lies on its optical axis, may be
 rolled and mirrored, and has no distortion. The way back is exact: a pixel of the crop is a ray, a ray is a pixel of the
 picture; 3D points are turned back.
+
+Test-time augmentations: the crop shown several times, a little other each time, and what is made of the answers.
+
+Figures of scale, rotation and gamma as MeTRAbs uses them (Sarandi et al. 2023, WACV, and its published PyTorch code),
+so that the spread of its answers is the one for which the paper states its confidence.
+
+From the axes of a picture's crop to the camera frame.
+
+A network that sees a crop does not know where in the picture it was cut. Except for a slight stretch, the crop is
+the picture of a camera that looks straight at the crop's centre and is rolled with the crop. Its 3D points stand in
+that virtual camera's frame. A person at the edge of a wide picture is seen at up to 30 degrees from the optical axis,
+and without this rotation would seem to turn while she walks straight on.
 """
 
 from __future__ import annotations
@@ -13,10 +25,97 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from scipy.special import expit
 
-from pbl_pipeline.video import Camera, viewing_ray
+from pbl_pipeline.video import Camera, turning_radius2, viewing_ray
 
-from .crop_geometry import view_rotation
+
+def crop_matrix(roi_px: np.ndarray, size: int) -> np.ndarray:
+    """(2, 3) matrix from continuous crop coordinates (0..size, from the crop's edge) to picture pixels.
+
+    `roi_px` (4,): centre x, centre y, side, rotation (rad, clockwise in the picture).
+    """
+    x, y, side, rotation = roi_px
+    cosine, sine = np.cos(rotation), np.sin(rotation)
+    turn = np.array([[cosine, -sine], [sine, cosine]]) * (side / size)
+    return np.column_stack([turn, np.array([x, y]) - turn @ [size / 2, size / 2]])
+
+
+def view_rotation(roi_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """(3, 3) rotation from the axes of the crop's virtual camera to the camera frame.
+
+    The virtual camera looks along the ray through the crop's centre; its down axis is seen in the picture as the
+    crop's down direction. At the principal point it is the crop's roll alone.
+    """
+    centre = np.asarray(roi_px[:2], np.float64)
+    down_px = np.array([-np.sin(roi_px[3]), np.cos(roi_px[3])])
+    ray, below = viewing_ray(np.stack([centre, centre + down_px]), camera)
+    z = ray / np.linalg.norm(ray)
+    y = (below - ray) - z * (z @ (below - ray))
+    y /= np.linalg.norm(y)
+    return np.column_stack([np.cross(y, z), y, z])
+
+
+#: Rotations up to this to either side (deg); scales and exponents of gamma from and to.
+_ROTATION_DEG = 25.0
+_SCALES = (0.8, 1.0, 1.1)
+_GAMMAS = (0.6, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Augmentation:
+    """`scale` of what is seen, `roll_rad` clockwise, left and right exchanged, exponent `gamma` of values in 0..1."""
+
+    scale: float = 1.0
+    roll_rad: float = 0.0
+    mirrored: bool = False
+    gamma: float = 1.0
+
+
+def augmentations(n: int) -> tuple[Augmentation, ...]:
+    """The `n` augmentations, always the same ones; `n` = 1 is the crop as it is, 2 it and its mirror image.
+
+    From 3 on: rotations evenly from -25 to 25 deg, scales from 0.8 to 1.1, gamma from 0.6 to 1, every other mirrored.
+    """
+    if n < 1:
+        raise ValueError(f"{n} augmentations")
+    if n <= 2:
+        return (Augmentation(), Augmentation(mirrored=True))[:n]
+    half = n // 2
+    low, middle, high = _SCALES
+    scale = np.concatenate([np.linspace(low, middle, half, endpoint=False), np.linspace(middle, high, n - half)])
+    roll = np.radians(np.linspace(-_ROTATION_DEG, _ROTATION_DEG, n))
+    gamma = np.linspace(*_GAMMAS, n)
+    mirrored = (np.arange(n) - half) % 2 != 0
+    values = zip(scale, roll, mirrored, gamma, strict=True)
+    return tuple(Augmentation(float(s), float(r), bool(m), float(g)) for s, r, m, g in values)
+
+
+def sd_confidence(sigma_mm: np.ndarray, half_mm: float = 30.0, width_mm: float = 10.0) -> np.ndarray:
+    """c = 1 / (1 + exp((sigma - half) / width)): 0.5 at 30 mm (the paper, section Keypoint Detection).
+
+    `sigma_mm` is the standard deviation of a 3D point over the augmentations (`spread_mm`).
+    """
+    return expit((half_mm - np.asarray(sigma_mm, np.float64)) / width_mm)
+
+
+def aligned(xyz: np.ndarray) -> np.ndarray:
+    """Answers (..., A, J, 3), each moved by the shift that brings it onto the others; axes stay as they are.
+
+    The network gives a shape, not a place. First the means of all points coincide, then the median deviation from the
+    mean answer goes from each axis, so that a few points that differ do not move the others.
+    """
+    centred = xyz - xyz.mean(axis=-2, keepdims=True)
+    off = centred - centred.mean(axis=-3, keepdims=True)
+    return centred - np.median(off, axis=-2, keepdims=True)
+
+
+def spread_mm(xyz_m: np.ndarray) -> np.ndarray:
+    """(..., J) standard deviation in mm of aligned answers (..., A, J, 3) in m: the root mean square distance from
+    their mean over the A answers. One answer has none: 0."""
+    off = xyz_m - xyz_m.mean(axis=-3, keepdims=True)
+    return 1000.0 * np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-2))
+
 
 #: From this many picture pixels per crop pixel on, the picture is averaged before it is sampled.
 _SHRINK_FROM = 1.5
@@ -94,7 +193,7 @@ def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> 
     maps = [
         cv2.initUndistortRectifyMap(matrix, distortion, v.turn, v.matrix, (width, height), cv2.CV_32FC1) for v in views
     ]
-    reach = _reach(camera)
+    reach = np.sqrt(turning_radius2(camera))  # beyond it the picture would appear a second time
     if np.isfinite(reach):
         for view, (map_x, map_y) in zip(views, maps, strict=True):
             _blank(map_x, map_y, view, reach)
@@ -125,16 +224,6 @@ def _per_pixel(roi_px: np.ndarray, camera: Camera) -> float:
     rays = viewing_ray(ends, camera) @ view_rotation(roi_px, camera)
     flat = rays[:, :2] / rays[:, 2:]
     return float(np.linalg.norm(flat[1] - flat[0])) / (2 * half)
-
-
-def _reach(camera: Camera) -> float:
-    """Undistorted radius up to which the lens model grows; beyond it the picture would appear a second time."""
-    k1, k2, _, _, k3 = np.asarray(camera.distortion, np.float64)
-    if not (k1 or k2 or k3):
-        return np.inf
-    r = np.linspace(0.0, 4.0, 4001)
-    turns = np.flatnonzero(np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) <= 0)
-    return float(r[turns[0]]) if len(turns) else np.inf
 
 
 def _blank(map_x: np.ndarray, map_y: np.ndarray, view: VirtualCamera, reach: float) -> None:

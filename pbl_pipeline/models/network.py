@@ -164,7 +164,7 @@ class _Remote:
 
 def read_network(spec: NetworkSpec) -> bytes:
     """Return the bytes of the network's file with the wanted outputs. Raises `PblError` ASSET_CHECKSUM."""
-    from .tflite_outputs import keep_outputs
+    from .tflite import keep_outputs
 
     content = Path(spec.path).read_bytes()
     found = hashlib.sha256(content).hexdigest()

@@ -12,7 +12,7 @@ from pbl_pipeline.body import CapsuleShapes, capsule_frames, capsule_shapes, cap
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.checks import SD_WARN_DEG
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.render.colours import side_of
+from pbl_pipeline.render.drawing import side_of
 from pbl_pipeline.render.overlay import check_body
 
 #: Confidence of a side's leg below which it is drawn as uncertain: as `draw_keypoints` draws points hollow.

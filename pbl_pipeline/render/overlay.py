@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,10 +15,15 @@ from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.render.drawing import capsule_outline, draw_body, draw_keypoints
-from pbl_pipeline.render.projection import scaled_camera, to_camera
-from pbl_pipeline.render.strip import Event, Strip
-from pbl_pipeline.video import read_frames, write_h264
+from pbl_pipeline.render.drawing import (
+    Event,
+    Strip,
+    capsule_outline,
+    draw_body,
+    draw_keypoints,
+    to_camera,
+)
+from pbl_pipeline.video import read_frames, scaled_matrix, write_h264
 
 _BLOCK = 64  # frames whose capsules are computed and kept at a time
 
@@ -71,7 +77,7 @@ class _Painter:
         width, height = self.fit.image_size_px
         fx, fy = image.shape[1] / width, image.shape[0] / height
         if self.known(index):
-            camera = scaled_camera(self.fit.camera, fx, fy)
+            camera = dataclasses.replace(self.fit.camera, matrix=scaled_matrix(self.fit.camera.matrix, (fx, fy)))
             quat, position = self.fit.phone_quat_wxyz[index], self.fit.camera_position_m
             draw_body(image, *self._pose(index), quat, position, camera)
         if self._keypoints is not None and index < len(self._keypoints.time_s):

@@ -1,4 +1,4 @@
 """The report of a visit: one HTML page for people."""
 
-from pbl_pipeline.report._write import write_report
-from pbl_pipeline.report.types import Picture
+from pbl_pipeline.report._figures import Picture
+from pbl_pipeline.report.page import write_report

@@ -1,8 +1,9 @@
-"""Charts and pictures of the page, made from results."""
+"""Charts and pictures of the page, made from results, and what a report shows beside its visit."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 from collections.abc import Sequence
 
 import cv2
@@ -13,10 +14,19 @@ from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, far_leg_of, leg_angles
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
-from pbl_pipeline.report.types import Picture
 from pbl_pipeline.report.words import plural
 from pbl_pipeline.runs import runs
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """One frame with the fitted body drawn over it, as `render.overlay_frames` gives it: (H, W, 3) uint8 BGR."""
+
+    index: int
+    time_s: float
+    image: np.ndarray
+
 
 _SIDES = ("left", "right")
 _JPEG_QUALITY = 84

@@ -1,4 +1,4 @@
-"""Change of the same persons: standardised response mean, Cohen's d_z, Wilcoxon's signed ranks.
+"""Paired values: standardised response mean, Cohen's d_z, Wilcoxon's signed ranks, agreement, the paper's errors.
 
 Everywhere change is post - pre, one value per person; without `post`, `pre` holds the changes themselves.
 """
@@ -7,13 +7,89 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from ._input import changes, count, fraction, refuse
-from .types import Estimate, noncentrality
+from .types import Estimate, changes, count, fraction, noncentrality, numbers, refuse
+
+#: IQR to the standard deviation of a normal distribution.
+NIQR_FACTOR = 0.7413
+
+
+def niqr(values: Any) -> float:
+    """nIQR = IQR * 0.7413 of (N,) values, in their unit; quartiles interpolate linearly.
+
+    Raises `PblError` STATS_INPUT: fewer than two values, NaN.
+    """
+    array = numbers(values, "values")
+    if len(array) < 2:
+        raise refuse(f"{len(array)} value(s)", "at least 2", "a spread needs several trials")
+    low, high = np.percentile(array, [25, 75])
+    return float(NIQR_FACTOR * (high - low))
+
+
+def median_of_medians(errors: Sequence[Any]) -> tuple[float, float]:
+    """Median absolute error: the median within each trial, then over the trials; and the nIQR over the trials.
+
+    Raises `PblError` STATS_INPUT: a trial without errors, NaN, fewer than two trials.
+
+    Parameters
+    ----------
+    errors
+        Of each trial its errors, signed or not, (N_i,) in any unit. Two trials at least.
+    """
+    medians = []
+    for i, trial in enumerate(errors):
+        absolute = np.abs(numbers(trial, f"trial {i}"))
+        if not len(absolute):
+            raise refuse(f"trial {i} without errors", "one at least", "leave that trial out and report it")
+        medians.append(np.median(absolute))
+    return float(np.median(medians)) if medians else np.nan, niqr(medians)
+
+
+#: Bland and Altman's multiple of the standard deviation: 95 % of normal differences.
+LIMIT_SD = 1.96
+
+
+@dataclasses.dataclass(frozen=True)
+class BlandAltman:
+    """Limits of agreement, in the unit of the values."""
+
+    bias: Estimate  # mean of a - b with Student's interval
+    #: bias - and + 1.96 sd, each with its interval.
+    lower: Estimate
+    upper: Estimate
+    sd: float  # of the differences (n - 1)
+    n: int  # pairs
+
+
+def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
+    """Limits of agreement of (N,) and (N,) values, one pair per person (Bland & Altman 1986, Lancet 327:307-310).
+
+    The intervals of the limits are exact for normal differences (noncentral t; Carkeet 2015, Optom Vis Sci 92:e71-80).
+    Bland and Altman's own, limit and t sqrt(3 / n) sd, are nearly that from 50 pairs on.
+
+    Raises `PblError` STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
+    """
+    difference = changes(b, a, 3)
+    fraction(confidence, "confidence")
+    n, bias, sd = len(difference), float(difference.mean()), float(difference.std(ddof=1))
+    error = sd / math.sqrt(n)
+    # A limit mean + c sd, c standard errors of it: the noncentrality of (sample mean - limit) / error is -1.96 sqrt(n).
+    tail = (1 - confidence) / 2
+    near, far = (float(stats.nct.ppf(q, n - 1, LIMIT_SD * math.sqrt(n))) * error for q in (tail, 1 - tail))
+    half = float(stats.t.isf(tail, n - 1)) * error
+    return BlandAltman(
+        bias=Estimate(bias, bias - half, bias + half, confidence),
+        lower=Estimate(bias - LIMIT_SD * sd, bias - far, bias - near, confidence),
+        upper=Estimate(bias + LIMIT_SD * sd, bias + near, bias + far, confidence),
+        sd=sd,
+        n=n,
+    )
+
 
 #: Fewest persons whose change is judged: with fewer a jackknife or bootstrap has nothing to vary.
 MIN_PERSONS = 3

@@ -12,7 +12,7 @@ from scipy import stats
 
 from pbl_pipeline.runs import runs
 
-from ._input import count, differ, fraction, labels, numbers, one_of, refuse
+from .types import count, differ, fraction, labels, numbers, one_of, refuse
 
 CURVE_METHODS = ("max-t", "cluster")
 

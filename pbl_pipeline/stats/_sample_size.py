@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy import stats
 
-from ._input import fraction, numbers, one_of, refuse
+from .types import fraction, numbers, one_of, refuse
 
 DESIGNS = ("paired", "parallel", "parallel-change")
 #: Beyond this a study is not one of a laboratory.

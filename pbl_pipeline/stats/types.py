@@ -1,13 +1,113 @@
-"""A number with its interval, and the intervals that several statistics share."""
+"""A number with its interval, and what several statistics ask of their values."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy import optimize, stats
 
-from ._input import refuse
+from pbl_pipeline.errors import PblError
+
+#: Beyond this, and as a spread below its inverse, squares are no longer numbers of a computer.
+_LARGEST = 1e100
+
+
+def refuse(found: str, expected: str, next_step: str) -> PblError:
+    return PblError("STATS_INPUT", found=found, expected=expected, next_step=next_step)
+
+
+def numbers(values: Any, name: str, ndim: int = 1, missing: bool = False) -> np.ndarray:
+    """`values` as a float array of `ndim` dimensions without infinite values and, unless `missing`, without NaN.
+
+    Raises `PblError` STATS_INPUT.
+    """
+    try:
+        array = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise refuse(f"{name}: {error}", "numbers", "convert the column to numbers") from None
+    if array.ndim != ndim:
+        raise refuse(f"{name} of shape {array.shape}", f"{ndim} dimension(s)", "pass an array of that shape")
+    if np.nanmax(np.abs(array), initial=0.0) > _LARGEST:
+        raise refuse(f"{name}: infinite values, or beyond {_LARGEST:g}", "measured numbers", "see where they are from")
+    if not missing and np.isnan(array).any():
+        raise refuse(
+            f"{name}: {np.isnan(array).sum()} of {array.size} values missing (NaN)",
+            "a number everywhere",
+            "leave out the persons, visits or cycles concerned and report how many",
+        )
+    return array
+
+
+def sample(values: Any, name: str, at_least: int) -> np.ndarray:
+    """(N,) finite values of which there are `at_least` and not all the same. Raises `PblError` STATS_INPUT."""
+    array = numbers(values, name)
+    if len(array) < at_least:
+        raise refuse(f"{name}: {len(array)} values", f"at least {at_least}", "record more persons")
+    if not differ(array):
+        raise refuse(f"{name}: all {len(array)} values are {array[0]:g}", "values that differ", "check the column")
+    return array
+
+
+def differ(values: np.ndarray) -> bool:
+    """Whether values differ by more than their last digits."""
+    return bool(np.ptp(values) > 1e-12 * np.abs(values).max() + 1 / _LARGEST)
+
+
+def same_length(a: np.ndarray, b: np.ndarray) -> None:
+    """Raises `PblError` STATS_INPUT where `a` and `b` cannot be pairs."""
+    if len(a) != len(b):
+        raise refuse(f"{len(a)} and {len(b)} values", "pairs", "pass both values of each person, in the same order")
+
+
+def changes(pre: Any, post: Any, at_least: int) -> np.ndarray:
+    """(N,) differences post - pre, or `pre` itself as the differences where `post` is None.
+
+    Raises `PblError` STATS_INPUT, also where all changes are the same.
+    """
+    if post is None:
+        return sample(pre, "changes", at_least)
+    before, after = numbers(pre, "pre"), numbers(post, "post")
+    same_length(before, after)
+    return sample(after - before, "changes (post - pre)", at_least)
+
+
+def labels(values: Any, name: str, length: int) -> tuple[np.ndarray, list[Any]]:
+    """(length,) number of each label, and the labels in the order in which they first appear.
+
+    Raises `PblError` STATS_INPUT for another length and missing labels.
+    """
+    given = pd.Series(list(values), dtype=object)
+    if len(given) != length:
+        raise refuse(f"{len(given)} {name} of {length} values", "one of each value", f"pass {name} in the same order")
+    index, found = pd.factorize(given)
+    if (index < 0).any():
+        raise refuse(f"{name}: {(index < 0).sum()} missing", "one of each value", "say whose the values are")
+    return index, list(found)
+
+
+def count(value: int, name: str) -> int:
+    """Raises `PblError` STATS_INPUT where `value` is less than 1."""
+    if value < 1:
+        raise refuse(f"{name} {value}", "a whole number of at least 1", f"correct {name}")
+    return int(value)
+
+
+def fraction(value: float, name: str) -> float:
+    """A number between 0 and 1, both excluded. Raises `PblError` STATS_INPUT."""
+    if not 0 < value < 1:
+        raise refuse(f"{name} {value}", "a number between 0 and 1", f"correct {name}")
+    return float(value)
+
+
+def one_of(value: str, names: tuple[str, ...], what: str) -> str:
+    """Raises `PblError` STATS_INPUT where `value` is none of `names`."""
+    if value not in names:
+        raise refuse(f"{what} {value!r}", f"one of {', '.join(names)}", "choose one of these")
+    return value
+
 
 #: scipy's noncentral t has six correct digits up to here.
 _LARGEST_T = 1e4

@@ -6,13 +6,11 @@ trials of `pbl synth`: legs by published curves at any speed, feet that stand st
 `plain_walk` is textbook curves and nothing else.
 """
 
-from .camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor, picture_px
+from .camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, VIEWS_DEG, PhoneSensor, picture_px
 from .impair import IMPAIRMENTS, Impairment
-from .markers import true_markers
 from .noise import CORRELATED_NOISE, NO_NOISE, Disturbance, Noise, correlated
-from .observe import Seen, film, hide, pelvis_positions, seen_by
+from .observe import Seen, film, hide, pelvis_positions, seen_by, true_markers
 from .physique import physique
-from .scene import VIEWS_DEG
+from .plan import plain_walk
 from .solve import SOLE_POINTS, sole_points
 from .synth import TASKS, Synthetic, SynthSpec, Truth, lens, speed_of_group, synthesise
-from .walk import plain_walk

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body
 
-from .curves import within
+from .plan import within
 
 #: Standard deviations of the size: overall, of the segments against it, of the left against the right side; of a
 #: marker's place on its body (m, each axis).

@@ -13,9 +13,8 @@ from pbl_pipeline.body import joint_of, load_body
 from pbl_pipeline.gait import BODY_ANGLES, LEG_ANGLES, PLUG_IN_GAIT, offset_deg
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
-from .curves import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
 from .impair import Style
-from .plan import GRID_STEP_S, Plan
+from .plan import GRID_STEP_S, MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, Plan, swing, wander, within
 
 #: Curves that drive the pelvis (sign, joint), by the right side's cycle; the model's tilt and list count the other way.
 PELVIS = {"pelvis_tilt": (-1, "tilt"), "pelvis_obliquity": (-1, "list"), "pelvis_rotation": (1, "rotation")}

@@ -24,8 +24,7 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline.body import SCALE_NAMES, load_body
 
 from .physique import SOLE_M, scaled_model
-from .plan import GRID_STEP_S, Plan, Step
-from .walk import pelvis_joints
+from .plan import GRID_STEP_S, Plan, Step, pelvis_joints
 
 #: Points of the sole in the frames of their bodies (right side; m, unscaled): those that the contact holds.
 SOLE_POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {

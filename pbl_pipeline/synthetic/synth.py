@@ -23,14 +23,13 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
 from . import tasks
-from .camera import PHONE_CAMERA, PHONE_SIZE_PX, PhoneSensor
+from .camera import CAMERAS, PHONE_CAMERA, PHONE_SIZE_PX, VIEWS_DEG, PhoneSensor, orientation, phone_path, place
 from .impair import Impairment, style_of
 from .noise import CORRELATED_NOISE, NO_NOISE, Noise
 from .observe import film, pelvis_positions
 from .physique import leg_length_m, physique
 from .plan import Plan
 from .reference import reference
-from .scene import CAMERAS, VIEWS_DEG, orientation, phone_path, place
 from .solve import solve
 
 #: task -> plan of a walker and a time (None: the task's own, or `DEFAULT_SECONDS`).

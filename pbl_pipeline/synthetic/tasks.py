@@ -13,9 +13,8 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 
-from .curves import wander, within
 from .impair import Style
-from .plan import GRID_STEP_S, Plan, Step, ease, grid
+from .plan import GRID_STEP_S, Plan, Step, ease, grid, wander, within
 
 #: How strides differ within a walk: step time (fraction), footprint along and across (m). The project's own numbers, of
 #: the size that is usual in healthy adults (a few percent).

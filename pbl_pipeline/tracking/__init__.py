@@ -3,18 +3,23 @@
 from .appearance import appearance_of, appearance_similarity
 from .associate import AssociationParams
 from .blazepose import BlazePoseDetector, body_box, circle_roi
-from .contact_sheets import contact_sheet, contact_sheet_jpeg, save_contact_sheet
 from .detection_schedule import WatchParams
 from .identity_swaps import UncrossParams
-from .methods import METHODS, SUBJECT_METHODS
+from .methods import METHODS, SUBJECT_METHODS, detector_params
 from .params import TrackingParams
-from .registered_detectors import detector_params
 from .reidentify import JoinParams
-from .required_subject import FILM_THE_WHOLE_BODY, require_subject
-from .subject_choice import choose_subject
+from .subject_choice import (
+    FILM_THE_WHOLE_BODY,
+    carried_choice,
+    choose_subject,
+    contact_sheet,
+    contact_sheet_jpeg,
+    require_subject,
+    same_person,
+    save_contact_sheet,
+)
 from .tiling import tiles
 from .track import track_people
-from .transfer_choice import carried_choice, same_person
 from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
 from .walker_score import SubjectParams, step_s, time_in_view_s
 from .yolox import YoloxDetector

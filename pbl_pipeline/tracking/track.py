@@ -19,13 +19,12 @@ from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from .appearance import appearance_of
 from .associate import Associator, Trail, measure
-from .backtracking import backtrack
 from .blazepose import body_box
 from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
 from .methods import METHODS
 from .params import TrackingParams
-from .reidentify import join_trails
+from .reidentify import backtrack, join_trails
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Tracking
 

@@ -2,15 +2,29 @@
 
 from .align import align_path, best_lag
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
-from .compare import JointError, KinematicErrors, compare, compare_angles
-from .curves import CURVE_COLUMNS, cycle_curves, save_curves
-from .frame import COLUMNS, TrialErrors, error_frame
-from .index import INDEX_COLUMNS, index_agreement, index_pairs
-from .joints import JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER
-from .paper import paper_figures
-from .paper_tables import paper_tables
-from .reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
-from .rotations import body_rotation_angles
+from .compare import (
+    CURVE_COLUMNS,
+    JointError,
+    KinematicErrors,
+    compare,
+    compare_angles,
+    cycle_curves,
+    median_niqr,
+    niqr,
+    save_curves,
+)
+from .paper_tables import COLUMNS, TrialErrors, error_frame, paper_tables
+from .reference import (
+    BODY_ROTATIONS,
+    CONVENTIONS,
+    JOINTS_CLIP,
+    JOINTS_OPENCAP,
+    JOINTS_PAPER,
+    QPOS,
+    Reference,
+    body_rotation_angles,
+    view_classes,
+)
 from .sources import (
     fit_angles,
     fit_angles_sd,
@@ -19,7 +33,15 @@ from .sources import (
     reference_of_mot,
     reference_of_qpos,
 )
-from .statistics import median_niqr, niqr
-from .table import Cell, Table
-from .view import view_classes
-from .write import html, latex, print_tables, write_tables
+from .write import (
+    INDEX_COLUMNS,
+    Cell,
+    Table,
+    html,
+    index_agreement,
+    index_pairs,
+    latex,
+    paper_figures,
+    print_tables,
+    write_tables,
+)

@@ -18,7 +18,7 @@ from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
 
-from .table import Cell, Table
+from .write import Cell, Table
 
 #: Measure of a frame of values that is the index.
 INDEX = "gdi"

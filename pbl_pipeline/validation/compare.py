@@ -1,24 +1,81 @@
-"""A fit against a reference: the errors of every joint they share."""
+"""A fit against a reference: the errors of every joint they share, over time and over gait cycles, and their nIQR."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicSpline
 
 from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import Z90, trial_poses
+from pbl_pipeline.gait import Z90, GaitCycle, trial_poses
+from pbl_pipeline.stats import niqr as niqr_of_all
+from pbl_pipeline.stats import shapiro_wilk
 
-from .align import MIN_COMMON, about_vertical, align_path, at_times, best_lag, unwrapped, vertical_turn, wrapped
-from .joints import JOINTS_OPENCAP, JOINTS_PAPER
-from .reference import Reference
-from .rotations import pelvis_angles_deg, pelvis_rotations
+from .align import (
+    MAX_GAP_S,
+    MIN_COMMON,
+    about_vertical,
+    align_path,
+    at_times,
+    best_lag,
+    unwrapped,
+    vertical_turn,
+    wrapped,
+)
+from .reference import (
+    JOINTS_OPENCAP,
+    JOINTS_PAPER,
+    MIXED,
+    Reference,
+    pelvis_angles_deg,
+    pelvis_rotations,
+    split_side,
+    view_of_fit,
+)
 from .sources import fit_angles, fit_angles_sd
-from .statistics import normality_p
-from .view import MIXED, view_of_fit
+
+#: Most values of a Shapiro-Wilk test: beyond 5,000 its p is not accurate.
+_MOST_TESTED = 5000
+
+
+def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """Median and nIQR = IQR * 0.7413 of the finite values; quartiles interpolate linearly.
+
+    NaN without a value; the nIQR is NaN with one, because one value has no spread.
+    """
+    v = _finite(values)
+    if v.size == 0:
+        return float("nan"), float("nan")
+    return float(np.median(v)), niqr(v)
+
+
+def niqr(values: Sequence[float] | np.ndarray) -> float:
+    """IQR * 0.7413 of the finite values; NaN with fewer than two."""
+    v = _finite(values)
+    return niqr_of_all(v) if v.size >= 2 else float("nan")
+
+
+def normality_p(values: Sequence[float] | np.ndarray) -> float:
+    """p of the Shapiro-Wilk test of the finite values against a normal distribution (scipy).
+
+    Of more than 5,000 values every second, third ... counts. NaN with fewer than three or where all are the same.
+    """
+    v = _finite(values)
+    try:
+        return shapiro_wilk(v[:: -(-v.size // _MOST_TESTED) or 1]).p
+    except PblError:
+        return float("nan")
+
+
+def _finite(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    v = np.asarray(values, float)
+    return v[np.isfinite(v)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,3 +319,75 @@ def _refused(key: str, found: str, expected: str) -> PblError:
         next_step="check that both are of one movement; set the reference's time stamps to the video's clock",
         key=key or None,
     )
+
+
+#: Phases of the curves in percent of the cycle: 101 points, as SPM1D's examples have.
+CURVE_PERCENT = np.linspace(0.0, 100.0, 101)
+CURVE_COLUMNS = ("trial", "cycle", "side", "joint", "percent", "fit_deg", "reference_deg")
+
+
+def cycle_curves(
+    fit: TrialFit, reference: Reference, cycles: Iterable[GaitCycle], errors: KinematicErrors | None = None
+) -> pd.DataFrame:
+    """Each joint of fit and reference at 0, 1, ..., 100 % of each gait cycle, side by side, in degrees.
+
+    One row per cycle, joint and phase (`CURVE_COLUMNS`). Both are read at the same moments: those of the cycle in the
+    video, less the lag for the reference. A cycle holds the joints of its own side and those of the middle; `joint` is
+    without side. Cubic splines through the samples; a cycle in which fit or reference lacks a joint for longer than
+    0.1 s has no pair for that joint. Angles of the pelvis against the world are left out: the worlds differ.
+
+    Raises `PblError` REFERENCE_INPUT, GAIT_INPUT as `compare`.
+
+    Parameters
+    ----------
+    cycles
+        Of `pbl_pipeline.gait.find_cycles`; only those with `used`.
+    errors
+        Of `compare(fit, reference)`, for its lag; computed where absent.
+    """
+    lag = (errors or compare(fit, reference)).lag_s
+    ours = fit_angles(fit, reference.convention)
+    parts = []
+    for cycle in (c for c in cycles if c.used):
+        at = cycle.start_s + CURVE_PERCENT / 100.0 * (cycle.end_s - cycle.start_s)
+        for name, theirs in reference.angles_deg.items():
+            joint, side = split_side(name)
+            if name not in ours or name in PELVIS_TURNS or side not in ("", cycle.side[0]):
+                continue
+            here = _curve(fit.time_s, ours[name], at)
+            there = _curve(reference.time_s, theirs, at - lag)
+            if here is None or there is None:
+                continue
+            here = here - 360.0 * np.round(np.mean(here - there) / 360.0)
+            values = (fit.name, cycle.number, cycle.side, joint, CURVE_PERCENT, here, there)
+            parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, values, strict=True))))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
+
+
+def save_curves(frame: pd.DataFrame, path: str | Path) -> Path:
+    """Write the pairs of one or several trials as .npz: `percent` (101,) and for each joint `<joint>_fit` and
+    `<joint>_reference` (N, 101) in degrees, row n of both from the same cycle, named in `<joint>_cycle` (N,).
+
+    With the package spm1d (which this project does not depend on) the paired test of a joint is
+    `spm1d.stats.ttest_paired(data["knee_flexion_fit"], data["knee_flexion_reference"]).inference(0.05)`.
+    """
+    arrays: dict[str, np.ndarray] = {"percent": CURVE_PERCENT}
+    for joint in dict.fromkeys(frame["joint"]):
+        of_joint = frame.loc[np.asarray(frame["joint"] == joint), :]
+        pairs = list(of_joint.groupby(["trial", "cycle", "side"], sort=False))
+        for column, name in (("fit_deg", "fit"), ("reference_deg", "reference")):
+            arrays[f"{joint}_{name}"] = np.array([np.asarray(part[column], float) for _, part in pairs])
+        arrays[f"{joint}_cycle"] = np.array(["/".join(str(k) for k in key) for key, _ in pairs], dtype=str)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+    return Path(path)
+
+
+def _curve(time_s: np.ndarray, angle_deg: np.ndarray, at_s: np.ndarray) -> np.ndarray | None:
+    """(101,) degrees at `at_s`, or None where samples are missing for longer than `MAX_GAP_S` or at an end."""
+    known = np.isfinite(angle_deg)
+    time, angle = np.asarray(time_s, float)[known], np.asarray(angle_deg, float)[known]
+    first, last = np.searchsorted(time, at_s[0], side="right") - 1, np.searchsorted(time, at_s[-1], side="left")
+    if first < 0 or last >= len(time) or np.max(np.diff(time[first : last + 1])) > MAX_GAP_S:
+        return None
+    part = slice(max(0, first - 3), last + 4)
+    return CubicSpline(time[part], unwrapped(angle[part, None])[:, 0])(at_s)

@@ -1,11 +1,12 @@
-"""The paper's tables from error rows: what the rows cannot fill stays empty, with n = 0."""
+"""Errors of many trials as one frame, and the paper's tables from it: what cannot be filled stays empty, with n = 0."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -15,12 +16,78 @@ from scipy import stats
 
 from pbl_pipeline.errors import PblError
 
-from .frame import COLUMNS, KEY
-from .joints import JOINTS_OPENCAP, JOINTS_PAPER, ROWS_PAPER, split_side
-from .paper import paper_cells
-from .statistics import median_niqr, niqr, normality_p
-from .table import Cell, Table
-from .view import BACK, CONTRALATERAL, FRONT, IPSILATERAL, LATERAL, MIXED
+from .compare import JointError, KinematicErrors, median_niqr, niqr, normality_p
+from .reference import (
+    BACK,
+    CONTRALATERAL,
+    FRONT,
+    IPSILATERAL,
+    JOINTS_OPENCAP,
+    JOINTS_PAPER,
+    LATERAL,
+    MIXED,
+    ROWS_PAPER,
+    split_side,
+)
+from .write import Cell, Table, paper_cells
+
+STATIC, HANDHELD, SEVERAL = "static", "handheld", "several"
+_JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError))
+_TRIAL_FIELDS = ("lag_s", "rte_m", "residual_2d_px", "residual_3d_cm")
+#: The columns that say which trial a row is of.
+KEY = ("dataset", "subject", "population", "activity", "camera", "trial", "detector", "solver")
+COLUMNS = (
+    *KEY,
+    "view",
+    "joint",
+    "side",
+    *(f for f in _JOINT_FIELDS if f != "joint"),
+    *_TRIAL_FIELDS,
+    "trial_median_abs_deg",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialErrors:
+    """The errors of one trial and what the trial was. `camera`: "static", "handheld" or "several"."""
+
+    errors: KinematicErrors
+    dataset: str
+    subject: str
+    population: str
+    activity: str
+    camera: str
+    trial: str
+    detector: str = ""
+    solver: str = ""
+
+
+def error_frame(rows: Iterable[TrialErrors]) -> pd.DataFrame:
+    """One row per trial and joint; no rows give an empty frame with the same columns (`COLUMNS`).
+
+    `joint` is without its side (`hip_flexion`), `side` is `r`, `l` or ``""``. `view` is the side's own; a joint of the
+    middle seen from either side has "lateral". Several cameras have no single view (``""``).
+    `trial_median_abs_deg` is the trial's error over all joints of `JOINTS_PAPER` (`KinematicErrors.median_abs_deg`).
+    """
+    out = []
+    for row in rows:
+        key = {name: getattr(row, name) for name in KEY}
+        trial = {name: getattr(row.errors, name) for name in _TRIAL_FIELDS}
+        trial["trial_median_abs_deg"] = row.errors.median_abs_deg
+        for error in row.errors.joints:
+            joint, side = split_side(error.joint)
+            values = {f: getattr(error, f) for f in _JOINT_FIELDS if f != "joint"}
+            view = _view(row, side)
+            out.append({**key, "view": view, "joint": joint, "side": side, **values, **trial})
+    return pd.DataFrame(out, columns=list(COLUMNS))
+
+
+def _view(row: TrialErrors, side: str) -> str:
+    if row.camera == SEVERAL:
+        return ""
+    view = row.errors.view["left" if side == "l" else "right"]
+    return LATERAL if not side and view in (IPSILATERAL, CONTRALATERAL) else view
+
 
 #: Level of significance (the paper, Statistics).
 ALPHA = 0.05

@@ -1,4 +1,4 @@
-"""Reference of a fit: joint angles and the path of the pelvis over time, and where they come from."""
+"""Reference of a fit: joint angles and the pelvis' path over time, by joints, rotations and the camera's view."""
 
 from __future__ import annotations
 
@@ -7,9 +7,134 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.body import PELVIS_TURNS, Y_UP_TO_Z_UP
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import BodyPoses, camera_side, mostly
+
+FRONT, BACK, IPSILATERAL, CONTRALATERAL, MIXED = "front", "back", "ipsilateral", "contralateral", "mixed"
+#: View of a joint of the middle if the camera stands on one side.
+LATERAL = "lateral"
+
+
+def view_of_fit(fit: TrialFit, poses: BodyPoses) -> dict[str, str]:
+    """View class for the joints of the "right" and "left" side: see `view_classes`.
+
+    The camera stands at `camera_position_m`; of several cameras that is the first one.
+    """
+    pelvis = poses.index("pelvis")
+    return view_classes(poses.position_m[:, pelvis], poses.rotation[:, pelvis, :, 0], fit.camera_position_m)
+
+
+def view_classes(pelvis_m: np.ndarray, forward: np.ndarray, camera_m: np.ndarray) -> dict[str, str]:
+    """View class per side from where the camera stands in most frames (`gait.camera_side`, with its arguments): "front"
+    or "back"; else "ipsilateral" for the joints of the side on which it is and "contralateral" for the other's. Where
+    no class holds 70 % of the known frames (a turn, a walk past the camera), or without a camera: "mixed".
+    """
+    sides = camera_side(pelvis_m, forward, camera_m)
+    most = mostly(sides[sides != ""])
+    if most in (FRONT, BACK, ""):
+        return dict.fromkeys(("right", "left"), most or MIXED)
+    return {side: IPSILATERAL if side == most else CONTRALATERAL for side in ("right", "left")}
+
+
+def body_rotation_angles(rotation: Mapping[str, Rotation]) -> dict[str, np.ndarray]:
+    """(T,) degrees of `JOINTS_CLIP` from body rotations whose axes are OpenSim's (forward, up, right).
+
+    Hip: R_pelvis^-1 R_femur as body-fixed ZXY (flexion, adduction, rotation); knee: -(R_femur^-1 R_tibia) as ZXY [0];
+    ankle: R_tibia^-1 R_talus as ZXY [0]. Left-side axes are mirrored. Every system goes through here, so that the axes
+    that a model gives its ankle and knee count the same way.
+
+    Parameters
+    ----------
+    rotation
+        `pelvis`, `femur_r`, `femur_l`, `tibia_r`, ... `talus_l`, each T rotations, body to any one world.
+    """
+    out = {}
+    for side, sign in (("r", 1.0), ("l", -1.0)):
+        hip = _relative(rotation, "pelvis", f"femur_{side}")
+        out[f"hip_flexion_{side}"] = hip[:, 0]
+        out[f"hip_adduction_{side}"] = sign * hip[:, 1]
+        out[f"hip_rotation_{side}"] = sign * hip[:, 2]
+        out[f"knee_flexion_{side}"] = -_relative(rotation, f"femur_{side}", f"tibia_{side}")[:, 0]
+        out[f"ankle_angle_{side}"] = _relative(rotation, f"tibia_{side}", f"talus_{side}")[:, 0]
+    return out
+
+
+def pelvis_rotations(tilt_deg: np.ndarray, list_deg: np.ndarray, rotation_deg: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) pelvis to a z-up world from the body's own pelvis angles (about z, x, y of a y-up ground, body-fixed).
+
+    The columns are forward, up and right of the pelvis.
+    """
+    angles = np.radians(np.column_stack([tilt_deg, list_deg, rotation_deg]))
+    return Y_UP_TO_Z_UP @ Rotation.from_euler("ZXY", angles).as_matrix()
+
+
+def pelvis_angles_deg(R_world_pelvis: np.ndarray) -> np.ndarray:
+    """(T, 3) tilt, list, rotation in degrees: the inverse of `pelvis_rotations`."""
+    return Rotation.from_matrix(Y_UP_TO_Z_UP.T @ R_world_pelvis).as_euler("ZXY", degrees=True)
+
+
+def _relative(rotation: Mapping[str, Rotation], parent: str, child: str) -> np.ndarray:
+    return (rotation[parent].inv() * rotation[child]).as_euler("ZXY", degrees=True)
+
+
+_SIDES = ("r", "l")
+_HIPS = tuple(f"hip_{n}_{s}" for n in ("flexion", "adduction", "rotation") for s in _SIDES)
+_KNEES = tuple(f"knee_flexion_{s}" for s in _SIDES)
+_ANKLES = tuple(f"ankle_angle_{s}" for s in _SIDES)
+_LUMBAR = tuple(f"lumbar_{n}" for n in ("extension", "bending", "rotation"))
+
+#: The joints of the paper's median absolute error (Supplementary Methods, Validation Metrics).
+JOINTS_PAPER: tuple[str, ...] = (
+    *_HIPS,
+    *_KNEES,
+    *_ANKLES,
+    *_LUMBAR,
+    *(f"neck_{n}" for n in ("extension", "bending", "rotation")),
+    *(f"arm_{n}_{s}" for n in ("flex", "add") for s in _SIDES),
+    *(f"elbow_flex_{s}" for s in _SIDES),
+)
+#: The joints of OpenCap's mean absolute error (Uhlrich et al. 2023, as the paper lists them).
+JOINTS_OPENCAP: tuple[str, ...] = (
+    *PELVIS_TURNS,
+    *_HIPS,
+    *_KNEES,
+    *_ANKLES,
+    *(f"subtalar_angle_{s}" for s in _SIDES),
+    *_LUMBAR,
+)
+#: The angles that body rotations of any model give alike (convention "body_rotations").
+JOINTS_CLIP: tuple[str, ...] = (*_HIPS, *_KNEES, *_ANKLES)
+
+#: Row of the paper's tables -> the joint without its side.
+ROWS_PAPER: Mapping[str, str] = {
+    "Hip Flexion": "hip_flexion",
+    "Hip Adduction": "hip_adduction",
+    "Hip Rotation": "hip_rotation",
+    "Knee Flexion": "knee_flexion",
+    "Ankle Angle": "ankle_angle",
+    "Lumbar Extension": "lumbar_extension",
+    "Lumbar Bending": "lumbar_bending",
+    "Lumbar Rotation": "lumbar_rotation",
+    "Neck Extension": "neck_extension",
+    "Neck Bending": "neck_bending",
+    "Neck Rotation": "neck_rotation",
+    "Arm Flex": "arm_flex",
+    "Arm Add": "arm_add",
+    "Elbow Flex": "elbow_flex",
+}
+
+
+def split_side(joint: str) -> tuple[str, str]:
+    """`hip_flexion_r` -> (`hip_flexion`, `r`); a joint of the middle has the side ``""``."""
+    if joint.endswith(("_r", "_l")):
+        return joint[:-2], joint[-1]
+    return joint, ""
+
 
 #: The joints of our body, by its own axes.
 QPOS = "qpos"

@@ -15,9 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, trial_poses
 
-from .joints import JOINTS_CLIP
-from .reference import BODY_ROTATIONS, CONVENTIONS, QPOS, Reference
-from .rotations import body_rotation_angles
+from .reference import BODY_ROTATIONS, CONVENTIONS, JOINTS_CLIP, QPOS, Reference, body_rotation_angles
 
 _PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 

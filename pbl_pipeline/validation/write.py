@@ -1,20 +1,182 @@
-"""Tables as CSV, LaTeX and one HTML page."""
+"""Tables of errors with the paper's own figures beside, as CSV, LaTeX and one HTML page."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import json
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import click
 import jinja2
+import numpy as np
+import pandas as pd
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.csv_cells import frame_to_csv
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.latex import tex_escape
+from pbl_pipeline.stats import bland_altman, correlation
 
-from .paper import paper_figures
-from .table import Table
+
+@functools.cache
+def paper_figures() -> dict[str, Any]:
+    """`data/paper_figures.json`: table -> `where` (table or section of the paper) and `cells` (row -> column -> text).
+
+    The texts are as printed, most "median (nIQR)". Beside the tables that we fill from error rows it holds the paper's
+    figures on reliability, curves and run time.
+    """
+    folder = resources.files("pbl_pipeline.validation").joinpath("data")
+    return json.loads(folder.joinpath("paper_figures.json").read_text(encoding="utf-8"))
+
+
+def paper_cells(table: str) -> dict[str, dict[str, str]]:
+    """Row -> column -> text of one table; empty where the paper has no such table."""
+    return paper_figures().get(table, {}).get("cells", {})
+
+
+def paper_where(table: str) -> str:
+    """Where in the paper a table's figures stand; empty where it has none."""
+    return paper_figures().get(table, {}).get("where", "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """`value` (`spread`) over `n` trials; `paper` is the paper's figure as printed, or ``""``.
+
+    An empty cell has NaN and n = 0. A single value has no spread (NaN).
+    """
+
+    value: float = math.nan
+    spread: float = math.nan
+    n: int = 0
+    paper: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table in the paper's form."""
+
+    name: str  # stem of its files
+    title: str  # quantity, with its unit and the meaning of the brackets
+    cells: dict[tuple[str, str], Cell]  # by (row, column), row by row; one for every pair
+    note: str = ""  # how ours were made, and how they differ from the paper's
+    digits: dict[str, int] = dataclasses.field(default_factory=dict)  # by name of a row or column; else 2
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Names of the rows, in order."""
+        return tuple(dict.fromkeys(row for row, _ in self.cells))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns, in order."""
+        return tuple(dict.fromkeys(column for _, column in self.cells))
+
+    @property
+    def where(self) -> str:
+        """Where in the paper the figures beside ours stand; empty where there are none."""
+        return paper_where(self.name)
+
+    def cell(self, row: str, column: str) -> Cell:
+        return self.cells[row, column]
+
+    def ours(self, row: str, column: str) -> str:
+        """Return our value as text: `2.79 (0.86)`; empty where there is none."""
+        cell, digits = self.cells[row, column], self.digits.get(row, self.digits.get(column, 2))
+        if not math.isfinite(cell.value):
+            return ""
+        spread = f" ({cell.spread:.{digits}f})" if math.isfinite(cell.spread) else ""
+        return f"{cell.value:.{digits}f}{spread}"
+
+    def frame(self) -> pd.DataFrame:
+        """Return the long form: one row per cell with `row, column, value, spread, n, paper, paper_where`."""
+        cells = [
+            {"row": r, "column": c, **dataclasses.asdict(cell), "paper_where": self.where if cell.paper else ""}
+            for (r, c), cell in self.cells.items()
+        ]
+        return pd.DataFrame(cells, columns=["row", "column", "value", "spread", "n", "paper", "paper_where"])
+
+    def text(self) -> str:
+        """Return the table for a terminal: ours with n in square brackets, the paper's figure below it."""
+        body: list[list[str]] = [[" " * 5, *self.columns]]
+        for row in self.rows:
+            cells = {c: self.cells[row, c] for c in self.columns}
+            body.append([row, *(f"{self.ours(row, c)} [{cell.n}]".strip() for c, cell in cells.items())])
+            if any(cell.paper for cell in cells.values()):
+                body.append(["  paper", *(cell.paper for cell in cells.values())])
+        first, *others = (max(map(len, column)) for column in zip(*body, strict=True))
+        lines = ["  ".join([label.ljust(first), *map(str.rjust, texts, others)]).rstrip() for label, *texts in body]
+        return "\n".join([self.title, *lines, *filter(None, [self.note, self.where and f"paper: {self.where}"])])
+
+
+#: Columns of the indices: of a visit by one kind of recordings (`kind`: single, rig, markers) against a norm that was
+#: built from cycles of `norm_kind`; "" for one that ships.
+INDEX_COLUMNS = ("subject", "session_label", "session_id", "kind", "method", "norm", "norm_kind", "index")
+#: Columns of the pairs: the index of one camera and of several, of one visit.
+PAIR_COLUMNS = ("subject", "session_label", "single", "rig", "single_norm", "rig_norm")
+_ROW = "GDI of one camera against several"
+
+
+def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
+    """Visits that have an index of one camera and one of several, each against a norm of its own kind, as pairs.
+
+    Raises `PblError` USAGE: a visit has several such indices of one kind, by several methods or norms.
+
+    Parameters
+    ----------
+    indices
+        Rows with `INDEX_COLUMNS`. An index against a norm of another kind, or against one that ships, does not count.
+    """
+    own: Any = indices[(indices["kind"] == indices["norm_kind"]) & indices["index"].notna()]
+    twice = own[own.duplicated(["session_id", "kind"], keep=False)]
+    if len(twice):
+        chains = sorted({f"{m}, {n}" for m, n in zip(twice["method"], twice["norm"], strict=True)})
+        raise PblError(
+            "USAGE",
+            found=f"several indices of one kind for a visit: {'; '.join(chains[:6])}",
+            expected="one index and one norm of each kind",
+            next_step="name them: --where method=NAME, or --where norm=NAME for each kind",
+        )
+    columns = ["subject", "session_label", "session_id", "index", "norm"]
+    kinds = [
+        own.loc[own["kind"] == k, columns].rename(columns={"index": k, "norm": f"{k}_norm"}) for k in ("single", "rig")
+    ]
+    return kinds[0].merge(kinds[1], on=columns[:3])[list(PAIR_COLUMNS)]
+
+
+def index_agreement(pairs: pd.DataFrame) -> Table:
+    """Pearson's r, bias and limits of agreement of the index of one camera and of several.
+
+    Raises `PblError` STATS_INPUT: fewer than four visits, or indices that are all the same.
+    """
+    one, several = (pairs[k].to_numpy(float) for k in ("single", "rig"))
+    r, agreement, n = correlation(one, several), bland_altman(one, several), len(pairs)
+    values = {
+        "r": Cell(r.value, n=n, paper=paper_cells("index_agreement")[_ROW]["r"]),
+        "r, low": Cell(r.low, n=n),
+        "r, high": Cell(r.high, n=n),
+        "bias": Cell(agreement.bias.value, n=n),
+        "lower limit": Cell(agreement.lower.value, n=n),
+        "upper limit": Cell(agreement.upper.value, n=n),
+        "sd, one camera": Cell(float(np.std(one, ddof=1)), n=n),
+        "sd, several": Cell(float(np.std(several, ddof=1)), n=n),
+    }
+    persons = pairs["subject"].nunique()
+    norms = [", ".join(sorted(set(pairs[f"{k}_norm"]))) for k in ("single", "rig")]
+    return Table(
+        "index_agreement",
+        "Index of one camera against several, each with a norm of its own kind",
+        {(_ROW, column): cell for column, cell in values.items()},
+        f"{n} visits of {persons} persons. Norms: {norms[0]} (one camera), {norms[1]} (several). Bias: one camera "
+        "minus several; limits of agreement hold 95 % of the visits. r with its 95 % interval, which is too narrow "
+        "where a person has several visits.",
+        {column: 1 if column not in ("r", "r, low", "r, high") else 2 for column in values},
+    )
 
 
 def write_tables(tables: Mapping[str, Table], folder: str | Path) -> list[Path]:

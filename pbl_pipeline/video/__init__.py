@@ -1,15 +1,21 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
 from .attitude import Attitude, camera_in_device, check_attitude
-from .attitude_of_video import attitude_of, load_attitude
 from .boards import Board
-from .calibrate import Calibration, calibrate_video
-from .calibration_picture import draw_calibration
-from .camera import check_lens, guess_camera, load_camera, scaled_matrix, undistort_px, viewing_ray
-from .camera_pose import CameraPose, load_camera_poses
-from .camera_source import find_camera
-from .cut_region import cut_image
-from .file_facts import packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
+from .calibrate import Calibration, calibrate_video, draw_calibration
+from .camera import (
+    CameraPose,
+    check_lens,
+    guess_camera,
+    load_camera,
+    load_camera_poses,
+    scaled_matrix,
+    turning_radius2,
+    undistort_px,
+    viewing_ray,
+)
+from .clock import attitude_of, load_attitude
+from .file_facts import check_timing, packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
 from .frames import read_frames
 from .h264 import write_h264
 from .lens_calibration import (
@@ -17,11 +23,11 @@ from .lens_calibration import (
     PhoneLens,
     about_phone,
     calibrated_camera,
+    find_camera,
     load_lens_calibration,
     phone_lens,
     turned_camera,
 )
 from .phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor
-from .phone_log_reader import read_phone_log
-from .timing import check_timing
-from .types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo
+from .sensor_logger import read_phone_log
+from .types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo, cut_image

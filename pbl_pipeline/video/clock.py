@@ -1,4 +1,4 @@
-"""The clock of a phone's log against its video's.
+"""The clock of a phone's log against its video's, from how the picture moves.
 
 A log that counts in UTC meets the time of recording in the video's file, which is rounded to seconds, and which some
 phones write for the beginning and others for the end. That is too coarse for a hand that shakes at 3 Hz, and the fit
@@ -10,16 +10,66 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 from pathlib import Path
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 
-from .frame_motion import picture_motion
+from .attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
+from .frames import read_frames
 from .phone_log import UTC_CLOCK, VIDEO_CLOCK, PhoneLog
+from .sensor_logger import read_phone_log
 from .types import VideoInfo
+
+#: Longer side (px) of the reduced picture, and the longest stretch of a video that is looked at (s): a shift of two
+#: clocks shows within some seconds.
+_SIDE_PX, LONGEST_S = 256, 90.0
+#: Parts of the picture along its shorter and its longer side.
+_PARTS = (2, 3)
+
+
+def picture_motion(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Times (T,) of the frames and shifts (T - 1, 2) between neighbours, to the right and down, in longer sides.
+
+    The median over six parts of the reduced grey picture, each by phase correlation: a person who walks through one or
+    two of them does not count. (On a rendered film with such a person the correlation with the true turns is 0.97; of
+    the whole picture at once it is 0.62.)
+    """
+    times, shifts = [], []
+    last: list[np.ndarray] = []
+    for frame in progress.track(read_frames(path), "movement of the picture"):
+        if frame.time_s > LONGEST_S:
+            break
+        height, width = frame.image.shape[:2]
+        scale = _SIDE_PX / max(width, height)
+        size = (max(32, round(width * scale)), max(32, round(height * scale)))
+        grey = cv2.cvtColor(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2GRAY)
+        across, down = _PARTS if width < height else _PARTS[::-1]
+        parts = [p for row in np.array_split(grey, down) for p in np.array_split(row, across, axis=1)]
+        parts = [np.ascontiguousarray(p, np.float32) for p in parts]
+        if last:
+            moved = [_shift(a, b) for a, b in zip(last, parts, strict=True)]
+            shifts.append(np.median(moved, axis=0) / max(size))
+        times.append(frame.time_s)
+        last = parts
+    return np.array(times), np.array(shifts, np.float64).reshape(-1, 2)
+
+
+def _shift(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    window = _window(before.shape[1], before.shape[0])
+    (dx, dy), _ = cv2.phaseCorrelate(before, after, window)
+    return dx, dy
+
+
+@functools.lru_cache(maxsize=16)
+def _window(width: int, height: int) -> np.ndarray:
+    return cv2.createHanningWindow((width, height), cv2.CV_32F)
+
 
 #: How far the stated time of recording may be off (s): rounded to seconds, and a recording takes time to start.
 STATED_WITHIN_S = 2.0
@@ -211,3 +261,34 @@ def _too_short(log: PhoneLog, duration: float, path: Path) -> PblError:
         next_step="take the log of this recording, or leave it out",
         key=str(path),
     )
+
+
+def load_attitude(path: str | Path, video: VideoInfo | None = None) -> Attitude:
+    """Read a phone's sensor log (docs/phone_capture.md): R_nc of the camera on the video's clock.
+
+    With the probed `video`, how the phone was held is taken from it where the log does not say, and a log on another
+    clock is brought to the video's (`align_clock`, which may read the pictures). Without it, the phone was held in
+    portrait, and time 0 of the log is the first frame.
+
+    Raises `PblError` FILE_MISSING, PHONE_LOG: see `read_phone_log`; a log by which the upright picture would lie on its
+    side or stand on its head (a wrong `frame` or `rotation_deg`, or quaternions that turn the other way); a log of
+    another time than the video's; a video of the front camera.
+    """
+    path = Path(path)
+    return attitude_of(read_phone_log(path), path, video)
+
+
+def attitude_of(log: PhoneLog, path: Path, video: VideoInfo | None = None) -> Attitude:
+    """The camera's orientation from a log that was read; see `load_attitude`."""
+    quat = log.quat_wxyz
+    if log.frame == DEVICE:
+        if video is not None and "front" in (video.lens or "").lower():
+            raise log_error(f"a video of the {video.lens}", "the camera on the phone's back", path)
+        turned = log.rotation_deg
+        if turned is None:
+            turned = held_deg(video, quat) if video is not None else 0.0
+        turns = Rotation.from_quat(quat, scalar_first=True) * camera_in_device(turned)
+        quat = turns.as_quat(scalar_first=True)
+    check_roll(path, quat, log.frame)
+    shift_s, how = (0.0, "") if video is None else align_clock(log, np.asarray(quat), video, path)
+    return Attitude(log.time_s + shift_s, quat, f"{path.name} ({log.form})" + (f": {how}" if how else ""))

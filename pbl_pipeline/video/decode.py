@@ -18,10 +18,9 @@ from av.container import InputContainer
 from av.error import FFmpegError
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.memory import return_large_blocks
-from pbl_pipeline.resources import cores
+from pbl_pipeline.resources import cores, return_large_blocks
 
-from .container_structure import family, missing_end, photo_format
+from .container_tags import family, missing_end, photo_format
 
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.

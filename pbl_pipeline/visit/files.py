@@ -20,8 +20,7 @@ from pbl_pipeline.files import load_npz
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.angles_file import write_angles_csv
 from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
-from pbl_pipeline.gait.curves_file import Curves, load_curves, save_curves
-from pbl_pipeline.gait.metrics_file import metrics_of
+from pbl_pipeline.gait.metrics_file import Curves, load_curves, metrics_of, save_curves
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.kinetics.kinetics_file import kinetics_of, load_arrays, save_arrays, save_content
@@ -134,7 +133,7 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
         visit = Visit(
             recordings=(
                 *(_recording(fit, facts.get(n, {})) for n, fit in zip(names, fits, strict=True) if fit.is_file()),
-                *(_left_out(r) for r in facts.values() if r["name"] not in names),
+                *(Recording(n, **_told(r, None)) for n, r in facts.items() if n not in names),
             ),
             solution=_solution(content) if "solver" in content else None,
             fit_checks=(_checks_unknown(names),) if found and not (folder / METRICS).is_file() else _checks(content),
@@ -284,27 +283,23 @@ def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
     """Return a fitted recording from its files; `facts`: what session.json holds of it."""
     name = name_of_fit(fit)
     points = fit.with_name(f"{name}.{KEYPOINTS}")
-    video, choice = facts.get("video"), facts.get("choice")
     return Recording(
         name,
-        video=None if video is None else _video(video, points),
-        choice=None if choice is None else _choice(choice),
-        condition=Condition(**facts.get("condition", {})),
-        problem=str(facts.get("problem", "")),
+        **_told(facts, points),
         load_keypoints=functools.partial(_keypoints_of, points, fit),
         load_fit=functools.partial(TrialFit.load, fit),
     )
 
 
-def _left_out(facts: Mapping[str, Any]) -> Recording:
-    video, choice = facts["video"], facts["choice"]
-    return Recording(
-        str(facts["name"]),
-        video=None if video is None else _video(video, None),
-        choice=None if choice is None else _choice(choice),
-        condition=Condition(**facts["condition"]),
-        problem=str(facts["problem"]),
-    )
+def _told(facts: Mapping[str, Any], points: Path | None) -> dict[str, Any]:
+    """Return the fields of a recording that session.json holds; `points`: file of its keypoints."""
+    video, choice = facts.get("video"), facts.get("choice")
+    return {
+        "video": None if video is None else _video(video, points),
+        "choice": None if choice is None else _choice(choice),
+        "condition": Condition(**facts.get("condition", {})),
+        "problem": str(facts.get("problem", "")),
+    }
 
 
 def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
@@ -334,18 +329,10 @@ def _keypoints_of(path: Path, fit_path: Path) -> Keypoints | None:
 
 
 def _solution(content: Mapping[str, Any]) -> Solution:
-    return Solution(
-        solver=str(content["solver"]),
-        params_hash=str(content["params_hash"]),
-        iterations=None if content.get("iterations") is None else int(content["iterations"]),
-        converged=None if content.get("converged") is None else bool(content["converged"]),
-        scale=np.array([float(content["scale"][n]) for n in SCALE_NAMES]),
-        loss_trace=np.array(content["loss_trace"], float).reshape(-1, 2),
-        seconds=float(content["seconds"]),
-        compile_seconds=float(content["compile_seconds"]),
-        device=str(content["device"]),
-        software=str(content.get("code_version", "")),
-    )
+    own = {f.name: content.get(f.name) for f in dataclasses.fields(Solution)}
+    own["scale"] = [content["scale"][n] for n in SCALE_NAMES]
+    own["loss_trace"] = np.reshape(content["loss_trace"], (-1, 2))
+    return structured({**own, "software": content.get("code_version", "")}, Solution)
 
 
 def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:

@@ -28,7 +28,7 @@ import numpy as np
 import scipy.linalg  # noqa: F401 - so that its BLAS is loaded when threads are limited
 from threadpoolctl import threadpool_limits
 
-from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS
+from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit, fit_sessions
 from pbl_pipeline.synthetic import pelvis_positions

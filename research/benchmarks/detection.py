@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 
 from pbl_pipeline.keypoints import METHODS, KeypointParams, Keypoints, detect_keypoints, read_trc
-from pbl_pipeline.keypoints.trc import Trc
+from pbl_pipeline.keypoints.world_markers import Trc
 from pbl_pipeline.render import to_pixels
 from pbl_pipeline.runs import runs as stretches
 from pbl_pipeline.tracking import choose_subject, track_people

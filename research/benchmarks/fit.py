@@ -18,7 +18,7 @@ from pathlib import Path
 import click
 
 from pbl_pipeline.bench import Case, Programs, Row, run_cases
-from pbl_pipeline.bench.table import ERRORS, TIMES, Column, accuracy, meaning, method_name, notes, number, table
+from pbl_pipeline.bench.run import ERRORS, TIMES, Column, accuracy, meaning, method_name, notes, number, table
 from pbl_pipeline.cli.bench import Numbers, keep
 from research.benchmarks.fit_data import MOTIONS, WalkerData
 

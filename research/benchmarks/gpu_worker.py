@@ -195,9 +195,8 @@ def queue_fits(warm_up: int) -> int:
 # ------------------------------------------------------------------------------------------------------------ one run
 def run(batch: int, processes: int, folder: Path) -> list[dict[str, Any]]:
     """Have a worker fit what is queued; the device's own readings [(time, percent)] as spans named "smi"."""
-    from workers.devices import given_gpus
     from workers.metrics import Metrics
-    from workers.process import Options
+    from workers.process import Options, given_gpus
     from workers.supervisor import Supervisor
 
     folder.mkdir()

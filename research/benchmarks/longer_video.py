@@ -14,7 +14,7 @@ from pathlib import Path
 import av
 import click
 
-from pbl_pipeline.bench.clip import demo_clip
+from pbl_pipeline.bench.detect import demo_clip
 from pbl_pipeline.errors import PblError
 
 

@@ -8,9 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
-from schemas.intake.plans import resolve
 from schemas.intake.records import File, Methods, VisitRecord
-from schemas.intake.registration import check_owner, registered, write
+from schemas.intake.registration import check_owner, registered, resolve, write
 from schemas.intake.videos import OneCamera
 from schemas.transactions import in_transaction
 

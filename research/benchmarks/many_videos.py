@@ -19,7 +19,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from pbl_pipeline.bench.clip import demo_clip
+from pbl_pipeline.bench.detect import demo_clip
 from pbl_pipeline.bench.detect_case import measure
 from pbl_pipeline.keypoints import METHODS, Keypoints
 from pbl_pipeline.resources import cores, shared_cores

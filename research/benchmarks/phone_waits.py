@@ -21,7 +21,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from pbl_pipeline.bench.clip import demo_clip
+from pbl_pipeline.bench.detect import demo_clip
 from research.benchmarks.workers import _PBL, say
 from tests.database import installation
 
@@ -75,6 +75,7 @@ def main(videos: int, processes: int, phones: int) -> None:
         verdicts, indices = [], []
         for i in range(phones):
             (one,) = register([OneCamera(copy_of(clip, videos + i), VisitRecord(f"P{i:05d}", "1"))])
+            assert one.video_id is not None, one.error
             key = {"video_id": one.video_id}
             queue.fill(video.VideoInfo, [key], FIRST)
             begin = time.monotonic()

@@ -25,7 +25,7 @@ import click
 import numpy as np
 
 from pbl_pipeline import assets
-from pbl_pipeline.bench.clip import demo_clip
+from pbl_pipeline.bench.detect import demo_clip
 from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints.crops import smooth_rois
 from pbl_pipeline.models import box_iou

@@ -28,7 +28,7 @@ from pbl_pipeline.gait import FootTrajectories, detect_events, feet_from_markers
 from pbl_pipeline.gait.events import METHODS, PhaseParams
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 from pbl_pipeline.synthetic import SynthSpec, synthesise, true_markers
-from pbl_pipeline.synthetic.walk import plain_walk
+from pbl_pipeline.synthetic.plan import plain_walk
 from research.benchmarks.events import feet_of_truth, lab_walks
 from research.walker.path import floor_path
 from research.walker.turns import turned

@@ -20,14 +20,16 @@ from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.gait import MEASURES, Z90, load_norm
-from pbl_pipeline.gait.change import IMPORTANT_CHANGE, chances, change_sd
 from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
+    IMPORTANT_CHANGE,
     MeasureError,
     MeasurementModel,
     Pass,
     View,
+    chances,
+    change_sd,
     estimate,
     expected_index,
     measure_error,
@@ -356,7 +358,7 @@ def change_pairs(frame: pd.DataFrame) -> pd.DataFrame:
 
 def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
     """Logarithmic loss of both probabilities by how much of what two visits have in common does not cancel
-    (`gait.change.REMAINS`), over pairs that were filmed alike and that changed."""
+    (`gait.measurement.REMAINS`), over pairs that were filmed alike and that changed."""
     own = pairs[(pairs["kind"] != "left, then front") & ~pairs["unchanged"]]
     rows = []
     for share in np.arange(0.0, 1.01, 0.1):

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS
+from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS
 from pbl_pipeline.fit import METHODS, GaussNewtonParams
 from pbl_pipeline.keypoints import Keypoints
 from research.benchmarks.ablation import figures_of, path_error_m, row_of, table

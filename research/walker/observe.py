@@ -20,11 +20,9 @@ from pbl_pipeline.synthetic import (
     pelvis_positions,
     sole_points,
 )
-from pbl_pipeline.synthetic.camera import HeldPhone, camera_turn
-from pbl_pipeline.synthetic.curves import within
-from pbl_pipeline.synthetic.markers import as_marker_set
-from pbl_pipeline.synthetic.observe import film, hide
-from pbl_pipeline.synthetic.scene import CAMERAS, MIDDLE_M, NEAREST_M, PHONE_HEIGHT_M
+from pbl_pipeline.synthetic.camera import CAMERAS, MIDDLE_M, NEAREST_M, PHONE_HEIGHT_M, HeldPhone, camera_turn
+from pbl_pipeline.synthetic.observe import as_marker_set, film, hide
+from pbl_pipeline.synthetic.plan import within
 from pbl_pipeline.video import Camera, scaled_matrix
 from research.walker.turns import facing, turned
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.synthetic.curves import within
+from pbl_pipeline.synthetic.plan import within
 
 #: Where the middle of the walk lies ahead of the camera (m).
 MIDDLE_M = 5.4

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from pbl_pipeline.body import MarkerSet
 from pbl_pipeline.synthetic import Noise, pelvis_positions, true_markers
 from pbl_pipeline.synthetic.camera import camera_turn
-from pbl_pipeline.synthetic.markers import as_marker_set
-from pbl_pipeline.synthetic.observe import seen_by
+from pbl_pipeline.synthetic.observe import as_marker_set, seen_by
 from pbl_pipeline.video import Camera
 
 if TYPE_CHECKING:

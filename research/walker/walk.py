@@ -6,10 +6,19 @@ import numpy as np
 from jaxtyping import Float
 
 from pbl_pipeline.body import SCALE_NAMES, MarkerSet
-from pbl_pipeline.synthetic.curves import MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, swing, wander, within
-from pbl_pipeline.synthetic.markers import as_marker_set
+from pbl_pipeline.synthetic.observe import as_marker_set
 from pbl_pipeline.synthetic.physique import SITE_SD_M
-from pbl_pipeline.synthetic.walk import BOB_M, SWAY_M, qpos_of
+from pbl_pipeline.synthetic.plan import (
+    BOB_M,
+    MIDDLE_CURVES_DEG,
+    OFFSET_SD_DEG,
+    SIDE_CURVES_DEG,
+    SWAY_M,
+    qpos_of,
+    swing,
+    wander,
+    within,
+)
 from research.walker.path import choose_path, floor_path
 
 #: How people differ: stride time and length of healthy adults (Perry and Burnfield 2010: 1.06 to 1.12 s, 1.3 to 1.5 m).

@@ -1,18 +1,168 @@
-"""`pbl db`: the embedded database."""
+"""`pbl db`: the embedded database, its accounts, its configuration and migrations."""
 
 from __future__ import annotations
 
 import json
 import os
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import click
 
-from ._db_config import config
-from ._db_migrate import migrate
-from ._db_roles import roles
+from pbl_pipeline.errors import PblError
+
 from .db_backup import backup, restore
+
+
+@click.command()
+@click.option(
+    "--role",
+    "names",
+    type=click.Choice(["admin", "worker", "analyst"]),
+    multiple=True,
+    help="Only this role; may be given several times (default: all three).",
+)
+@click.option("--user", help="Name of the account, with one --role (default: pbl_worker, pbl_analyst, pbl_owner).")
+@click.option(
+    "--schema",
+    "own",
+    multiple=True,
+    metavar="NAME",
+    help="With --user: a custom schema (pbl_NAME on the server) for tables that refer to ours; may be repeated.",
+)
+@click.option("--from", "host", metavar="HOST", help="Where it may come from; % is anywhere (default: this machine).")
+@click.option(
+    "--secrets",
+    "folder",
+    type=click.Path(path_type=Path),
+    default="secrets",
+    show_default=True,
+    metavar="DIR",
+    help="Folder with one file per account that holds its password; made where missing.",
+)
+@click.option("--require-tls", is_flag=True, help="Refuse connections of these accounts that are not encrypted.")
+@click.option("--drop", "remove", is_flag=True, help="Remove the account instead (with --role).")
+@click.option("--dry-run", is_flag=True, help="Print the statements, without passwords, and do nothing.")
+def roles(
+    names: tuple[str, ...],
+    user: str | None,
+    own: tuple[str, ...],
+    host: str | None,
+    folder: Path,
+    require_tls: bool,
+    remove: bool,
+    dry_run: bool,
+) -> None:
+    """Create the accounts admin, worker and analyst, or bring them back to exactly their rights. Safe to repeat.
+
+    Needs a login that may create accounts: the embedded database has one, elsewhere DJ_USER=root. Passwords are read
+    from files in DIR, and made there (random, readable by you only) where they are missing; none is printed.
+
+    \b
+    Example: pbl db roles
+    Example: DJ_HOST=db DJ_USER=root DJ_PASS_FILE=secrets/mysql_root pbl db roles --from %
+    Example: pbl db roles --role analyst --user maria --from %
+    Example: pbl db roles --role analyst --user maria --from % --schema mylab
+    """
+    from schemas import connection
+    from schemas.operations import roles as lib
+
+    if (user or remove) and len(names) != 1:
+        raise PblError(
+            "USAGE",
+            found=f"--user or --drop with {len(names) or 'no'} roles",
+            expected="one --role",
+            next_step="name the role of that account",
+        )
+    if own and not user:
+        raise PblError(
+            "USAGE",
+            found="--schema without --user",
+            expected="the account that may use it",
+            next_step="add --role analyst --user NAME",
+        )
+    where = host or ("localhost" if connection.external() else "127.0.0.1")
+    chosen = names or tuple(lib.ROLES)
+    accounts = [lib.Account(r, user, where, own) if user else lib.default_account(r, where) for r in chosen]
+    if remove:
+        lib.drop(accounts[0])
+        click.echo(f"{accounts[0].user} from {where} is removed; its password file, if any, stays")
+        return
+    if dry_run:
+        for account in accounts:
+            for line in lib.statements(account, "********", require_tls):
+                click.echo(f"{line};")
+        return
+    files = [lib.password_file(folder, account) for account in accounts]
+    lib.apply([(a, lib.read_password(f)) for a, f in zip(accounts, files, strict=True)], require_tls)
+    for account, file in zip(accounts, files, strict=True):
+        rights = ", ".join(lib.ROLES[account.role]).lower()
+        also = "".join(f", all on {connection.prefix()}_{name}" for name in account.schemas)
+        click.echo(f"{account.role:<8} {account.user} from {where}: {rights} on {connection.prefix()}_*{also}; {file}")
+
+
+@click.command()
+@click.option("--dry-run", is_flag=True, help="Print what would be done, change nothing. Exit code 1: more is needed.")
+def migrate(dry_run: bool) -> None:
+    """Bring the tables on the server to their definitions in this version: create what is missing, apply numbered
+    migrations, then compare. Safe to repeat.
+
+    Rows stay as they are. Make a backup first, stop the workers, and use an account that may alter tables.
+
+    \b
+    Example: pbl db migrate --dry-run
+    Example: pbl db backup /backup/before && pbl db migrate
+    """
+    from schemas import migrations
+    from schemas.reading.comparison import changed_defaults
+
+    known = migrations.applied()
+    click.echo(f"{len(known)} migrations applied so far" + (f", last {known[-1].when} UTC" if known else ""))
+    outcome = migrations.migrate(dry_run, click.echo)
+    for line in outcome.created:
+        click.echo(f"  {line}")
+    for title, statements in outcome.steps:
+        click.echo(f"{title}: {len(statements)} statements")
+        for statement in statements if dry_run else ():
+            click.echo(f"  {statement};")
+    for line in outcome.open:
+        click.echo(f"  needs its own migration: {line}")
+    if outcome.open:
+        raise click.exceptions.Exit(1)
+    for line in changed_defaults():
+        click.echo(line)
+    done = not outcome.created and not any(s for _, s in outcome.steps)
+    click.echo("The tables are as this version defines them." if done or not dry_run else "Nothing was changed.")
+
+
+@click.command()
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("."),
+    show_default=True,
+    help="Folder of the notebooks or programs; programs in folders below find the files as well.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace the files of an earlier call (the port may have changed).")
+def config(out: Path, overwrite: bool) -> None:
+    """Write datajoint.json and .secrets/ of the database in use, so that plain `import datajoint` connects to it.
+
+    The login is the one of this call: DJ_USER's, or the embedded database's. .secrets/ is readable for you alone and
+    keeps itself out of git. DataJoint goes on asking before it deletes (safemode).
+
+    Example: pbl db config --out notebooks
+    """
+    from schemas.operations.client_config import AGGREGATE, is_mariadb, write_config
+
+    for path in write_config(out, overwrite):
+        click.echo(path)
+    if is_mariadb():
+        click.echo(
+            "The server is MariaDB, where A.aggr(B) of plain DataJoint fails (error 1055). After each connect:\n"
+            f"{AGGREGATE}"
+        )
+
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.
 

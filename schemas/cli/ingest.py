@@ -193,7 +193,7 @@ def ingest(
 
 def _warn(methods: Methods, markers: bool) -> None:
     """Print a warning where the fit method was made for other points."""
-    from schemas.intake.plans import resolve
+    from schemas.intake.registration import resolve
     from schemas.plan import unsuited
 
     chosen = resolve(methods, markers)

@@ -19,7 +19,7 @@ def report(subject: str, label: str | None, fit_method: str | None, fit_set_kind
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
     from pbl_pipeline.files import check_out_folder
-    from schemas.reading.report import write_visit
+    from schemas.reading.visits import write_visit
 
     check_out_folder(out)
     schemas.activate(methods=False)

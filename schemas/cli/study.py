@@ -152,7 +152,7 @@ def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     import getpass
 
     import schemas
-    from schemas.studies.own_instruments import add_instrument
+    from schemas.studies.study_sheets import add_instrument
 
     columns = {"title": "instrument_name", "change_source": "minimal_change_source", "minimal_change": "minimal_change"}
     values = {columns.get(option, f"instrument_{option}"): text for option, text in stated.items()}

@@ -203,7 +203,7 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
     comparisons = None
     if in_tables:
         import schemas
-        from schemas.reading.bridge import values_by
+        from schemas.reading.comparison import values_by
 
         schemas.activate(methods=False)
         values, comparisons = values_by(old, str(new))

@@ -5,6 +5,5 @@ from __future__ import annotations
 from .markers import LaboratoryMarkers
 from .records import Methods, Recording, Registered, VisitRecord
 from .registration import register
-from .rigs import SeveralCameras
 from .sensors import Sensors
-from .videos import OneCamera, ingest
+from .videos import OneCamera, SeveralCameras, ingest

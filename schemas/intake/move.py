@@ -22,9 +22,8 @@ from ..rows import delete_below
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
 from ..video import unknown_video
-from .records import VisitRecord
-from .rigs import check_same_number
-from .visits import session_ids
+from .records import VisitRecord, session_ids
+from .videos import check_same_number
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan)

@@ -66,8 +66,7 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
 
     Raises `PblError` DB_NOT_FOUND for an unknown visit or protocol, USAGE for a time that is too long.
     """
-    if not session.Session & {"session_id": session_id}:
-        raise session.unknown_visit(session_id)
+    session.registered_visit(session_id)
     if protocol is not None and not Protocol & {"protocol": protocol}:
         raise PblError(
             "DB_NOT_FOUND",

@@ -17,9 +17,8 @@ from ..rows import inside
 from ..subject_codes import day_of
 from ..transactions import in_transaction
 from ..video import CAMERA_MOTIONS
-from .plans import resolve
 from .records import Methods, VisitRecord
-from .registration import check_owner, registered, write
+from .registration import check_owner, registered, resolve, write
 from .sensors import Sensors
 from .sheets import (
     Imported,

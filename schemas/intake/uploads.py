@@ -19,7 +19,7 @@ import fsspec
 
 from pbl_pipeline.errors import PblError
 
-from ..operations.secret_files import secret
+from ..operations.folders import secret
 from ..store import purge, store_error
 
 #: What is a sensor log, by the ending.

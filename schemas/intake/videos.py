@@ -1,24 +1,160 @@
-"""Videos of one camera: what `pbl ingest` registers where nothing else is said."""
+"""Videos of one camera, and trials that several calibrated cameras film at once (`pbl ingest --rig`)."""
 
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
+from pbl_pipeline.temporary import new_folder
 
 from .. import fit, video
+from ..datajoint_setup import dj
 from ..jobs import forget_errors
-from ..transactions import in_transaction
+from ..rows import utc_now
+from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of, camera_row, known_camera
-from .records import File, Methods, Recording, Registered, VisitRecord, usage
+from .records import File, Methods, Recording, RefusedFile, Registered, VisitRecord, usage
 from .registration import register
 from .sensors import NONE, Sensors, attach, delete_keypoints
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog
+
+
+@dataclasses.dataclass
+class SeveralCameras(Recording):
+    """The videos of one trial, one of each camera, and the calibration of the cameras; registered together or not.
+
+    A file belongs to the camera that it is named after (`cam_01.mp4`, `walk.cam_01.mp4`), else the files are in the
+    order of the calibration. The trial has the number of the first video. Persons and keypoints of each video are found
+    as of any other; the fit is one of all views together.
+    """
+
+    videos: Sequence[Path]
+    calibration: Path
+    visit: VisitRecord
+    motion: ClassVar[str] = video.ONE_OF_SEVERAL  # type: ignore[misc]
+    rig: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)  # columns of Rig
+    seen_by: list[str] = dataclasses.field(default_factory=list, init=False)  # the camera of each video
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        return tuple(Path(p).absolute() for p in self.videos)
+
+    def check(self, methods: Methods) -> None:
+        super().check(methods)
+        own_camera = self.visit.camera_file is not None or self.visit.camera_motion not in (None, self.motion)
+        if own_camera or self.visit.person is not None:
+            raise usage(
+                "a camera, its motion or a person's number with --rig",
+                "the calibration alone, and cameras that stand still",
+            )
+
+    def read(self) -> None:
+        """Read the calibration, the bytes and first picture of each video, and the time stamps of its container: videos
+        that were not started together are refused.
+
+        Raises
+        ------
+        PblError
+            CAMERA_INVALID (calibration, or files that are not one of each camera), FIT_INPUT (fewer than two, or other
+            frames or times), USAGE.
+        RefusedFile
+            One of the videos cannot be read.
+        """
+        from pbl_pipeline.keypoints import cameras_of_files, check_same_times
+        from pbl_pipeline.video import load_camera_poses, packet_times, sha256_of
+
+        paths, names = self.paths, list(load_camera_poses(self.calibration))
+        if len(paths) < 2:
+            raise PblError(
+                "FIT_INPUT",
+                found=f"{len(paths)} video of a trial of several cameras",
+                expected="a video of each of at least two cameras",
+                next_step="name the videos of all cameras; one camera alone is registered without --rig",
+                key=paths[0] if paths else None,
+            )
+        for name in names:
+            check_label("camera of the calibration", name, 64)
+        _, self.seen_by = cameras_of_files([p.stem for p in paths], self.calibration)
+        files, times = [], []
+        for path, name in zip(paths, self.seen_by, strict=True):
+            try:
+                files.append(dataclasses.replace(File.of(path), camera=_lens(self.calibration, name, path)))
+                times.append(packet_times(path))
+            except PblError as error:
+                raise RefusedFile(path, error) from error
+        sha256 = [file.sha256 for file in files]
+        if twice := [p for i, p in enumerate(paths) if sha256[i] in sha256[:i]]:
+            found = "the same video as two cameras"
+            raise usage(found, "a video of each camera", twice[0], "name each camera's own video")
+        check_same_times(times, paths[0])
+        self.files = tuple(files)
+        self.rig = {"rig_sha256": sha256_of(self.calibration), "rig_cameras": names}
+
+    def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        numbers = [int(row["video_id"]) for row in rows]
+        views = video.RigView * video.Rig.proj("rig_sha256") & [{"video_id": v} for v in numbers]
+        found = {int(r["video_id"]): r for r in views.to_dicts()}
+        stated = [(camera, self.rig["rig_sha256"]) for camera in self.seen_by]
+        same = len(found) == len(self.files) and len({r["rig_trial"] for r in found.values()}) == 1
+        if not same or [(found[v]["rig_camera"], found[v]["rig_sha256"]) for v in numbers] != stated:
+            raise usage(
+                f"{len(self.files)} videos, {len(numbers)} of them registered "
+                f"(video_id {', '.join(map(str, numbers))}), not as these cameras of one trial with this calibration",
+                "videos that are new, or registered together with this calibration",
+                self.files[0].path,
+                "register them as they were, or delete these rows of video.Video and register them again",
+            )
+
+    def check_session(self, session_id: int) -> None:
+        check_same_number(session_id, len(self.files), self.files[0].path)
+
+    def insert(self, numbers: Sequence[int]) -> list[str]:
+        rig_id = self._rig_id()
+        video.RigView.insert(
+            {"video_id": number, "rig_id": rig_id, "rig_trial": numbers[0], "rig_camera": camera}
+            for number, camera in zip(numbers, self.seen_by, strict=True)
+        )
+        return [f"trial {numbers[0]}, camera {camera}" for camera in self.seen_by]
+
+    def _rig_id(self) -> int:
+        """The number of the rig of this calibration, which is registered where it is new."""
+        found = (video.Rig & {"rig_sha256": self.rig["rig_sha256"]}).to_arrays("rig_id")
+        if len(found):
+            return int(found[0])
+        number = next_id(video.Rig, "rig_id")
+        with new_folder() as folder:
+            # Not its own name, which may identify a person.
+            copy = Path(shutil.copyfile(self.calibration, folder / "rig.toml"))
+            video.Rig.insert1({"rig_id": number, **self.rig, "rig_created": utc_now(), "rig_file": copy})
+        return number
+
+
+def check_same_number(session_id: int, n: int, path: Path) -> None:
+    """Raise `PblError` USAGE where the session has trials of another number of cameras: they are fitted together."""
+    views = video.RigView * video.Video.proj("session_id") & {"session_id": session_id}
+    for row in dj.U("rig_trial").aggr(views, n_views="count(*)").to_dicts(limit=1):
+        if int(row["n_views"]) != n:
+            raise usage(
+                f"{n} cameras in a session whose trial {row['rig_trial']} has {row['n_views']}",
+                "the same cameras in all trials of a session: they are fitted with one body",
+                path,
+                "register it in a separate session",
+            )
+
+
+def _lens(calibration: Path, camera: str, path: Path) -> dict[str, Any]:
+    from pbl_pipeline.video import load_camera, read_first
+
+    first = read_first(path)
+    size = (first.width_px, first.height_px)
+    return camera_row(load_camera(calibration, size, camera), size)
 
 
 @dataclasses.dataclass

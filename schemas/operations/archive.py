@@ -20,8 +20,7 @@ from typing import Any
 from pbl_pipeline import settings
 
 from ..subject_codes import SUBJECT_CODE
-from .folders import private_folder, remove_empty
-from .json_files import write_json
+from .folders import private_folder, remove_empty, write_json
 
 #: Name of the installation-wide lock that whoever changes the archive holds (`worker.alone`).
 LOCK = "incoming"

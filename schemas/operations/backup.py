@@ -28,11 +28,10 @@ from pbl_pipeline.bounded import read_json
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
-from schemas.operations.folders import make_private, private_folder
-from schemas.operations.json_files import write_json
+from schemas.operations.folders import make_private, private_folder, write_json
 from schemas.store import check_store, store_error
 
-from . import backup_files, catalog, dump
+from . import backup_files, catalog
 from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
 from .catalog import Column, quote
 
@@ -205,7 +204,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
             say(f"Bringing {len(manifest['rows'])} tables back")
             total = sum(manifest["rows"].values())
             with progress.bar("restore", total=total, unit="row") as update:
-                for statement in dump.read_lines(folder / "database.sql.gz"):
+                for statement in backup_files.read_lines(folder / "database.sql.gz"):
                     n = cursor.execute(statement)
                     update(n if statement.startswith("INSERT") else 0)
             _check_rows(cursor, manifest["rows"])
@@ -249,12 +248,12 @@ def _save_tables(
         gzip.open(path, "wb", compresslevel=6) as out,
         progress.bar("tables", total=len(tables), unit="table") as update,
     ):
-        for statement in dump.HEADER:
-            dump.write_line(out, statement)
+        for statement in backup_files.HEADER:
+            backup_files.write_line(out, statement)
         for schema in dict.fromkeys(schema for schema, _ in tables):
-            dump.write_line(out, f"CREATE DATABASE IF NOT EXISTS {quote(schema)}")
+            backup_files.write_line(out, f"CREATE DATABASE IF NOT EXISTS {quote(schema)}")
         for (schema, table), columns in tables.items():
-            rows[f"{schema}.{table}"], named = dump.save_table(server, schema, table, columns, out)
+            rows[f"{schema}.{table}"], named = backup_files.save_table(server, schema, table, columns, out)
             files |= named
             update(1)
     return rows, files

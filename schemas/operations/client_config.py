@@ -8,8 +8,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.datajoint_setup import dj
-from schemas.operations.folders import private_folder
-from schemas.operations.json_files import write_json, write_text
+from schemas.operations.folders import private_folder, write_json, write_text
 from schemas.tables_version import refuse_other_version
 
 #: Names that DataJoint looks for, in the working directory and above it.

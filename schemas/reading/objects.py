@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
-from ..checks import check_values
 from ..gait import load_cycles, load_events
-from ..rows import Rows, number, or_nan, row_of, stored_rows
+from ..rows import Rows, check_values, number, or_nan, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

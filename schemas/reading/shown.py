@@ -110,10 +110,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
 
     Raises `PblError` DB_NOT_FOUND for an unknown visit or result.
     """
-    subjects = (session.Session & {"session_id": session_id}).to_arrays("subject")
-    if not len(subjects):
-        raise session.unknown_visit(session_id)
-    of_person = visits_of(str(subjects[0]))
+    of_person = visits_of(str(session.registered_visit(session_id)["subject"]))
     results = tuple(results_of([session_id])[session_id])
     if not 0 <= shown < max(1, len(results)):
         raise PblError(

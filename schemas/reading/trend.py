@@ -60,9 +60,7 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
 
     Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an unknown measure.
     """
-    subjects = (session.Session & {"session_id": session_id}).to_arrays("subject")
-    if not len(subjects):
-        raise session.unknown_visit(session_id)
+    subject = str(session.registered_visit(session_id)["subject"])
     known = (INDEX, *MEASURES)
     if measure not in known:
         raise PblError(
@@ -71,7 +69,7 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
             expected=f"one of {', '.join(known)}",
             next_step="choose one on the page",
         )
-    rows = sorted(visits_of(str(subjects[0])), key=lambda v: (v.day or datetime.date.min, v.session_id))
+    rows = sorted(visits_of(subject), key=lambda v: (v.day or datetime.date.min, v.session_id))
     results = results_of(v.session_id for v in rows)
     chains = Counter((r.kind, r.methods) for found in results.values() for r in found)
     usual = max(chains, key=lambda chain: chains[chain], default=None)
@@ -93,7 +91,7 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
             with_value.append((point, result))
         points.append(point)
     methods = () if usual is None else (usual[0], *usual[1])
-    return Trend(str(subjects[0]), measure, known, methods, tuple(points), tuple(left_out))
+    return Trend(subject, measure, known, methods, tuple(points), tuple(left_out))
 
 
 def _value(session_id: int, at: int, result: Result, measure: str) -> dict:

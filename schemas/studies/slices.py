@@ -423,7 +423,7 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
     """Mean curve of the used cycles that each visit pools, per side and angle, at 0, 1, ..., 100 %."""
     import pandas as pd
 
-    from pbl_pipeline.gait.curves_file import load_curves
+    from pbl_pipeline.gait.metrics_file import load_curves
     from pbl_pipeline.study import CURVE_PERCENT, CURVE_POINTS
 
     of = rows.loc[rows["fit_set"] != ""].set_index("fit_set")

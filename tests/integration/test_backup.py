@@ -20,7 +20,7 @@ import schemas
 from pbl_pipeline.errors import PblError
 from schemas import connection, gait, lab, load_visit, migrations, video
 from schemas.intake import VisitRecord, ingest
-from schemas.operations import backup, backup_files, dump, embedded
+from schemas.operations import backup, backup_files, embedded
 from schemas.operations.declare import declare_all
 from schemas.reading import frames
 from tests.command import pbl
@@ -56,7 +56,7 @@ def elsewhere(filled: None) -> Iterator[Any]:
 
 
 def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(dump, "STATEMENT", 500)  # several inserts of a table
+    monkeypatch.setattr(backup_files, "STATEMENT", 500)  # several inserts of a table
     saved = tmp_path / "backup"
     before = everything()
     done = pbl("db", "backup", "--recordings", saved)
@@ -122,7 +122,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
     before = everything()
     backup.backup(tmp_path / "backup")
     elsewhere()
-    lines = dump.read_lines
+    lines = backup_files.read_lines
 
     def broken(path: Path) -> Iterator[str]:
         for i, line in enumerate(lines(path)):
@@ -131,7 +131,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
             yield line
 
     with monkeypatch.context() as patch:
-        patch.setattr(dump, "read_lines", broken)
+        patch.setattr(backup_files, "read_lines", broken)
         with pytest.raises(KeyboardInterrupt):
             backup.restore(tmp_path / "backup")
     assert pbl("db", "restore", tmp_path / "backup").error_code == "DB_REFUSED"
@@ -142,7 +142,7 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
 
 
 def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    create = dump.create_statement
+    create = backup_files.create_statement
     late: list[str] = []
 
     def slow(server: Any, schema: str, table: str) -> str:
@@ -154,7 +154,7 @@ def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, mo
             assert not writer.is_alive(), "the backup holds up who writes"
         return create(server, schema, table)
 
-    monkeypatch.setattr(dump, "create_statement", slow)
+    monkeypatch.setattr(backup_files, "create_statement", slow)
     rows = backup.backup(tmp_path / "backup").rows
     assert len(lab.Subject()) == 2
     assert rows["pbl_lab.subject"] == 1

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from schemas import gait, gdi
-from schemas.reading import bridge
+from schemas.reading import comparison
 from tests.command import pbl
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -47,7 +47,7 @@ def test_the_shift_is_that_of_the_rows(visits: None, tmp_path: Path):
 def test_visits_across_the_change_are_listed(visits: None, tmp_path: Path):
     gone = (gdi.SessionGdi & {"session_id": 2, "gait_method": NEW}).keys()
     (gdi.SessionGdi & gone).delete(part_integrity="cascade", prompt=False)
-    _, found = bridge.values_by(OLD, NEW)
+    _, found = comparison.values_by(OLD, NEW)
     # The second by the old alone: the first has both, the third only the new.
     assert found.to_records(index=False).tolist() == [
         ("P001", "2026-01-10", "2026-04-10", "old"),
@@ -61,11 +61,11 @@ def test_keys_without_results_are_refused(visits: None):
 
 
 def test_an_upgrade_names_results_by_an_older_default(visits: None, monkeypatch: pytest.MonkeyPatch):
-    assert bridge.changed_defaults() == []
+    assert comparison.changed_defaults() == []
     newer = "phase-transformer-v3"
-    defaults = {**bridge.default_methods(), "gait_method": ("gait", "phase-transformer", newer)}
-    monkeypatch.setattr(bridge, "default_methods", lambda: defaults)
-    (line,) = bridge.changed_defaults()
+    defaults = {**comparison.default_methods(), "gait_method": ("gait", "phase-transformer", newer)}
+    monkeypatch.setattr(comparison, "default_methods", lambda: defaults)
+    (line,) = comparison.changed_defaults()
     assert line.startswith(f"The default gait method is {newer}; 3 visits have results by {NEW}.")
     assert f"pbl validate bridge {NEW} {newer} --tables" in line
     assert line in pbl("db", "migrate", "--dry-run").out

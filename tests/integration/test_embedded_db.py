@@ -21,7 +21,8 @@ from click.testing import CliRunner
 from pbl_pipeline.errors import PblError
 from schemas.cli.db import db
 from schemas.operations import embedded
-from schemas.operations.embedded import account, apt, binaries, process, setup
+from schemas.operations.embedded import binaries, process, server
+from schemas.operations.embedded.folder import UNPRIVILEGED, server_account
 from tests.database import new_home, remove_home
 
 pytestmark = pytest.mark.database
@@ -188,7 +189,7 @@ def test_a_server_that_cannot_start_says_why():
 def test_too_little_space_is_said_before_anything_is_written(monkeypatch: pytest.MonkeyPatch):
     home = new_home()
     try:
-        monkeypatch.setattr(setup.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
+        monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
         with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
             embedded.start(folder=folder(home))
         assert caught.value.found.startswith("30 MB")
@@ -316,7 +317,7 @@ def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_uma
     home, before = new_home(), os.umask(umask)
     folder = embedded.Folder(home / "deeper/db")
     try:
-        folder.create(account.server_account(folder.data))
+        folder.create(server_account(folder.data))
         assert [stat.S_IMODE(p.stat().st_mode) for p in (folder.path.parent, folder.path, folder.data)] == [
             0o755,
             0o755,
@@ -329,10 +330,10 @@ def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_uma
 
 def test_root_leaves_a_database_with_its_owner(tmp_path: Path):
     data = tmp_path / "data"
-    assert account.server_account(data).name in account.UNPRIVILEGED
+    assert server_account(data).name in UNPRIVILEGED
     data.mkdir()
     os.chown(data, 12345, 12345)
-    assert account.server_account(data).uid == 12345
+    assert server_account(data).uid == 12345
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
@@ -403,7 +404,7 @@ def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.Monk
 def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DJ_PASS", "secret")
     assert "secret" not in embedded.Binaries(Path("a"), Path("b"), Path("c")).environment().values()
-    assert apt.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
+    assert binaries.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
 
 
 # ---------------------------------------------------------------- the connection

@@ -13,7 +13,7 @@ import pbl_pipeline.fit
 from research.benchmarks import gpu_worker
 from schemas import fit
 from schemas.jobs import jobs_of
-from workers import batches, queue
+from workers import loop, queue
 from workers.heartbeat import Silent
 from workers.loop import Worker
 
@@ -28,7 +28,7 @@ def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> C
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
     gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
     assert gpu_worker.queue_fits(0) == N
-    monkeypatch.setattr(batches, "_threads", lambda: 2)
+    monkeypatch.setattr(loop, "_threads", lambda: 2)
 
     def worker(solve: Callable[[int], None]) -> Worker:
         def fit_sessions(given, paramset=None, batch=None):
@@ -53,7 +53,7 @@ def test_two_batches_are_computed_at_a_time_and_each_session_once(sessions):
         together.wait()  # breaks, and with it the batch, where no other one is being computed
 
     worker = sessions(solve)
-    batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    loop.run_fits(queue.claim(fit.SessionFit, 2), worker)
     assert sorted(sizes) == [1, 2, 2, 2]
     assert not together.broken
     assert (worker.done, worker.failed) == (N, 0)
@@ -73,7 +73,7 @@ def test_told_to_stop_it_ends_what_it_has_and_takes_no_more(sessions):
             worker.stop.set()
 
     worker.report = stop
-    batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    loop.run_fits(queue.claim(fit.SessionFit, 2), worker)
     # The batch that was written when it was told, and one for each thread.
     assert worker.done == len(fit.SessionFit()) == sum(computed) == 6
     assert jobs() == {"pending": N - 6}
@@ -87,7 +87,7 @@ def test_told_to_end_at_once_it_puts_all_back(sessions):
 
     worker.one = end
     with pytest.raises(SystemExit):
-        batches.run_fits(queue.claim(fit.SessionFit, 2), worker)
+        loop.run_fits(queue.claim(fit.SessionFit, 2), worker)
     # `one` itself puts back the job it has in hand; here it is a stand-in.
     assert jobs() == {"pending": N - 1, "reserved": 1}
     assert len(fit.SessionFit()) == 0

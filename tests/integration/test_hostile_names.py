@@ -25,7 +25,7 @@ from schemas.intake import VisitRecord, ingest
 from schemas.intake.calibrations import camera_row
 from schemas.intake.references import add_reference
 from schemas.job_errors import error_next_step
-from schemas.reading.report import write_visit
+from schemas.reading.visits import write_visit
 from tests.command import pbl
 from workers.populate import populate
 

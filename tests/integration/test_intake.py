@@ -12,8 +12,8 @@ from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
 from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
-from schemas.intake.plans import resolve
 from schemas.intake.recording_sheet import ingest_sheet
+from schemas.intake.registration import resolve
 from tests.command import pbl
 from tests.rows import everything_but_refreshes
 

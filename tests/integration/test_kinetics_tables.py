@@ -15,14 +15,14 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.visit import Visit
 from schemas import capture, gait, gdi, kinetics, load_visit, session
 from schemas.intake import Methods, VisitRecord, ingest
-from schemas.intake.conditions import set_condition
+from schemas.intake.records import set_condition
 from schemas.method_rows import insert_methods
 from schemas.reading import frames
 from schemas.reading.status import pipeline_status
 from schemas.reading.visit_progress import visit_progress
 from schemas.reading.why import why
 from schemas.rows import delete_below, utc_now
-from schemas.studies import visit_facts
+from schemas.studies import visit_forms
 from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
 from tests.integration import chain, web
@@ -57,7 +57,7 @@ def found() -> Kinetics:
 
 
 def correct(**values: str) -> tuple[str, ...]:
-    changed, errors = visit_facts.correct(1, values, "A. First", visit_facts.facts(1).seen)
+    changed, errors = visit_forms.correct(1, values, "A. First", visit_forms.facts(1).seen)
     assert errors == {}
     return changed
 

@@ -13,7 +13,7 @@ from pbl_pipeline.gait import GDI_METHODS, TASK_MEASURES
 from pbl_pipeline.paramset import Paramset
 from schemas import fit, gait, gdi, load_visit, norms, session, video
 from schemas.intake import Methods, VisitRecord, ingest
-from schemas.intake.conditions import set_condition
+from schemas.intake.records import set_condition
 from schemas.method_rows import insert_methods
 from schemas.reading import frames
 from schemas.reading.shown import shown_visit

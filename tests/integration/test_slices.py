@@ -15,7 +15,7 @@ from pbl_pipeline.study_report import all_tables, plan, study_results
 from schemas import fit, gait, gdi, session, study, video
 from schemas.cli.study import export, slice_
 from schemas.intake import VisitRecord, ingest
-from schemas.intake.conditions import set_condition
+from schemas.intake.records import set_condition
 from schemas.reading import frames
 from schemas.studies import slices
 from schemas.studies.study_sheets import import_sheets

@@ -262,7 +262,7 @@ def test_the_page_has_curves_measures_and_videos_without_scripts(visits: None):
 
 
 def test_a_video_that_is_gone_leaves_the_rest(visits: None, monkeypatch: pytest.MonkeyPatch):
-    from workers.web.videos import Videos
+    from workers.web.source import Videos
 
     def gone(self: Videos, number: int) -> Path:
         raise PblError("VIDEO_MISSING", found="no file", expected="a video", next_step="bring it back")

@@ -17,7 +17,7 @@ import pbl_pipeline.fit
 from pbl_pipeline.kinetics import REASONS
 from pbl_pipeline.words import check_words
 from schemas import study
-from schemas.intake.conditions import set_condition
+from schemas.intake.records import set_condition
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
 from tests.rows import register

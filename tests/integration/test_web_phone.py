@@ -21,14 +21,14 @@ from pbl_pipeline.qc import Check
 from pbl_pipeline.words import UNUSABLE
 from schemas import keypoints, session, video
 from schemas.capture import PhoneLink, PhoneRecording
-from schemas.checks import check_row
 from schemas.cli.capture import capture
 from schemas.intake import VisitRecord, phone_recordings
 from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from schemas.intake.protocols import add_protocol, read_protocol
-from schemas.intake.visits import session_ids
+from schemas.intake.records import session_ids
 from schemas.jobs import jobs_of
 from schemas.reading.usable import Next
+from schemas.rows import check_row
 from schemas.transactions import in_transaction
 from tests.integration import web
 from tests.integration.chain import small_video

@@ -13,7 +13,7 @@ import pytest
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from schemas import lab, session, study, video
 from schemas.review import Decision
-from schemas.studies.visit_facts import FACTS, NEW, facts
+from schemas.studies.visit_forms import FACTS, NEW, facts
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register

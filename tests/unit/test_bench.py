@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from pbl_pipeline import bench
 from pbl_pipeline.bench import Case, Data, case, data
-from pbl_pipeline.bench.accuracy import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg, mean_over, summary
+from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg, mean_over, summary
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
 

@@ -20,7 +20,7 @@ from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES, blazepose
 from pbl_pipeline.keypoints.passes import ParallelInference
 from pbl_pipeline.keypoints.protocol import Inspection
 from pbl_pipeline.models import LiteModel, suppress
-from pbl_pipeline.models.tflite_outputs import keep_outputs
+from pbl_pipeline.models.tflite import keep_outputs
 from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking.blazepose import LAYOUT
 from pbl_pipeline.tracking.tiling import detect_in, tiles

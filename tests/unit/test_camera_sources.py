@@ -14,7 +14,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import CAMERA_KINDS, Camera, check_timing, find_camera, probe, read_frames
 from pbl_pipeline.video.camera import reaches_corners
 from pbl_pipeline.video.container_tags import read_tags
-from pbl_pipeline.video.presets import preset_camera, presets, quarter_turn
+from pbl_pipeline.video.lens_calibration import preset_camera, presets, quarter_turn
 from research.phone_cameras import build
 from tests.inputs import keypoints, video_info
 from tests.quicktime import edit_list, insert, meta

@@ -25,8 +25,7 @@ from pbl_pipeline.deidentify import (
     ranges,
     sidecar_of,
 )
-from pbl_pipeline.deidentify.head_of_body import around_both, body_end, head_circle, head_of_person, off_course
-from pbl_pipeline.deidentify.hold import held
+from pbl_pipeline.deidentify.heads_of_video import around_both, body_end, head_circle, head_of_person, held, off_course
 from pbl_pipeline.deidentify.types import BODY, DISAGREE, HELD, KEYPOINTS, NONE
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks, Keypoints

@@ -21,7 +21,7 @@ import pbl_pipeline.body
 from pbl_pipeline.body import Y_UP_TO_Z_UP, load_body, load_marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS, ExportOptions, write_export
-from pbl_pipeline.export.text import lines, number_cells, text_cells
+from pbl_pipeline.export.columns import lines, number_cells, text_cells
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers

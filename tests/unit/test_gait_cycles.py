@@ -16,8 +16,8 @@ from pbl_pipeline.gait import (
     find_cycles,
     spatiotemporal,
 )
+from pbl_pipeline.gait._cycles import foot_passes
 from pbl_pipeline.gait.events import GaitEvent
-from pbl_pipeline.gait.outliers import foot_passes
 
 
 def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bout: int = 0) -> list[GaitEvent]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.gait import GaitCycle, cycle_checks, find_cycles, spatiotemporal
-from pbl_pipeline.gait.outliers import CURVE_ANGLES, without_odd_curves
+from pbl_pipeline.gait._cycles import CURVE_ANGLES, without_odd_curves
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.operations.json_files import write_json
+from schemas.operations.folders import write_json
 
 
 def test_a_file_is_replaced_with_its_permissions(tmp_path: Path):

@@ -20,9 +20,9 @@ from pbl_pipeline.keypoints import (
     view_rotation,
 )
 from pbl_pipeline.keypoints.blazepose import MIRROR, NAMES
-from pbl_pipeline.keypoints.crop_geometry import crop_matrix
 from pbl_pipeline.keypoints.crops import Regions, corrected, first_pass_rows, smooth_at, smooth_rois
 from pbl_pipeline.keypoints.detect import _detect_all
+from pbl_pipeline.keypoints.virtual_camera import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
 from tests.videos import constant_rate, write_video

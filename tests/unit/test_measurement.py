@@ -27,7 +27,6 @@ from pbl_pipeline.gait import (
     score_gdi,
     spatiotemporal,
 )
-from pbl_pipeline.gait.curves_file import load_curves, save_curves
 from pbl_pipeline.gait.measurement import (
     MeasureError,
     MeasurementModel,
@@ -43,6 +42,7 @@ from pbl_pipeline.gait.measurement import (
     with_one_more,
 )
 from pbl_pipeline.gait.metrics import with_errors
+from pbl_pipeline.gait.metrics_file import load_curves, save_curves
 
 K = 2
 NORM = load_norm()

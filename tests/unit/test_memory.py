@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from pbl_pipeline.memory import return_large_blocks
+from pbl_pipeline.resources import return_large_blocks
 
 #: After the first picture was freed: does the next one lie in the heap, where it leaves a hole?
 PROGRAM = """
 import sys
 import numpy as np
-from pbl_pipeline.memory import return_large_blocks
+from pbl_pipeline.resources import return_large_blocks
 
 if sys.argv[1] == "fixed":
     assert return_large_blocks()

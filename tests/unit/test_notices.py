@@ -12,7 +12,7 @@ from pbl_pipeline.errors import PblError
 
 PROBE = """
 import os
-from pbl_pipeline.models.notices import without_notice
+from pbl_pipeline.models.tflite import without_notice
 try:
     with without_notice(b"known words"):
         os.write(2, b"INFO: known words\\nERROR: other words\\n")

@@ -27,15 +27,21 @@ from pbl_pipeline.keypoints import (
     detect_keypoints,
     onnx_keypoints,
 )
-from pbl_pipeline.keypoints.augment import Augmentation, aligned, augmentations, sd_confidence, spread_mm
-from pbl_pipeline.keypoints.batched import BatchedInference
 from pbl_pipeline.keypoints.blazepose import CROP_MARGIN, MIRROR, N_ALL
 from pbl_pipeline.keypoints.blazepose import NAMES as BLAZEPOSE_NAMES
-from pbl_pipeline.keypoints.decode_2d import from_heatmap, from_simcc
-from pbl_pipeline.keypoints.params import MODEL_SHA256 as BLAZEPOSE_SHA256
+from pbl_pipeline.keypoints.onnx_keypoints import absolute_root, from_heatmap, from_simcc
+from pbl_pipeline.keypoints.passes import BatchedInference
+from pbl_pipeline.keypoints.protocol import MODEL_SHA256 as BLAZEPOSE_SHA256
 from pbl_pipeline.keypoints.protocol import Inspection
-from pbl_pipeline.keypoints.root_position import absolute_root
-from pbl_pipeline.keypoints.virtual_camera import crops, look_at
+from pbl_pipeline.keypoints.virtual_camera import (
+    Augmentation,
+    aligned,
+    augmentations,
+    crops,
+    look_at,
+    sd_confidence,
+    spread_mm,
+)
 from pbl_pipeline.models import LiteModel
 from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import PersonTrack, Tracking

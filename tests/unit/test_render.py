@@ -26,7 +26,6 @@ from pbl_pipeline.render import (
     render_overlay,
     report_indices,
     rotation_matrix,
-    scaled_camera,
     side_of,
     stance_spans,
     to_camera,
@@ -34,7 +33,7 @@ from pbl_pipeline.render import (
     uncertain_sides,
 )
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
-from pbl_pipeline.video import Camera, probe, read_frames
+from pbl_pipeline.video import Camera, probe, read_frames, scaled_matrix
 from research.walker.observe import observe
 from tests.videos import write_video
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
@@ -76,7 +75,7 @@ def test_points_that_no_lens_shows_are_nan() -> None:
 def test_camera_of_a_resized_picture_hits_the_same_place() -> None:
     points = np.array([[0.3, -0.2, 2.0], [-0.5, 0.1, 3.0]])
     full = to_pixels(points, LENS)
-    half = to_pixels(points, scaled_camera(LENS, 0.5, 0.25))
+    half = to_pixels(points, dataclasses.replace(LENS, matrix=scaled_matrix(LENS.matrix, (0.5, 0.25))))
     np.testing.assert_allclose(half, (full + 0.5) * [0.5, 0.25] - 0.5)
 
 

@@ -82,7 +82,7 @@ def test_a_worker_divides_the_cores_by_its_processes(
     monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
     found: list[Options] = []
     monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
-    monkeypatch.setattr("workers.devices.given_gpus", tuple)
+    monkeypatch.setattr("workers.process.given_gpus", tuple)
     with monkeypatch.context() as patch:
         for name in {resources.CORES, *resources._THREADS} - {"OMP_NUM_THREADS"}:
             patch.setenv(name, "x")
@@ -96,7 +96,7 @@ def test_a_worker_divides_the_cores_by_its_processes(
 def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatch):
     groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(13 * GB)})
     monkeypatch.setattr("schemas.activate", lambda **_: None)
-    monkeypatch.setattr("workers.devices.given_gpus", tuple)
+    monkeypatch.setattr("workers.process.given_gpus", tuple)
     monkeypatch.setattr("pbl_pipeline.resources.divide_cores", lambda _: None)
     found: list[Options] = []
     monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)

@@ -13,8 +13,7 @@ from av.video.reformatter import VideoReformatter
 
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import cut_image, read_frames
-from pbl_pipeline.video.cut_planes import cut_planes
-from pbl_pipeline.video.orientation import Orientation
+from pbl_pipeline.video.frames import Orientation, cut_planes
 from tests.videos import constant_rate, write_video
 
 #: Turned, 2.2 pixels a step, and partly beyond the picture.

@@ -22,7 +22,7 @@ from pbl_pipeline.visit import load_visit, save_beside
 from tests.exported import with_markers
 from tests.walking_fit import walking_fit
 from workers.web import Options, ResultsFolder, Where, create_app, serve
-from workers.web.plain_values import plain
+from workers.web.pages import plain
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,8 @@ from unittest import mock
 import pytest
 
 from tests.command import program
-from workers import devices, process
-from workers.devices import VISIBLE, given_gpus
-from workers.process import Options
+from workers import process
+from workers.process import VISIBLE, Options, given_gpus
 from workers.supervisor import Supervisor
 
 #: Variable by which JAX does not reserve a GPU's memory for one process.
@@ -35,7 +34,7 @@ def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, m
 def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch):
     monkeypatch.delenv(VISIBLE, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(devices, "QUERY_S", 0.5)
+    monkeypatch.setattr(process, "QUERY_S", 0.5)
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected

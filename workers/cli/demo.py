@@ -63,7 +63,7 @@ def _run(out: Path) -> None:
     from schemas.intake import VisitRecord, ingest
     from schemas.operations import embedded
     from schemas.reading import frames
-    from schemas.reading.report import write_visit
+    from schemas.reading.visits import write_visit
     from workers.cli.populate import summary
     from workers.populate import populate
 

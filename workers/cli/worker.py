@@ -79,9 +79,8 @@ def worker(
     import schemas
     from pbl_pipeline.resources import cores, divide_cores, memory_bytes
     from schemas import connection
-    from workers.devices import given_gpus
     from workers.log import to_stderr
-    from workers.process import Options
+    from workers.process import Options, given_gpus
     from workers.supervisor import Supervisor
 
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again

@@ -21,6 +21,7 @@ OPEN = "open"
 FILM = "film"
 #: Ending of the address of a page as JSON.
 JSON = ".json"
+_OWN = re.compile(r"/(visits|recordings)(/[0-9]{1,9}(/enter)?)?|/operate")
 _NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
@@ -74,6 +75,11 @@ def number_of(request: Request) -> int:
 def whole_number(text: str) -> int | None:
     """Return the number that a form or query names, None if it is not in its shortest form or has over nine digits."""
     return int(text) if _NUMBER.fullmatch(text) else None
+
+
+def own_address(text: str) -> str:
+    """Return an address of this page that a form names, else the first page."""
+    return text if _OWN.fullmatch(text) else "/"
 
 
 def shown_of(request: Request) -> int:

@@ -25,30 +25,28 @@ from . import (
     access,
     audit,
     compare,
-    compute,
+    computing,
     corrections,
     decide,
     entry,
     export,
     folder,
     operate,
-    people,
     phone,
     recordings,
     registration,
     reports,
-    sign_in,
     texts,
     trend,
     visits,
 )
-from .accounts import Accounts, Attempts
-from .address import OPEN, Address
+from .accounts import Accounts, Attempts, WayIn
+from .accounts import routes as sign_in_routes
+from .address import OPEN, Address, own_address
 from .computing import Target, compute_visit
 from .pages import Pages
-from .source import Source, TablesSource
+from .source import Source, TablesSource, Videos
 from .tables import Asks, Files, Tables
-from .videos import Videos
 
 log = logging.getLogger(__name__)
 
@@ -85,15 +83,15 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     if sessions is None and accounts is not None:
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    way = sign_in.WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    way = WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
-    computing = ProcessQueue(most=50, kept=50)
+    visits_queue = ProcessQueue(most=50, kept=50)
 
     @contextlib.asynccontextmanager
     async def life(app: Starlette) -> AsyncIterator[None]:
         yield
         making.close()
-        computing.close()
+        visits_queue.close()
         videos.close()
         tables.close()
 
@@ -107,7 +105,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
 
     async def language(request: Request) -> Response:
         fields = await access.form_of(request)
-        response = RedirectResponse(recordings.own_address(fields.get("back", "")), 303)
+        response = RedirectResponse(own_address(fields.get("back", "")), 303)
         chosen = texts.language_of(fields.get("language"), "")
         response.set_cookie("pbl_language", chosen, httponly=True, samesite="strict", secure=options.secure)
         return response
@@ -139,10 +137,9 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         parts = [
             *visits.list_routes(pages, tables),
             *decide.routes(pages, tables),
-            *people.routes(pages, tables),
             *corrections.routes(tables),
             *reports.routes(pages, tables, making),
-            *compute.routes(pages, tables, computing, options.target),
+            *computing.routes(pages, tables, visits_queue, options.target),
             *compare.routes(pages, tables, videos),
             *entry.routes(pages, tables),
             *registration.routes(pages, tables),
@@ -151,7 +148,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         ]
     phones = phone.Phones(tables, options.secure) if options.folder is None else None
     if phones is not None:
-        parts += phone.routes(pages, tables, phones, computing, options.target)
+        parts += phone.routes(pages, tables, phones, visits_queue, options.target)
     parts += [
         *visits.routes(pages, asks, source),
         *recordings.routes(pages, asks, source),
@@ -159,7 +156,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     ]
     routes: list[Address] = [
         Address("/", home, OPEN),
-        *sign_in.routes(pages, way, link_used),
+        *sign_in_routes(pages, way, link_used),
         Address("/language", language, "", methods=["POST"]),
         *parts,
         _files("static", "no-store"),
@@ -186,7 +183,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         lifespan=life,
     )
     app.state.sessions, app.state.way_in = sessions, way
-    app.state.computing, app.state.phones = computing, phones
+    app.state.computing, app.state.phones = visits_queue, phones
     app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
     app.router.default, app.router.redirect_slashes = unknown, False
     return app

@@ -21,10 +21,9 @@ from schemas.reading import comparison
 
 from . import texts
 from .address import Address, interval, page, whole_number
-from .pages import Pages, as_json, reader_language
-from .plain_values import plain
+from .pages import Pages, as_json, plain, reader_language
+from .source import Videos
 from .tables import Tables
-from .videos import Videos
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,11 +8,17 @@ import signal
 from collections.abc import Callable
 
 from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
-from schemas.reading.visit_progress import Progress
+from schemas import session
+from schemas.reading.visit_progress import Progress, visit_progress
 
 from ..process_queue import ProcessQueue, Task
+from .access import Refused, form_of
+from .address import Address, number_of, own_address
+from .pages import Pages
+from .tables import Tables
 
 #: Seconds that a process is given to put its job back when the page ends.
 END_S = 15.0
@@ -80,3 +86,26 @@ def told(request: Request, progress: Progress) -> Told:
     works = [w for again in (False, True) if (w := computing.find((progress.session_id, again))) is not None]
     states, errors = [w.state for w in works], [w.error for w in works if w.error is not None]
     return Told(progress, next((s for s in ("running", "waiting") if s in states), ""), errors[0] if errors else None)
+
+
+def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Address]:
+    """The addresses of this part."""
+
+    async def compute(request: Request) -> Response:
+        fields = await form_of(request)
+        number = number_of(request)
+        if fields.get("again") not in ("yes", "no"):
+            raise Refused("form")
+        await tables.ask(session.registered_visit, number)
+        begin(computing, target, number, fields["again"] == "yes")
+        return RedirectResponse(own_address(fields.get("back", f"/visits/{number}")), 303)
+
+    async def progress(request: Request) -> Response:
+        number = number_of(request)
+        await tables.ask(session.registered_visit, number)
+        return pages.show(request, "progress.html", told=told(request, await tables.ask(visit_progress, number)))
+
+    return [
+        Address("/visits/{session_id:int}/compute", compute, "decide", methods=["POST"]),
+        Address("/visits/{session_id:int}/progress", progress, "look", look="progress"),
+    ]

@@ -1,14 +1,19 @@
-"""Decide: who is measured, and which warnings are accepted. Each decision is a row (`schemas.decisions`)."""
+"""Decide: who of a recording is measured, which warnings are accepted; each a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.temporary import new_folder
-from schemas import video
+from schemas import reading, video
 from schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit, queue_visit_of
@@ -16,6 +21,9 @@ from .access import Refused, Session, form_of
 from .address import Address, number_of, whole_number
 from .pages import Pages
 from .tables import Tables
+
+if TYPE_CHECKING:
+    from pbl_pipeline.tracking import Tracking
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
@@ -55,6 +63,18 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         await tables.ask(queue_visit, number)
         return RedirectResponse(f"/visits/{number}?result={shown}", 303)
 
+    async def boxes(request: Request) -> Response:
+        number, which = number_of(request), whole_number(request.query_params.get("method", "0"))
+
+        def load() -> Tracking:
+            found = candidates.candidates(number)
+            if which is None or which >= len(found):
+                raise video.unknown_video(number)
+            return reading.load_tracking(found[which].key)
+
+        tracked = await tables.ask(load)
+        return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
+
     async def people(request: Request) -> Response:
         """The picture of the numbered people. It is of the original: none where heads are to be hidden."""
         number, which = number_of(request), _number(request.query_params.get("method", "0"))
@@ -73,6 +93,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     return [
         Address("/recordings/{video_id:int}/person", person, "decide", methods=["POST"]),
         Address("/recordings/{video_id:int}/people", people, "look", look="people"),
+        Address("/recordings/{video_id:int}/boxes", boxes, "look", look="boxes"),
         Address("/visits/{session_id:int}/accept", accept, "decide", methods=["POST"]),
     ]
 
@@ -82,3 +103,26 @@ def _number(text: str) -> int:
     if number is None:
         raise Refused("form")
     return number
+
+
+def boxes_json(tracked: Tracking) -> bytes:
+    """Boxes of everybody as JSON.
+
+    `size`: width, height of the upright video (px); `time`: (T) s; `people`: number of a person and `boxes`: for each
+    frame x0, y0, x1, y1 (px) and whether somebody was detected there (1) or the box is carried over a gap (0); null in
+    frames without the person.
+    """
+    people: list[dict[str, Any]] = []
+    for person in tracked.persons:
+        known = np.asarray(np.isfinite(person.box_px).all(axis=1), bool)
+        rows = [
+            [*(round(float(v)) for v in box), int(seen)] if there else None
+            for box, seen, there in zip(person.box_px, person.observed, known, strict=True)
+        ]
+        people.append({"number": int(person.person_id), "boxes": rows})
+    out = {
+        "size": [int(v) for v in tracked.image_size_px],
+        "time": [round(float(t), 5) for t in tracked.time_s],
+        "people": people,
+    }
+    return json.dumps(out, allow_nan=False, separators=(",", ":")).encode()

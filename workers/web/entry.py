@@ -8,8 +8,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
-from schemas.studies import own_instruments
-from schemas.studies import visit_entry as enter
+from schemas.studies import study_sheets, visit_forms
 
 from .access import Session, form_of
 from .address import Address, number_of
@@ -24,7 +23,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     """The addresses of this part."""
 
     def page(
-        request: Request, entry: enter.Entry, values: Mapping[str, str], errors: Mapping[str, PblError]
+        request: Request, entry: visit_forms.Form, values: Mapping[str, str], errors: Mapping[str, PblError]
     ) -> Response:
         return pages.show(
             request,
@@ -33,12 +32,12 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             values={**entry.values, **values},
             errors=errors,
             field=_FIELD,
-            role=enter.ROLE,
-            usual_roles=enter.USUAL_ROLES,
+            role=visit_forms.ROLE,
+            usual_roles=visit_forms.USUAL_ROLES,
         )
 
     async def form(request: Request) -> Response:
-        return page(request, await tables.ask(enter.entry, number_of(request)), {}, {})
+        return page(request, await tables.ask(visit_forms.entry, number_of(request)), {}, {})
 
     async def send(request: Request) -> Response:
         fields = await form_of(request)
@@ -46,9 +45,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         number = number_of(request)
         values = {name.removeprefix(_FIELD): text for name, text in fields.items() if name.startswith(_FIELD)}
         reason = fields.get("reason", "").strip()
-        done = await tables.ask(enter.enter, number, values, session.name, fields.get("seen", ""), reason)
-        if done.errors:
-            return page(request, await tables.ask(enter.entry, number), values, done.errors)
+        _, errors = await tables.ask(visit_forms.enter, number, values, session.name, fields.get("seen", ""), reason)
+        if errors:
+            return page(request, await tables.ask(visit_forms.entry, number), values, errors)
         return RedirectResponse(f"/visits/{number}#entered", 303)
 
     async def instruments(request: Request) -> Response:
@@ -57,14 +56,14 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def add_instrument(request: Request) -> Response:
         fields = await form_of(request)
         session: Session = request.state.session
-        errors = await tables.ask(own_instruments.add_instrument, fields, session.name)
+        errors = await tables.ask(study_sheets.add_instrument, fields, session.name)
         if errors:
             return await instrument_page(request, fields, errors)
         return RedirectResponse("/instruments", 303)
 
     async def instrument_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
-        rows = await tables.ask(enter.instruments)
-        fields = (*own_instruments.TEXTS, *own_instruments.NUMBERS, *own_instruments.FLAGS)
+        rows = await tables.ask(visit_forms.instruments)
+        fields = (*study_sheets.TEXTS, *study_sheets.NUMBERS, *study_sheets.FLAGS)
         known = {name: values.get(name, "") for name in fields}
         return pages.show(
             request,
@@ -72,9 +71,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             instruments=rows,
             values=known,
             errors=errors,
-            texts=own_instruments.TEXTS,
-            numbers=own_instruments.NUMBERS,
-            flags=own_instruments.FLAGS,
+            texts=study_sheets.TEXTS,
+            numbers=study_sheets.NUMBERS,
+            flags=study_sheets.FLAGS,
         )
 
     return [

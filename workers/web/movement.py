@@ -99,7 +99,8 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
         camera's, in steps. Of each channel second differences, first the low bytes of all, then the high bytes: that
         packs to a third. Frames without a pose repeat the one before.
     """
-    from pbl_pipeline.render import NEAR_M, body_track, turning_radius2
+    from pbl_pipeline.render import NEAR_M, body_track
+    from pbl_pipeline.video import turning_radius2
 
     fit = _fit(found)
     track = body_track(fit)

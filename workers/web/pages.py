@@ -1,23 +1,73 @@
-"""Templates to answers."""
+"""Templates to answers, as pages or as JSON."""
 
 from __future__ import annotations
 
+import dataclasses
+import datetime
 import functools
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
+import pandas as pd
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
 from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, check_words, number, significant
+from schemas.reading.shown import ShownVisit
 
 from . import texts
 from .access import HEADERS, HOURS, Session
 from .address import JSON
-from .plain_values import plain
+
+#: The folders of an absolute path in a text.
+_FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
+
+
+def plain(value: Any) -> Any:
+    """Return a value of a template as plain JSON.
+
+    A visit is what its session.json and metrics.json hold, which may load its arrays; a recording is its facts and
+    events; a frame is a list of its rows. Numbers that are not finite are null. Of a path, alone or in a text, only the
+    file's name is kept. Arrays are left out.
+    """
+    if isinstance(value, Visit):
+        judged = value.judged
+        return plain({**visit_facts(value), "metrics": None if judged is None else judged.to_dict()})
+    if isinstance(value, Recording):
+        events = [] if value.events is None else [dataclasses.asdict(e) for e in value.events.events]
+        return plain({**recording_facts(value), "events": events})
+    if isinstance(value, PblError):
+        return plain({k: str(getattr(value, k) or "") for k in ("code", "found", "expected", "next_step", "key")})
+    if isinstance(value, pd.DataFrame):
+        return plain(value.to_dict("records"))
+    if isinstance(value, ShownVisit):
+        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "load_visit"}
+        return plain({**own, "visit": value.visit})
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(v) for v in value]
+    if isinstance(value, datetime.date | datetime.datetime):
+        return value.isoformat()
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return _FOLDERS.sub("", value)
+    if value is None or isinstance(value, int | bool):
+        return value
+    return value.name if isinstance(value, Path) else None
+
 
 #: Status of the answer to a request that may not pass, by its reason.
 _REFUSED = {"session": 401, "host": 400, "token": 403, "right": 403, "size": 413, "form": 415}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import re
 from collections.abc import Hashable
 
 from starlette.requests import Request
@@ -22,7 +21,6 @@ from .tables import Asks
 
 #: Recordings whose movement is kept in memory at a time: some hundred kB each.
 _KEPT = 8
-_OWN = re.compile(r"/(visits|recordings)(/[0-9]{1,9}(/enter)?)?|/operate")
 #: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
@@ -89,8 +87,3 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         Address("/recordings/{video_id:int}/body", body, "look", look="body"),
         Address("/recordings/{video_id:int}/points", points, "look", look="points"),
     ]
-
-
-def own_address(text: str) -> str:
-    """An address of this page that a form names, else the first page."""
-    return text if _OWN.fullmatch(text) else "/"

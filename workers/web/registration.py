@@ -13,8 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from pbl_pipeline.errors import PblError
 from schemas import lab
 from schemas import session as sessions
-from schemas.studies import visit_facts
-from schemas.studies.visit_entry import USUAL_ROLES
+from schemas.studies import visit_forms
 
 from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
@@ -40,21 +39,21 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         return await new_page(request, {"visit": today}, {})
 
     async def new_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
-        known = {name: values.get(name, "") for name in (*visit_facts.NEW, "height_m", visit_facts.DISTINCT)}
+        known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
         return pages.show(
             request,
             "new_visit.html",
             values=known,
             errors=errors,
-            longest={**visit_facts.NEW, "height_m": visit_facts.FACTS["height_m"]},
-            usual_roles=USUAL_ROLES,
+            longest={**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]},
+            usual_roles=visit_forms.USUAL_ROLES,
             populations=await tables.ask(_populations),
         )
 
     async def register(request: Request) -> Response:
         fields = await form_of(request)
         session: Session = request.state.session
-        number, errors = await tables.ask(visit_facts.register_visit, fields, session.name)
+        number, errors = await tables.ask(visit_forms.register_visit, fields, session.name)
         if errors:
             return await new_page(request, fields, errors)
         if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
@@ -68,14 +67,14 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
-        stored = await tables.ask(visit_facts.facts, number_of(request))
+        stored = await tables.ask(visit_forms.facts, number_of(request))
         return pages.show(
             request,
             "facts.html",
             facts=stored,
             values={**stored.values, **values},
             errors=errors,
-            longest=visit_facts.FACTS,
+            longest=visit_forms.FACTS,
             choices={"activity": ACTIVITIES, "pace": PACES},
             populations=await tables.ask(_populations),
         )
@@ -84,7 +83,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         fields = dict(await form_of(request))
         session: Session = request.state.session
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_facts.correct, number, fields, session.name, seen, reason)
+        changed, errors = await tables.ask(visit_forms.correct, number, fields, session.name, seen, reason)
         if errors:
             return await facts_page(request, fields, errors)
         if changed:

@@ -119,7 +119,7 @@ def report_key(session_id: int, shown: int) -> tuple[Any, ...]:
 
 def load_report(session_id: int, shown: int) -> Task:
     """Return how the report of a result of a visit is written."""
-    from schemas.reading.report import to_show
+    from schemas.reading.visits import to_show
 
     about = reading.computed_visit(session_id, shown)
     assert about.visit is not None

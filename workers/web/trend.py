@@ -14,8 +14,7 @@ from schemas.reading.trend import INDEX, Point, trend_of
 
 from . import texts
 from .address import Address, number_of, page
-from .pages import Pages, as_json, reader_language
-from .plain_values import plain
+from .pages import Pages, as_json, plain, reader_language
 from .tables import Tables
 
 

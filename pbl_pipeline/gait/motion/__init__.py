@@ -7,7 +7,7 @@ from ._feet import (
     feet_from_fit,
     feet_from_keypoints,
     feet_from_markers,
+    heading_agreement,
+    heading_from_hips,
 )
-from ._heading import heading_agreement, heading_from_hips
-from ._legs import LEG_JOINTS
-from ._poses import BodyPoses, trial_poses
+from ._legs import LEG_JOINTS, BodyPoses, trial_poses

@@ -1,22 +1,130 @@
-"""Finding the MariaDB server on this machine, or getting it."""
+"""Finding the MariaDB server on this machine, or getting it.
+
+Get the Debian packages of the server: installed by root, or unpacked into a folder by any user.
+
+By hand, because apt installs for root only; for other users its packages are downloaded and unpacked into a folder.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 
-from .apt import install, unpack
+#: The bare programs: no service, no system user, nothing started.
+PACKAGES = ("mariadb-server-core", "mariadb-client-core")
+TIMEOUT_S = 600.0
+
+Say = Callable[[str], None]
+
+
+def install(say: Say) -> str | None:
+    """Install the packages on the system, as root or with a sudo that asks no password.
+
+    Returns None when they are installed, else why not.
+    """
+    prefix = _privilege()
+    if prefix is None:
+        return "you are not root and sudo asks for a password"
+    # A fresh machine may be installing its own updates: wait for the lock.
+    command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-q", "-o", "DPkg::Lock::Timeout=120"]
+    add = [*command, "install", "-y", "--no-install-recommends", *PACKAGES]
+    say(f"  {' '.join([*prefix, 'apt-get install --no-install-recommends', *PACKAGES])}")
+    failure, _ = _run(add)
+    if failure is None:
+        return None
+    say(f"  the package list may be missing or old ({failure}): apt-get update")
+    return _run([*command, "update"])[0] or _run(add)[0]
+
+
+def unpack(folder: Path, say: Say) -> str | None:
+    """Download the packages, with the libraries the system lacks, and unpack them into `folder`. Needs no root.
+
+    `folder` becomes the root of the unpacked tree (`folder/usr/sbin/mariadbd`). Returns None when done, else why not.
+    """
+    work = folder.with_name(folder.name + ".tmp")
+    try:
+        shutil.rmtree(work, ignore_errors=True)
+        (work / "lists" / "partial").mkdir(parents=True)
+        (work / "archives" / "partial").mkdir(parents=True)
+        failure = _download_and_unpack(work, say)
+        if failure is None:
+            shutil.rmtree(folder, ignore_errors=True)
+            (work / "root").rename(folder)
+        return failure
+    except OSError as error:
+        return f"{error.strerror or error} ({error.filename or work})"
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _download_and_unpack(work: Path, say: Say) -> str | None:
+    # The system's package lists are used as they are; where they are missing, own ones are fetched beside them.
+    own_lists = ("-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
+    failure = _download(work, say)
+    if failure is not None:
+        say("  fetching a package list of our own")
+        failure = _run(["apt-get", *own_lists, "-q", "update"])[0] or _download(work, say, own_lists)
+    for package in sorted((work / "archives").glob("*.deb")):
+        failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
+    return failure
+
+
+def _download(work: Path, say: Say, options: Sequence[str] = ()) -> str | None:
+    """Download what an installation would add: our packages and the libraries that the system lacks."""
+    failure, said = _run(["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES])
+    if failure is not None:
+        return failure
+    missing = [line.split()[1] for line in said.splitlines() if line.startswith("Inst ")]
+    wanted = sorted({*missing, *PACKAGES})
+    say(f"  downloading {', '.join(wanted)}")
+    return _run(["apt-get", *options, "-q", "download", *wanted], work / "archives")[0]
+
+
+def _privilege() -> list[str] | None:
+    if os.geteuid() == 0:
+        return []
+    if shutil.which("sudo") and _run(["sudo", "-n", "true"])[0] is None:
+        return ["sudo", "-n"]
+    return None
+
+
+def _run(command: Sequence[str], cwd: Path | None = None) -> tuple[str | None, str]:
+    """Run a program to its end; return why it failed, None where it did not, and its output."""
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, "LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"},  # the output is read here
+            cwd=cwd,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+    except FileNotFoundError:
+        return f"{command[0]} is not installed", ""
+    except subprocess.TimeoutExpired:
+        return f"{command[0]} took more than {TIMEOUT_S:.0f} s", ""
+    if done.returncode == 0:
+        return None, done.stdout
+    # The line that says why: apt's first error (E: ...), else the last line.
+    lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("E: ")]
+    return next(iter([*errors, *lines[-1:]]), f"{command[0]} ended with code {done.returncode}"), done.stdout
+
 
 #: Where the server lies when it is not on PATH (Debian, Fedora, Homebrew).
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
 
-Say = Callable[[str], None]
 _ABSENT = "there is no MariaDB server on this machine"
 
 

@@ -15,10 +15,8 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import memory_bytes
 
-from .account import Account
 from .binaries import Binaries
-from .folder import ADMIN_USER, Folder, folder_error, indent
-from .port import HOST, free_port, port_free
+from .folder import ADMIN_USER, HOST, Account, Folder, folder_error, free_port, indent, port_free
 
 START_TIMEOUT_S = 60.0
 LOG_SIZE = "--innodb-log-file-size=256M"

@@ -1,25 +1,26 @@
-"""Registration of a visit by a form, and what is stated of its person and recordings; each change a row of Decision."""
+"""Forms of a visit: its registration, what is stated of its person and recordings, its role and clinical scores.
+
+Each change is a row of Decision. Role and scores are checked and written as the rows of a sheet of `pbl study import`.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label, check_mass
 
 from .. import lab, session, study, video
-from ..decisions.review_decisions import record
-from ..intake.conditions import set_condition
+from ..decisions.review_decisions import decisions, record
+from ..intake.records import replace_height, replace_mass, set_condition, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
-from ..intake.visits import replace_height, replace_mass, set_population
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
-from .form_checks import check_fields, decided_meanwhile, is_stored, last_decision, stored_value
-from .study_sheets import CLEAR, COLUMNS, import_rows
+from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
 NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
@@ -42,17 +43,40 @@ _KINDS = {
 }
 
 
+#: Name of the field of the role; those of scores are named by their instruments.
+ROLE = "role"
+#: Roles that are offered; any word of small letters, digits and underscores can be one.
+USUAL_ROLES = (*study.FIRST_ROLES, "6_weeks", "3_months", "6_months", "12_months", "24_months")
+
+
 @dataclasses.dataclass(frozen=True)
-class Facts:
-    """What is stored of a visit, as a form shows it. values: by field, those of the recordings included, empty where
-    nothing is stored; recordings: name by video_id; seen: another text after each change."""
+class Form:
+    """What is stored of a visit, as a form shows it."""
 
     session_id: int
     subject: str
     label: str
-    values: dict[str, str]
-    recordings: dict[int, str]
-    seen: str
+    values: dict[str, str]  # by field, empty where nothing is stored
+    recordings: dict[int, str] = dataclasses.field(default_factory=dict)  # of the facts: name by video_id
+    instruments: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)  # of the scores: rows by name
+
+    @property
+    def seen(self) -> str:
+        """Another text after each change."""
+        text = json.dumps([self.session_id, self.values], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def stored(self, name: str, text: str) -> Any:
+        """Return what is stored of a field with this text, None where there is nothing."""
+        numeric = name in _NUMBERS or name in self.instruments
+        return number_of(Row(name, {}), name, text[:40]) if text and numeric else text or None
+
+    def same(self, name: str, text: str) -> bool:
+        """Return whether a text is what is stored, also written otherwise: 1,80 for 1.8."""
+        try:
+            return text == self.values[name] or self.stored(name, text) == self.stored(name, self.values[name])
+        except PblError:
+            return False
 
 
 def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
@@ -98,23 +122,22 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         return None, {"": error.with_key(None)}
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)
-    before = facts(number).values
-    if "height_m" in given and not is_stored(given["height_m"], before["height_m"], numeric=True):
-        _write(number, given["subject"], {"height_m": given["height_m"]}, by, before, "")
+    now = facts(number)
+    if "height_m" in given and not now.same("height_m", given["height_m"]):
+        _write(now, {"height_m": given["height_m"]}, by, "")
     return number, {}
 
 
-def facts(session_id: int) -> Facts:
+def facts(session_id: int) -> Form:
     """Return what can be stated of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
-    rows = (session.Session * lab.Subject & {"session_id": session_id}).to_dicts()
-    if not rows:
-        raise session.unknown_visit(session_id)
+    visit = session.registered_visit(session_id)
+    person = (lab.Subject & {"subject": visit["subject"]}).fetch1()
     of_visit = (study.Visit & {"session_id": session_id}).to_dicts()
     masses = (session.BodyMass & {"session_id": session_id}).to_arrays("body_mass")
     values = {
-        "height_m": _text(rows[0]["subject_height"]),
+        "height_m": _text(person["subject_height"]),
         "mass_kg": _text(masses[0] if len(masses) else None),
-        "population": "" if rows[0]["population"] == "unknown" else rows[0]["population"],
+        "population": "" if person["population"] == "unknown" else person["population"],
         **{name: of_visit[0][name] if of_visit else "" for name in ("assistive_device", "orthosis")},
     }
     videos = (video.Video & {"session_id": session_id}).to_dicts(order_by="video_id")
@@ -123,10 +146,24 @@ def facts(session_id: int) -> Facts:
         condition = conditions[row["video_id"]]
         values[f"{ACTIVITY}{row['video_id']}"] = condition.activity
         values[f"{PACE}{row['video_id']}"] = condition.pace
-    text = json.dumps([session_id, values], sort_keys=True)
-    seen = hashlib.sha256(text.encode()).hexdigest()[:16]
     names = {int(row["video_id"]): row["video_name"] for row in videos}
-    return Facts(session_id, rows[0]["subject"], rows[0]["session_label"], values, names, seen)
+    return Form(session_id, visit["subject"], visit["session_label"], values, recordings=names)
+
+
+def entry(session_id: int) -> Form:
+    """Return role and scores of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
+    visit = session.registered_visit(session_id)
+    roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
+    scores = (study.ClinicalScore & {"session_id": session_id}).to_dicts()
+    stored = {r["instrument"]: f"{r['score_value']:.12g}" for r in scores}
+    known = instruments()
+    values = {ROLE: str(roles[0]) if len(roles) else "", **{n: stored.get(n, "") for n in known}}
+    return Form(session_id, visit["subject"], visit["session_label"], values, instruments=known)
+
+
+def instruments() -> dict[str, dict[str, Any]]:
+    """Return the rows of ClinicalInstrument by name."""
+    return {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
 
 
 def correct(
@@ -145,25 +182,55 @@ def correct(
     Parameters
     ----------
     values
-        Text by field of `Facts.values`; an empty one removes what is stored. Fields that are not named stay.
+        Text by field of `Form.values`; an empty one removes what is stored. Fields that are not named stay.
     by, reason
         Who entered it, and why (no names).
     seen
-        `Facts.seen` of the form that was filled in.
+        `Form.seen` of the form that was filled in.
     """
-    return in_transaction(lambda: _correct(session_id, _stripped(values), by, seen, reason))
+    return in_transaction(lambda: _correct(_locked(facts, session_id, values, seen), _stripped(values), by, reason))
 
 
-def _correct(
-    session_id: int, given: dict[str, str], by: str, seen: str, reason: str
+def enter(
+    session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = ""
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
+    """Bring role and scores of a visit to what was entered, all of it or nothing: as `correct`, of `entry`."""
+    return in_transaction(lambda: _enter(_locked(entry, session_id, values, seen), _stripped(values), by, reason))
+
+
+def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str], seen: str) -> Form:
+    """Return what is stored, which is what the form showed.
+
+    Raises `PblError` DB_NOT_FOUND, USAGE, DECIDED_MEANWHILE.
+    """
     session.lock(session_id)  # who enters at the same moment waits here
-    now = facts(session_id)
-    check_fields(session_id, given, now.values, "a field of the form")
-    if now.seen != seen:
-        last = last_decision(session_id, _KINDS.values())
-        raise decided_meanwhile(session_id, last, "" if last is None else f"changed the {last.what}")
-    changed = {name: text for name, text in given.items() if not is_stored(text, now.values[name], name in _NUMBERS)}
+    now = read(session_id)
+    if unknown := sorted(set(given) - set(now.values)):
+        raise PblError(
+            "USAGE",
+            found=f"a field {unknown[0][:64]!r}",
+            expected="the role or an instrument of ClinicalInstrument" if now.instruments else "a field of the form",
+            next_step="load the form again",
+            key=f"session_id={session_id}",
+        )
+    if now.seen == seen:
+        return now
+    kinds = ("role", "score") if now.instruments else _KINDS.values()
+    who = "it was imported"
+    if (last := next((d for d in decisions(session_id) if d.what in kinds), None)) is not None:
+        did = f"entered {last.about.get('instrument', 'the role')}" if now.instruments else f"changed the {last.what}"
+        who = f"{last.by} {did} at {last.at} UTC"
+    raise PblError(
+        "DECIDED_MEANWHILE",
+        found=f"since this form was loaded something else is stored: {who}",
+        expected="what the form showed; nothing of yours was written",
+        next_step="load the form again, look at what is stored, and enter then",
+        key=f"session_id={session_id}",
+    )
+
+
+def _correct(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tuple[str, ...], dict[str, PblError]]:
+    changed = {name: text for name, text in given.items() if not now.same(name, text)}
     checks: dict[str, Callable[[str], Any]] = {
         "height_m": _height,
         "mass_kg": _mass,
@@ -180,26 +247,46 @@ def _correct(
             return (), {next(iter(worn)): found.errors[0].with_key(None)}
     if errors:
         return (), errors
-    _write(session_id, now.subject, changed, by, now.values, reason)
+    _write(now, changed, by, reason)
     return tuple(changed), {}
 
 
-def _write(
-    session_id: int, subject: str, changed: Mapping[str, str], by: str, before: Mapping[str, str], reason: str
-) -> None:
+def _enter(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tuple[str, ...], dict[str, PblError]]:
+    changed = {name: text[:200] for name, text in given.items() if not now.same(name, text[:200])}
+    errors: dict[str, PblError] = {}
+    if changed.get(ROLE) == "":
+        errors[ROLE] = refused(ROLE, "no role", f"a role, such as {', '.join(USUAL_ROLES[:3])}", "write it")
+    of_visit = {"subject": now.subject, "visit": now.label}
+    cells = {n: {ROLE: t} if n == ROLE else {"instrument": n, "value": t or CLEAR} for n, t in changed.items()}
+    rows = {name: Row(name, {**of_visit, **cells[name]}) for name in changed if name not in errors}
+    roles = Sheet(ROLE, ("subject", "visit", ROLE), tuple(r for n, r in rows.items() if n == ROLE))
+    scores = Sheet("scores", SCORE_COLUMNS, tuple(r for n, r in rows.items() if n != ROLE))
+    # Codes that are alike are a question to who registers people, not to who enters a score.
+    found = import_rows([s for s in (roles, scores) if s.rows], dry_run=bool(errors), distinct_codes=True)
+    errors |= {line.where: line.errors[0] for line in found.lines if line.errors}
+    if errors:
+        return (), errors
+    for name, text in changed.items():
+        kind, about = (ROLE, {}) if name == ROLE else ("score", {"instrument": name})
+        was, after = ({"value": now.stored(name, v)} for v in (now.values[name], text))
+        record(kind, by, about, was, after, reason, session_id=now.session_id)
+    return tuple(changed), {}
+
+
+def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
     """Write values that were checked, each with its row of Decision; aid and orthosis are written by their caller."""
     for name, text in changed.items():
         kind, _, number = name.partition(":")
         if name == "height_m":
-            replace_height(subject, _height(text) if text else None)
+            replace_height(now.subject, _height(text) if text else None)
         elif name == "mass_kg":
-            replace_mass(session_id, _mass(text) if text else None)
+            replace_mass(now.session_id, _mass(text) if text else None)
         elif name == "population":
-            set_population(subject, text or "unknown")
+            set_population(now.subject, text or "unknown")
         elif number:
             set_condition(int(number), **{kind: text or "unknown"})
-        was, after = ({"value": stored_value(v, name in _NUMBERS)} for v in (before[name], text))
-        of = {"video_id": int(number)} if number else {"session_id": session_id}
+        was, after = ({"value": now.stored(name, v)} for v in (now.values[name], text))
+        of = {"video_id": int(number)} if number else {"session_id": now.session_id}
         record(_KINDS[kind], by, {}, was, after, reason, **of)
 
 
