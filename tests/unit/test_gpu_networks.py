@@ -14,11 +14,15 @@ import pytest
 
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import METHODS
 from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_visible
 from pbl_pipeline.models.gpu_server import Server
 from pbl_pipeline.models.network import NetworkSpec, read_network
 from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
+from research.benchmarks.many_videos import differences
+from research.clip_keypoints import clip_keypoints
+from tests.videos import write_video
 
 LANDMARKS = (195, 117, 1)
 
@@ -141,3 +145,20 @@ def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(
     network = network_of("blazepose_detector")
     assert not network.on_gpu
     assert "DEPTH_TO_SPACE" in network.note
+
+
+@pytest.mark.long
+def test_keypoints_do_not_depend_on_what_computed_them(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a clip from the file on: rounding in an earlier stage moves no crop, so it stays rounding."""
+    frames = [f.image for f in read_frames(assets.fetch("demo_video"), 60, 120)]
+    video = write_video(tmp_path / "clip.mp4", frames, np.arange(len(frames)) / 30.0, crf=18)
+    method = METHODS.find("blazepose-33")
+    by_jax = clip_keypoints(video, tmp_path / "people.jpg", method)
+    monkeypatch.setenv("PBL_ONNX_DEVICE", "cpu")
+    by_litert = clip_keypoints(video, tmp_path / "people.jpg", method)
+    assert (by_jax.origin, by_litert.origin) == ("blazepose on cpu", "")
+    for apart, median, most in zip(differences(by_jax, by_litert), (0.1, 1.0), (0.5, 4.0), strict=True):
+        assert np.median(apart) < median
+        assert np.percentile(apart, 99) < most
