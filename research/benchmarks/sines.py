@@ -32,9 +32,9 @@ def motion(seed: int, n_frames: int, degrees: float, share: float) -> Float[np.n
     """Return the joint values (rad, m) of a person whose joints all move at once."""
     body, rng = load_body(), np.random.default_rng([seed, 71])
     time_s = np.arange(n_frames) / FPS
-    low, high = body.joint_range_rad.T
-    free = ~np.isfinite(low)
-    middle = np.where(free, 0.0, 0.5 * (low + high))
+    free = ~np.isfinite(body.joint_range_rad[:, 0])
+    low, high = np.where(free, 0.0, body.joint_range_rad.T)
+    middle = 0.5 * (low + high)
     widest = np.where(free, np.where(body.is_slide, PELVIS_M, np.radians(PELVIS_DEG)), 0.5 * share * (high - low))
     size = (SINES, len(low))
     frequency, phase = rng.uniform(*FREQUENCIES_HZ, size), rng.uniform(0, 2 * np.pi, size)
