@@ -17,7 +17,7 @@ class HeadParams:
     """Parameters of `find_heads`. Margins are tuned on the clips that docs/privacy.md names, and reported on others.
 
     tracking: finds smaller and less sure people than measuring asks for; a false one costs a blurred patch of wall.
-    keypoints: those of everybody, however briefly in view.
+    keypoints: those of all people, however briefly in view.
     head_radius_m: of the circle around the middle of the ears, in metres of the detector's own body; the vertex and the
     chin lie 0.13 m from there, hair and error come on top.
     head_face: the same as a multiple of the largest distance between two points of the face; the larger one counts.
@@ -26,7 +26,7 @@ class HeadParams:
     jump: so does one farther than this many head radii from where the frames around say.
     face_score, face_sure, face_gap_s: a face counts from this score, if its scores add up to `face_sure` with no longer
     gap between them (two sure sightings, three less sure ones).
-    face_on_body: what the scores must add up to where the face lies on the body of somebody whose head is known: knees
+    face_on_body: what the scores must add up to where the face lies on the body of a person whose head is known: knees
     and folds of cloth are taken for faces, and a blurred knee is not measured.
     face_interval_s, face_tiles, face_overlap: searched so often, on tiles of these fractions of the shorter side by
     turns.

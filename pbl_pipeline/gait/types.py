@@ -108,7 +108,7 @@ class Condition:
 
     @property
     def pool(self) -> str:
-        """The pace under which a method pools this trial; "" where it is no walking, which none pools."""
+        """The pace under which a method pools this trial; "" where it is not walking, which none pools."""
         if not self.walks:
             return ""
         return SELF_SELECTED if self.pace == UNKNOWN else self.pace

@@ -1,10 +1,10 @@
 """One place that loads a TensorFlow Lite model: hash checked, thread count fixed.
 
-A TensorFlow Lite model without the branches that nobody asks for.
+A TensorFlow Lite model without the branches that no one asks for.
 
 BlazePose's landmark network also draws a silhouette of 256 x 256 and a heatmap for every point. Those two branches are
 a seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every
-output that the file names, so the file is rewritten with fewer; what is left is computed from the same weights in the
+output that the file names, so the file is rewritten with fewer; the rest is computed from the same weights in the
 same order, bit for bit.
 """
 

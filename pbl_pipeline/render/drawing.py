@@ -41,7 +41,7 @@ def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
 
     Pinhole with OpenCV's radial-tangential distortion (k1, k2, p1, p2, k3). NaN for points nearer than `NEAR_M` or
     behind the camera, and for points so far off the axis that the radial polynomial turns back: beyond that angle the
-    polynomial is no lens, and it would fold the point into the picture.
+    polynomial is not a lens, and it would fold the point into the picture.
     """
     p = np.asarray(points_cam_m, float)
     depth = np.where(p[..., 2] >= NEAR_M, p[..., 2], np.nan)

@@ -39,7 +39,7 @@ def mean_squares(ratings: np.ndarray, model: int) -> MeanSquares:
     Raises `PblError` STATS_INPUT.
     """
     seen = np.isfinite(ratings)
-    if model == 1 and len(ratings) > 1:  # a column is no rater: it may be empty where cycles are few
+    if model == 1 and len(ratings) > 1:  # a column is not a rater: it may be empty where cycles are few
         ratings, seen = ratings[:, seen.any(axis=0)], seen[:, seen.any(axis=0)]
     of_subject, of_rater = seen.sum(axis=1), seen.sum(axis=0)
     n, k = ratings.shape

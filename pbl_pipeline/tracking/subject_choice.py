@@ -28,13 +28,13 @@ _COLOURS = ((80, 220, 80), (60, 120, 255), (255, 160, 40), (220, 80, 220), (60, 
 
 
 def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int] | None = None) -> np.ndarray:
-    """A picture (H, W, 3) uint8 BGR of a few moments in order of time, everybody of `persons` boxed and numbered.
+    """A picture (H, W, 3) uint8 BGR of a few moments in order of time, all of `persons` boxed and numbered.
 
     `persons` (default: everybody) in order of interest: of as many as there is room for, the moment is shown in which
-    the person is seen best, then moments spread over the video in which most of them are in view. Who has no moment is
+    the person is seen best, then moments spread over the video in which most of them are in view. A person without a moment is
     still boxed in those of the others.
 
-    Raises `ValueError` when nobody was tracked, and the `PblError`s of `video.read_frames`.
+    Raises `ValueError` when no one was tracked, and the `PblError`s of `video.read_frames`.
     """
     wanted = list(persons) if persons is not None else [p.person_id for p in tracking.persons]
     people = [p for k in wanted for p in tracking.persons if p.person_id == k]
@@ -52,7 +52,7 @@ def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[
 
 
 def contact_sheet_jpeg(video_path: str | Path, tracking: Tracking, choice: SubjectChoice) -> bytes:
-    """The `contact_sheet` of everybody, those with the best scores first, as the bytes of a JPEG. Raises as it."""
+    """The `contact_sheet` of all people, those with the best scores first, as the bytes of a JPEG. Raises as it."""
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
     return _encoded(contact_sheet(video_path, tracking, ranked), ".jpg")
 
@@ -123,7 +123,7 @@ def _label(cell: np.ndarray, text: str, corner: tuple[int, int], size: float, co
     cv2.putText(cell, text, (x + 4, y + height + 4), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 2, cv2.LINE_AA)
 
 
-#: With fewer frames nobody can be followed, whoever is in the picture.
+#: With fewer frames no one can be followed, whoever is in the picture.
 LEAST_FRAMES = 10
 #: What to do where no person was found: she may be too small in the picture or too near.
 FILM_THE_WHOLE_BODY = "film in light, from where the whole body is in the picture and fills much of its height"
@@ -210,10 +210,10 @@ def carried_choice(
     tracking: Tracking,
     params: Method[SubjectParams] | Paramset | SubjectParams | str | None = None,
 ) -> SubjectChoice:
-    """The choice in `tracking` after somebody chose `person_id` by hand in `decided`, another tracking (by `method`).
+    """The choice in `tracking` after a person chose `person_id` by hand in `decided`, another tracking (by `method`).
 
     It is the same person (status CHOSEN). If no match is certain, somebody has to choose again: what the automatic
-    choice would say is not what somebody decided. `params` as for `choose_subject`.
+    choice would say is not what a person decided. `params` as for `choose_subject`.
     """
     found = same_person(decided, person_id, tracking)
     if found is not None:
