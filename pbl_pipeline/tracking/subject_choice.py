@@ -30,9 +30,9 @@ _COLOURS = ((80, 220, 80), (60, 120, 255), (255, 160, 40), (220, 80, 220), (60, 
 def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int] | None = None) -> np.ndarray:
     """A picture (H, W, 3) uint8 BGR of a few moments in order of time, all of `persons` boxed and numbered.
 
-    `persons` (default: everybody) in order of interest: of as many as there is room for, the moment is shown in which
-    the person is seen best, then moments spread over the video in which most of them are in view. A person without a moment is
-    still boxed in those of the others.
+    `persons` (default: all people) in order of interest: of as many as there is room for, the moment is shown in which
+    the person is seen best, then moments spread over the video in which most of them are in view. A person without a moment
+    is still boxed in those of the others.
 
     Raises `ValueError` when no one was tracked, and the `PblError`s of `video.read_frames`.
     """
@@ -212,7 +212,7 @@ def carried_choice(
 ) -> SubjectChoice:
     """The choice in `tracking` after a person chose `person_id` by hand in `decided`, another tracking (by `method`).
 
-    It is the same person (status CHOSEN). If no match is certain, somebody has to choose again: what the automatic
+    It is the same person (status CHOSEN). If no match is certain, a person has to choose again: what the automatic
     choice would say is not what a person decided. `params` as for `choose_subject`.
     """
     found = same_person(decided, person_id, tracking)
