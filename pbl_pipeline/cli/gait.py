@@ -36,7 +36,7 @@ Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
 @click.option(
     "--accept-cadence",
     is_flag=True,
-    help="Also measure recordings whose cadence is unusual (below 60 or over 150 steps/min): you counted the steps.",
+    help="Also measure recordings whose cadence is over 150 steps/min: you counted the steps.",
 )
 @MASS
 def gait(

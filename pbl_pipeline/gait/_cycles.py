@@ -107,10 +107,13 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
 
 
 def without_unusual_cadence(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
-    """Return the cycles of a recording, none used where their mean cadence is unusual for walking: steps counted twice
-    or missed, or left and right that the detector exchanged at each step, make every measure another one."""
+    """Return the cycles of a recording, none used where their mean cadence is too high for walking: steps counted
+    twice, or left and right that the detector exchanged at each step, make every measure another one. A low one is
+    that of many patients."""
     own = [120.0 / c.stride_time_s for c in cycles if c.used]
-    if not own or unusual_bound(float(np.mean(own))) is None:
+    mean = float(np.mean(own)) if own else 0.0
+    bound = unusual_bound(mean)
+    if bound is None or mean < bound:
         return list(cycles)
     return [not_used(c, failed_checks=(CADENCE,)) for c in cycles]
 

@@ -31,8 +31,8 @@ def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[
     """A picture (H, W, 3) uint8 BGR of a few moments in order of time, all of `persons` boxed and numbered.
 
     `persons` (default: all people) in order of interest: of as many as there is room for, the moment is shown in which
-    the person is seen best, then moments spread over the video in which most of them are in view. A person without a moment
-    is still boxed in those of the others.
+    the person is seen best, then moments spread over the video in which most of them are in view. A person without a
+    moment is still boxed in those of the others.
 
     Raises `ValueError` when no one was tracked, and the `PblError`s of `video.read_frames`.
     """

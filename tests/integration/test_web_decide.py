@@ -228,7 +228,7 @@ def test_an_unusual_cadence_gives_no_number_until_somebody_accepts_it(
     tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     measures = sys.modules["pbl_pipeline.gait.cycle_measures"]  # a function of the package has its name
-    monkeypatch.setattr(measures, "CADENCE_PER_MIN", (150.0, 200.0))  # the walk's is not
+    monkeypatch.setattr(measures, "CADENCE_PER_MIN", (20.0, 50.0))  # the walk's is higher
     register(small_video(tmp_path, "walk"), session_label="2026-01-10")
     populate()
     numbers = ("session_gdi", "session_cadence", "session_gps")

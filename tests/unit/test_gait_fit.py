@@ -320,6 +320,16 @@ def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
     ]
 
 
+def test_a_slow_walk_is_measured_with_a_warning():
+    time = np.arange(0, 12, 1 / 30)
+    usual = make_fit(time, walking(time))
+    metrics = gait_metrics([dataclasses.replace(usual, time_s=usual.time_s * 2.0)])
+    cadence = metrics.spatiotemporal["cadence_steps_per_min"]
+    assert cadence is not None
+    assert cadence.mean < 60.0
+    assert [(c.outcome, c.threshold) for c in metrics.checks if c.check == "cadence_plausible"] == [("WARN", 60.0)]
+
+
 def test_the_outcome_counts_what_came_before():
     time = np.arange(0, 6, 1 / 30)
     metrics = gait_metrics([make_fit(time, walking(time))])
