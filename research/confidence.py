@@ -78,10 +78,10 @@ def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams])
 
 
 def curve_params(method: Method[KeypointParams]) -> dict:
-    """What the confidence depends on: the parameters less the curve's own name."""
+    """What the confidence depends on: the parameters less the curve's own name, and less the grid of the crops, which
+    moves them by less than the next frame does."""
     params = json.loads(method.paramset.canonical_json)
-    del params["confidence_curve"]
-    return params
+    return {name: value for name, value in params.items() if name not in ("confidence_curve", "crop_step_px")}
 
 
 def fit_curve(

@@ -74,8 +74,8 @@ def hostile(drop: Path, outside: Path, known: bytes) -> dict[str, str]:
         place("a pseudonymous code", subject=subject).write_bytes(known + subject.encode())
     place("a pseudonymous code", subject=os.fsdecode(b"P\xff")).write_bytes(known + b"2")
     for visit in ("v" * 200, "\u6b65" * 80):
-        place("--session", visit=visit).write_bytes(known + visit.encode())
-    place("--session", visit=os.fsdecode(b"no\xfftext")).write_bytes(known + b"3")
+        place("visit", visit=visit).write_bytes(known + visit.encode())
+    place("visit", visit=os.fsdecode(b"no\xfftext")).write_bytes(known + b"3")
     # the same recording for another person
     place("VIDEO_DUPLICATE").write_bytes(known)
     # logs

@@ -126,7 +126,7 @@ def test_a_job_in_other_hands_is_not_taken_twice(visits: None, browser: Any):
     mark(browser, 2)
     (job,) = queue.claim(fit.SessionFit)  # a worker has it: this process
     compute(browser, 1)
-    until(lambda: "SessionFit" in browser.get("/visits/1/progress").text)
+    until(lambda: "fit of the body" in browser.get("/visits/1/progress").text)
     time.sleep(3.0)
     assert state(browser, 1) == "running"  # it waits for what follows
     assert len(fit.SessionFit & job.key) == 0
