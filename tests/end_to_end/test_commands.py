@@ -192,6 +192,7 @@ def test_the_fit_is_exported(fitted, tmp_path):
     assert all(path.is_relative_to(out) and path.stat().st_size for path in written)
 
 
+@pytest.mark.long
 def test_run_of_the_installed_wheel_does_the_same_in_one(installed, fitted, folder, tmp_path):
     out = tmp_path / "Měření, früh"  # a letter that the encoding of the output lacks
     done = pbl("run", folder / "walking.mp4", "--out", out, "--subject", "P017", packages=installed)

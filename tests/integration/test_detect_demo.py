@@ -106,6 +106,7 @@ def test_she_is_one_person_from_her_first_to_her_last_frame_in_view(tracking):
             assert not (away < 150).any()
 
 
+@pytest.mark.long
 def test_landmarks_are_on_her_in_98_percent_of_these_frames(keypoints):
     frames = np.arange(43, 186)
     x, y = (np.interp(frames, [w[0] for w in HER_WAY], [w[k] for w in HER_WAY]) for k in (1, 2))

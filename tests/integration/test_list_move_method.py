@@ -41,6 +41,7 @@ def walks(tables: None, tmp_path: Path) -> dict[str, int]:
     return {"one": one, "two": two, "three": three}
 
 
+@pytest.mark.long
 def test_lists_then_moves(walks):
     """One chain for both: the lists look at it before anything is moved."""
     lists_have_a_row_for_each_with_counts_and_filters(walks)

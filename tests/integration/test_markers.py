@@ -62,6 +62,7 @@ def fitted(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_either)
 
 
+@pytest.mark.long
 def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: Path):
     visit = ("--subject", "P001", "--session", "2026-03-01")
     assert pbl("ingest", chain.small_video(tmp_path, "walk"), *visit).code == 0

@@ -109,6 +109,7 @@ def errors_of(table) -> list[tuple[int, str]]:
     return [(int(r["video_id"]), error_code(r["error_message"])) for r in rows]
 
 
+@pytest.mark.long
 def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch, tmp_path: Path):
     rig.setattr(pbl_pipeline.fit, "fit_session", fit_either)
     visit = ("--subject", "P001", "--session", "2026-03-01")
@@ -184,6 +185,7 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
     assert wide["rig"].tolist() == [found["rig"]["session_gdi"]]
 
 
+@pytest.mark.long
 def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     """Somebody else in one camera, or nobody, takes a trial out with a reason; the other trials are fitted."""
 

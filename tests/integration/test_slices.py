@@ -189,6 +189,7 @@ def video_ids() -> list[dict]:
     return list((video.Video & own.proj()).proj().to_dicts())
 
 
+@pytest.mark.long
 def test_the_commands(cohort: Path, tmp_path: Path):
     run = CliRunner()
     made = run.invoke(slice_, ["from-shell", "--cohort", "dcm", "--role", "pre", "--role", "6_weeks"])

@@ -180,7 +180,7 @@ def test_the_walker_of_a_real_clip(folder, registry, shared_data, tmp_path):
     assert np.isnan(tracking.persons[0].roi_px).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_takes_a_registered_detector_and_says_its_licence(folder, registry, shared_data, tmp_path):
     models.add(folder)
     video = shared_data / "real" / "video_mocap" / "walk" / "video.mp4"
