@@ -3,7 +3,7 @@
     python -m research.benchmarks.phone_waits                    # 1,000 recordings wait, two processes, five by phone
     python -m research.benchmarks.phone_waits --videos 20 --phones 1
 
-A database of its own holds as many recordings as `--videos`: files of their own with the demo's walk, 6 s at 1080p.
+A database of its own holds as many recordings as `--videos`: files of their own with the demo's walk, 7 s at 1080p.
 `pbl worker` computes them for real. Once it detects keypoints, recordings are registered as the page of a phone does
 when its upload has ended, one after the other; each is of a visit of its own.
 """
@@ -84,8 +84,8 @@ def main(videos: int, processes: int, phones: int) -> None:
             wait_for(lambda of=visit: bool(gdi.SessionGdi & of))
             indices.append(time.monotonic() - begin)
             click.echo(f"{usable(key['video_id']).state}: {verdicts[-1]:.1f} s, index {indices[-1]:.1f} s", err=True)
-        left = len(keypoints.Keypoints.key_source - keypoints.Keypoints)
-    click.echo(f"{videos} recordings, {left} of them without keypoints at the end; {processes} processes")
+        left = videos + phones - len(keypoints.Keypoints())
+    click.echo(f"{videos} recordings, {left} of all still without keypoints at the end; {processes} processes")
     say("verdict: median", float(np.median(verdicts)), "s", "bar 20")
     say("verdict: longest", max(verdicts), "s")
     say("index: median", float(np.median(indices)), "s", "bar 60")
