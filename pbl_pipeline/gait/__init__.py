@@ -84,7 +84,6 @@ from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, tas
 from .types import (
     ACTIVITIES,
     ANY_PACE,
-    CADENCE,
     PACES,
     SELF_SELECTED,
     UNKNOWN,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from pbl_pipeline.qc import Check, failed
+from pbl_pipeline.qc import CADENCE, Check, failed
 
 from ._angles import AngleSeries, angle_series
 from .cycle_measures import far_leg, mostly, unusual_bound
@@ -18,7 +18,7 @@ from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
-from .types import CADENCE, NO_POSITIONS, Exclusion, GaitCycle, Lengths
+from .types import NO_POSITIONS, Exclusion, GaitCycle, Lengths
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -32,7 +32,7 @@ _PASSES = 2
 _BEYOND = 0.2
 #: Fraction of a cycle's frames in which both feet must be seen to count passes.
 _SEEN = 0.8
-#: Fewest cycles of a bout for a typical stride of its own; shorter bouts are compared with the whole trial.
+#: Fewest cycles of a bout for a separate typical stride; shorter bouts are compared with the whole trial.
 _OWN_MEDIAN = 5
 
 #: Angles whose curves are compared: those that move most and that every source of curves knows.
@@ -172,7 +172,7 @@ def find_cycles(
     metres in a world that stands still).
 
     Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Of a
-    fit none is used either where the cadence is unusual for walking (`with_cadence_accepted` takes that back).
+    fit none is used either where the cadence is too high for walking (`with_cadence_accepted` takes that back).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")

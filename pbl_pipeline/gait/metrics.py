@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.qc import EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
+from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
 from ._cycles import find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
@@ -45,7 +45,7 @@ from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
 from .tasks import TASK_MEASURES, task_measures, task_motion
-from .types import CADENCE, Condition, GaitCycle
+from .types import Condition, GaitCycle
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -201,8 +201,8 @@ def gait_metrics(
     `pool_trials`.
 
     Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
-    those of `score_gdi`, `conditions` those of `pool_trials`. `accept_cadence`: a person counted the
-    steps of trials whose cadence is unusual (`find_cycles`).
+    those of `score_gdi`, `conditions` those of `pool_trials`. `accept_cadence`: a person counted the steps
+    of trials whose cadence is too high for walking (`find_cycles`).
 
     A trial without walking has status EMPTY and takes no part in the session. Where one of `fit_checks`, the checks of
     the session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError`

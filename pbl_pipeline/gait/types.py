@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pbl_pipeline.names import check_label
+from pbl_pipeline.qc import CADENCE
 
 from .events import LEFT, RIGHT, SIDES
 from .normative import BODY_ANGLES, NINE_ANGLES, NormativeSet
@@ -119,10 +120,6 @@ class Condition:
 
     def __str__(self) -> str:
         return self.activity if self.pace == UNKNOWN else f"{self.activity}, {self.pace}"
-
-
-#: Name of the check that leaves out all cycles of a recording until a person accepts it.
-CADENCE = "cadence_plausible"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -276,11 +276,16 @@ def _pool(
         found = _measure(name, values, drawn, of_camera[name])
         n_sides = sum(map(bool, values.values()))
         sd = np.hypot(METHOD_SD[name] / np.sqrt(n_sides), of_camera[name]) if found.sd is None else found.sd
-        if WIDTH_SD * sd > HEALTHY_RANGE * HEALTHY_SD[name]:
+        if too_uncertain(name, float(sd)):
             reasons[name] = TOO_UNCERTAIN
         else:
             measures[name] = found
     return measures, reasons
+
+
+def too_uncertain(name: str, sd: float) -> bool:
+    """Return whether the 90 % interval of a measure is wider than the range of healthy people."""
+    return WIDTH_SD * sd > HEALTHY_RANGE * HEALTHY_SD[name]
 
 
 def _measure(

@@ -1,6 +1,7 @@
 """Quality checks: every verdict carries its value, its threshold and advice."""
 
 from ._check import (
+    CADENCE,
     EMPTY,
     FAIL,
     NEEDS_CHOICE,

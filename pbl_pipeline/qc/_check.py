@@ -8,6 +8,8 @@ from collections.abc import Iterable
 PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
 OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
+#: Name of the check that leaves out all cycles of a recording until a person accepts it, although it failed.
+CADENCE = "cadence_plausible"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +83,7 @@ ORDER = (
     "cycles_of_odd_length",
     "cycles_of_odd_curves",
     "legs_seen_alike",
-    "cadence_plausible",
+    CADENCE,
     "lengths_scale",
     "norm_convention",
     "gdi_cycles",

@@ -157,7 +157,7 @@ def _nobody(tracking: Tracking, video_path: str | Path) -> PblError:
     if n < LEAST_FRAMES:
         return PblError(
             "TRACK_NO_PERSON",
-            found=f"nobody can be followed in a video of {n} frame{'s' * (n != 1)}",
+            found=f"no one can be followed in a video of {n} frame{'s' * (n != 1)}",
             expected="a recording of several steps",
             next_step="choose the recording itself, not a still picture or a preview of it",
             key=str(video_path),

@@ -57,7 +57,7 @@ def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tup
     try:
         time, quat = np.asarray(time_s, np.float64), np.asarray(quat_wxyz, np.float64)
     except (TypeError, ValueError) as error:
-        raise log_error(f"values that are no numbers ({error})", "numbers", key) from error
+        raise log_error(f"values that are not numbers ({error})", "numbers", key) from error
     if time.ndim != 1 or quat.shape != (len(time), 4):
         raise log_error(f"times of shape {time.shape}, quaternions of shape {quat.shape}", "(P,) and (P, 4)", key)
     if len(time) < 2:

@@ -38,7 +38,7 @@ class CameraPose:
         try:
             R, p = np.array(self.R_nc, np.float64), np.array(self.p_nc, np.float64)
         except (TypeError, ValueError) as error:
-            raise _invalid_pose(None, f"values that are no numbers ({error})", "R_nc (3, 3) and p_nc (3,)") from error
+            raise _invalid_pose(None, f"values that are not numbers ({error})", "R_nc (3, 3) and p_nc (3,)") from error
         if R.shape != (3, 3) or p.shape != (3,):
             raise _invalid_pose(None, f"R_nc of shape {R.shape}, p_nc of shape {p.shape}", "shapes (3, 3) and (3,)")
         if not np.isfinite(R).all() or not np.isfinite(p).all():

@@ -45,7 +45,7 @@ _PHOTO_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"heim": "HEIC", b"heis": "HE
 
 
 def photo_format(path: Path) -> str | None:
-    """Return the format of a photo ("HEIC", "JPEG", ...) by the first bytes of a file, None for what is no photo."""
+    """Return the format of a photo ("HEIC", "JPEG", ...) by the first bytes of a file, None for what is not a photo."""
     with path.open("rb") as file:
         head = file.read(12)
     if head[4:8] == b"ftyp":

@@ -16,6 +16,7 @@ import click
 
 from tests.database import installation
 from tests.integration import chain
+from tests.videos import numbered
 
 
 def flipped(data: bytes, draw: random.Random) -> bytes:
@@ -142,7 +143,7 @@ def main(inputs: int, seed: int) -> None:
             path = place / f"{draw.choice(NAMES)}{i}.mp4"
             sensors = []
             if kind == "log":
-                path.write_bytes(good + struct.pack(">I4sQ", 16, b"free", i))
+                path.write_bytes(numbered(good, i))
                 log = place / draw.choice(["log.csv", "log.json", "log.zip"])
                 log.write_bytes(fuzzed_log(draw))
                 sensors = [Sensors(attitude=log)]

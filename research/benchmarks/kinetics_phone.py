@@ -35,7 +35,7 @@ from pbl_pipeline.gait import GaitCycle, GaitEvents, find_cycles, gait_metrics
 from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.gait.laboratory import read_lab_trial
 from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, segment_inertia, visit_kinetics
-from pbl_pipeline.kinetics.compute import HEALTHY_RANGE, HEALTHY_SD, METHOD_SD, trial_series
+from pbl_pipeline.kinetics.compute import HEALTHY_SD, METHOD_SD, too_uncertain, trial_series
 from pbl_pipeline.kinetics.types import WIDTH_SD
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
 from research.corpus.walks import Case, Walk, detector_model, recorded_walks, synthetic_walk
@@ -135,7 +135,7 @@ def main(kind: str, detector: str) -> None:
                 continue
             rms[known.tuning].append(vertical_rms(known.walk, fit, exact))
             for name, measure in seen.measures.items():
-                shown = WIDTH_SD * (measure.sd or 0.0) <= HEALTHY_RANGE * HEALTHY_SD[name]
+                shown = not too_uncertain(name, measure.sd or 0.0)
                 for side in SIDES:
                     value, truth = getattr(measure, side), getattr(true.measures.get(name), side, None)
                     truth = known.plates.get(side, {}).get(name) if known.plates else truth

@@ -3,15 +3,14 @@
     python -m research.benchmarks.phone_waits                    # 1,000 recordings wait, two processes, five by phone
     python -m research.benchmarks.phone_waits --videos 20 --phones 1
 
-A database of its own holds as many recordings as `--videos`: files of their own with the demo's walk, 7 s at 1080p.
+A separate database holds as many recordings as `--videos`: different files with the demo's walk, 7 s at 1080p.
 `pbl worker` computes them for real. Once it detects keypoints, recordings are registered as the page of a phone does
-when its upload has ended, one after the other; each is of a visit of its own.
+when its upload has ended, one after the other; each is of another visit.
 """
 
 from __future__ import annotations
 
 import contextlib
-import shutil
 import subprocess
 import sys
 import time
@@ -24,23 +23,21 @@ import numpy as np
 from pbl_pipeline.bench.detect import demo_clip
 from research.benchmarks.workers import _PBL, say
 from tests.database import installation
+from tests.videos import numbered
 
 #: Seconds between two questions to the database, and after which a recording that has no answer counts as none.
 _ASK_S, _MOST_S = 0.25, 600.0
 
 
 def copy_of(clip: Path, number: int) -> Path:
-    """Return a file of its own with the same pictures: an empty box at its end holds the number."""
+    """Return another file with the same pictures."""
     path = clip.with_name(f"{number:05d}.mp4")
-    shutil.copyfile(clip, path)
-    with path.open("ab") as file:
-        file.write((12).to_bytes(4, "big") + b"free" + number.to_bytes(4, "big"))
+    path.write_bytes(numbered(clip.read_bytes(), number))
     return path
 
 
-def wait_for(known: Callable[[], bool]) -> float:
-    """Return the seconds until something is known; NaN where it never is."""
-    begin = time.monotonic()
+def wait_for(known: Callable[[], bool], begin: float) -> float:
+    """Return the seconds from `begin` until something is known; NaN where it never is."""
     while not known():
         if time.monotonic() - begin > _MOST_S:
             return float("nan")
@@ -71,7 +68,7 @@ def main(videos: int, processes: int, phones: int) -> None:
         worker = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         end.callback(worker.wait)
         end.callback(worker.terminate)
-        wait_for(lambda: bool(keypoints.Keypoints.jobs.reserved))
+        wait_for(lambda: bool(keypoints.Keypoints.jobs.reserved), time.monotonic())
         verdicts, indices = [], []
         for i in range(phones):
             (one,) = register([OneCamera(copy_of(clip, videos + i), VisitRecord(f"P{i:05d}", "1"))])
@@ -79,10 +76,9 @@ def main(videos: int, processes: int, phones: int) -> None:
             key = {"video_id": one.video_id}
             queue.fill(video.VideoInfo, [key], FIRST)
             begin = time.monotonic()
-            verdicts.append(wait_for(lambda one=key["video_id"]: usable(one).state != PENDING))
+            verdicts.append(wait_for(lambda one=key["video_id"]: usable(one).state != PENDING, begin))
             visit = {"session_id": (video.Video & key).fetch1("session_id")}
-            wait_for(lambda of=visit: bool(gdi.SessionGdi & of))
-            indices.append(time.monotonic() - begin)
+            indices.append(wait_for(lambda of=visit: bool(gdi.SessionGdi & of), begin))
             click.echo(f"{usable(key['video_id']).state}: {verdicts[-1]:.1f} s, index {indices[-1]:.1f} s", err=True)
         left = videos + phones - len(keypoints.Keypoints())
     click.echo(f"{videos} recordings, {left} of all still without keypoints at the end; {processes} processes")

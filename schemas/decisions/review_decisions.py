@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.words import UNUSABLE
 
 from .. import fit, gait, qc, tracking, video
@@ -19,9 +20,6 @@ from ..transactions import next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
-
-#: The check that can be accepted although it failed (`pbl_pipeline.gait.CADENCE`).
-CADENCE = "cadence_plausible"
 
 
 @dataclasses.dataclass(frozen=True)

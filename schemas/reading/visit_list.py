@@ -16,10 +16,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.filming import VIEW, Difference, Filming, differences
+from pbl_pipeline.qc import CADENCE
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..datajoint_setup import dj
-from ..decisions.review_decisions import CADENCE, is_accepted
+from ..decisions.review_decisions import is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision

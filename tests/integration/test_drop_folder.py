@@ -22,6 +22,7 @@ from schemas.intake import VisitRecord, ingest, uploads
 from schemas.operations import archive as layout
 from schemas.operations import backup, forget
 from tests.command import pbl
+from tests.videos import numbered
 from workers import incoming
 
 from . import chain
@@ -113,8 +114,7 @@ def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(
     ingest([before], VisitRecord(subject="P099", session_label="first"))
     outside = tmp_path / "outside"
     outside.mkdir()
-    # The box that ends each is one that players skip.
-    good = {f"P{i:03}/1/walk.mp4": before.read_bytes() + b"\0\0\0\x0cfree%04d" % i for i in range(30)}
+    good = {f"P{i:03}/1/walk.mp4": numbered(before.read_bytes(), i) for i in range(30)}
     for name, content in good.items():
         (drop / name).parent.mkdir(parents=True)
         (drop / name).write_bytes(content)

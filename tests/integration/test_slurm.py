@@ -21,6 +21,7 @@ from schemas.operations.orphans import orphans
 from schemas.reading.status import queue_counts
 from tests import slurm
 from tests.rows import register
+from tests.videos import numbered
 
 from . import chain
 
@@ -65,7 +66,7 @@ def videos(folder: Path, n: int) -> Iterator[Path]:
     film = chain.small_video(folder, "film", FRAMES).read_bytes()
     for i in range(n):
         path = folder / f"walk{i}.mp4"
-        path.write_bytes(film + (16).to_bytes(4) + b"free" + i.to_bytes(8))
+        path.write_bytes(numbered(film, i))
         yield path
 
 

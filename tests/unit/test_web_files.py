@@ -10,7 +10,7 @@ import string
 from pathlib import Path
 
 from pbl_pipeline import words
-from pbl_pipeline.gait import CADENCE
+from pbl_pipeline.qc import CADENCE
 from workers.web import texts
 
 WEB = Path(texts.__file__).parent
