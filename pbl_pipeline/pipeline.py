@@ -30,7 +30,7 @@ from pbl_pipeline.resources import cores, shared_cores
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
-from pbl_pipeline.video import PhoneLog, attitude_of, find_camera, probe, read_phone_log, sha256_of
+from pbl_pipeline.video import PhoneLog, attitude_of, find_camera, frames_kept, probe, read_phone_log, sha256_of
 from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit, save_visit
 
 
@@ -146,6 +146,7 @@ def detection_processes(n: int) -> Iterator[ProcessPoolExecutor]:
         yield pool
 
 
+@frames_kept()
 def _detected(one: _Input) -> tuple[Recording, PblError | None]:
     """Keypoints of a video, checked, or the error that leaves it out."""
     video = choice = None

@@ -43,12 +43,12 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC", "OPENCV_FOR_THRE
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
-def cores() -> int:
-    """Number of cores that this process may use, 1 at least: what `PBL_CORES` states, at most those that the process is
-    bound to and the quota of its control group."""
+def cores(stated: bool = True) -> int:
+    """Number of cores that this process may use, 1 at least: those that it is bound to, at most the quota of its
+    control group and, where `stated`, what `PBL_CORES` says."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    stated = os.environ.get(CORES, "")
-    limits = [bound, *_quotas(), *([int(stated)] if stated.isdecimal() else [])]
+    own = os.environ.get(CORES, "") if stated else ""
+    limits = [bound, *_quotas(), *([int(own)] if own.isdecimal() else [])]
     return max(1, int(min(limits)))
 
 
@@ -57,6 +57,11 @@ def memory_bytes() -> int:
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 1 << 32
     texts = [*_values("memory.max"), *_values("memory/memory.limit_in_bytes", "memory")]
     return min([whole, *(int(text) for text in texts if text.isdecimal())])
+
+
+def share_of_memory() -> float:
+    """Memory (bytes) of this process, where each core's share is equal."""
+    return memory_bytes() * cores() / max(cores(stated=False), 1)
 
 
 def divide_cores(processes: int) -> None:

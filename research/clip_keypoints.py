@@ -7,9 +7,10 @@ from pathlib import Path
 from pbl_pipeline.keypoints import KeypointParams, Keypoints, detect_keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.tracking import choose_subject, require_subject, track_people
-from pbl_pipeline.video import find_camera, probe
+from pbl_pipeline.video import find_camera, frames_kept, probe
 
 
+@frames_kept()
 def clip_keypoints(video: Path, sheet: Path, keypoints: Method[KeypointParams] | None = None) -> Keypoints:
     """Return the keypoints of a clip's subject; `keypoints`: the method, None the default.
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Protocol
 
+from pbl_pipeline.video import release_frames
 from schemas import tables_version
 from schemas.jobs import jobs_of
 from schemas.reading.visit_progress import Scope
@@ -117,6 +118,7 @@ class Worker:
     _taken: Counter[str] = dataclasses.field(default_factory=Counter)
     _refreshed: float = -1e9
     _everything: bool | None = None
+    _in_hand: int | None = None  # video_id of the recording that was read last
 
     def run(self, once: bool = False, max_jobs: int | None = None) -> None:
         """Work until `stop`; with `once` until nothing is left to do anywhere."""
@@ -144,6 +146,7 @@ class Worker:
                 continue
             if once and found is not None:
                 return
+            self._let_go()
             self.heartbeat.doing("idle")
             # Not all at the same moment: workers that were started together would go on asking together.
             self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
@@ -159,17 +162,25 @@ class Worker:
             if urgent is not None:
                 ranked.append((urgent, -position, table))
         # What is near its end first: a session that is nearly done should not wait for all others to begin.
-        for _, _, table in sorted(ranked, key=lambda r: r[:2]):
+        for urgent, _, table in sorted(ranked, key=lambda r: r[:2]):
             stage = registry.stage_of(table)
             n = self.batch if stage.resource == registry.FIT else stage.batch
             if self.limit is not None:
                 n = min(n, self.limit - self._taken[table.__name__])
-            jobs = queue.claim(table, n, conditions[table]) if n > 0 else []
+            jobs = self._claim(table, n, urgent, conditions[table]) if n > 0 else []
             if jobs:
                 self._taken[table.__name__] += len(jobs)
                 self._do(jobs, conditions[table])
                 return len(jobs)
         return 0
+
+    def _claim(self, table: Any, n: int, urgent: int, where: str | None) -> list[Claim]:
+        """Reserve jobs: of the recording in hand, whose pictures are in memory, where no other is more urgent."""
+        if self._in_hand is not None and "video_id" in jobs_of(table).primary_key:
+            own = f"priority={urgent} AND video_id={self._in_hand}" + (f" AND {where}" if where else "")
+            if jobs := queue.claim(table, n, own):
+                return jobs
+        return queue.claim(table, n, where)
 
     def _conditions(self) -> dict[Any, str | None]:
         """The tables of which jobs may be taken, and the condition on their keys."""
@@ -202,6 +213,10 @@ class Worker:
             raise
         self.report(job, outcome)
         good = outcome.what in (run_job.DONE, run_job.ALREADY)
+        if job.table.__name__ == "VideoInfo":
+            self._in_hand = int(job.key["video_id"])
+        elif job.table.__name__ == "Keypoints":
+            self._let_go()
         self.done += good
         self.failed += outcome.what == run_job.FAILED
         self.heartbeat.count(job.table.__name__, int(good), int(outcome.what == run_job.FAILED), outcome.seconds)
@@ -212,6 +227,10 @@ class Worker:
         if outcome.what == run_job.LATER:
             self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
         return outcome
+
+    def _let_go(self) -> None:
+        self._in_hand = None
+        release_frames()
 
     def follow(self, outcomes: Sequence[Outcome]) -> None:
         """Queue what the jobs made computable."""

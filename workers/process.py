@@ -15,6 +15,7 @@ from typing import Any
 
 from pbl_pipeline import temporary
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.video import frames_kept
 
 from . import registry, run_job
 from .log import event, to_stderr
@@ -124,7 +125,8 @@ def work(options: Options, pipe: Connection) -> None:
         worker = loop.Worker(tables, beats, stop, report, options.batch, short=options.short)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
-            worker.run(once=options.once, max_jobs=options.max_jobs)
+            with frames_kept():
+                worker.run(once=options.once, max_jobs=options.max_jobs)
         finally:
             event(log, logging.INFO, "worker ended", done=worker.done, failed=worker.failed)
 

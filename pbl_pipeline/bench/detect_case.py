@@ -44,19 +44,20 @@ def measure(video: Path, person: int | None, repeat: int, keypoints: str | None)
 def _run(video: Path, person: int | None, keypoints: str | None) -> dict[str, Any]:
     from pbl_pipeline.keypoints import detect_keypoints
     from pbl_pipeline.tracking import choose_subject, time_in_view_s, track_people
-    from pbl_pipeline.video import guess_camera, probe
+    from pbl_pipeline.video import frames_kept, guess_camera, probe
 
     stages: dict[str, dict[str, Any]] = {}
-    info = _timed(stages, "decode", lambda: probe(video))
-    tracking = _timed(stages, "tracking", lambda: track_people(video, info=info))
-    subject = choose_subject(tracking, override=person).person_id
-    if subject is None and tracking.persons:  # without a clear subject: the person in view for longest
-        subject = max(tracking.persons, key=lambda p: time_in_view_s(p, tracking.time_s)).person_id
-    # No person: ID 0 is unknown, and the error says so.
-    camera = guess_camera(info)
-    found = _timed(
-        stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, camera, params=keypoints)
-    )
+    with frames_kept():
+        info = _timed(stages, "decode", lambda: probe(video))
+        tracking = _timed(stages, "tracking", lambda: track_people(video, info=info))
+        subject = choose_subject(tracking, override=person).person_id
+        if subject is None and tracking.persons:  # without a clear subject: the person in view for longest
+            subject = max(tracking.persons, key=lambda p: time_in_view_s(p, tracking.time_s)).person_id
+        # No person: ID 0 is unknown, and the error says so.
+        camera = guess_camera(info)
+        found = _timed(
+            stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, camera, params=keypoints)
+        )
     return {
         "frames": info.n_frames,
         "frames_in_view": int((found.confidence.max(axis=1) > 0).sum()),

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import queue
 import selectors
 import sys
 import threading
@@ -24,16 +23,17 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from .network import NetworkSpec, read_network
-from .tflite import LiteModel
+from .network import NetworkSpec
+from .tflite import LiteModel, read_network
 
 #: Pictures of one call of a network, and the smallest that is tried where the GPU's memory does not suffice.
-BATCH, LEAST_BATCH = 32, 4
+BATCH, LEAST_BATCH = 16, 4
 #: The process ends when no one has been connected for so long (s).
 IDLE_S = 60.0
 #: Largest difference to LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
-_POLL_S = 0.001
+#: Networks that use the device at a time.
+_AT_ONCE = 2
 
 
 class Program:
@@ -52,7 +52,7 @@ class Program:
 
         from .tflite_jax import read_model
 
-        model = read_model(read_network(spec))
+        model = read_model(read_network(spec.path, spec.sha256, spec.outputs))
         device = jax.devices()[0]
         if device.platform != "gpu" and not any_device:
             raise RuntimeError(f"JAX finds no GPU, only {device.device_kind}")
@@ -99,13 +99,17 @@ class Program:
 
 
 class _Served:
-    """A network and the connections that show it pictures."""
+    """A network and the connections that show it pictures.
 
-    def __init__(self, program: Program) -> None:
-        self._program = program
+    `device`: networks compute in turn, so that pictures gather for one while others compute; two at a time, so that the
+    pictures and results of one are copied while another computes.
+    """
+
+    def __init__(self, program: Program, device: threading.Semaphore) -> None:
+        self._program, self._device = program, device
         self._selector = selectors.DefaultSelector()
-        self._filled: queue.Queue[tuple[np.ndarray, list[Connection]]] = queue.Queue(1)
-        self._idle = threading.Event()
+        self._changed = threading.Condition()
+        self._images, self._owners = self._empty(), list[Connection]()
         self.n_connections = 0
         for work in (self._collect, self._compute):
             threading.Thread(target=work, daemon=True).start()
@@ -119,22 +123,24 @@ class _Served:
         for connection in [key.data for key in self._selector.get_map().values()]:
             self._drop(connection)
 
+    def _empty(self) -> np.ndarray:
+        return np.zeros((self._program.batch, *self._program.image_shape), np.uint8)
+
     def _collect(self) -> None:
-        """Fill batches with what waits; hand one on when it is full, or when the device is idle."""
+        """Receive pictures into the batch that is computed next."""
+        image = np.empty(self._program.image_shape, np.uint8)
         while True:
-            size = self._program.batch
-            images, owners = np.empty((size, *self._program.image_shape), np.uint8), []
-            while len(owners) < size:
-                ready = self._selector.select(0.0 if owners and self._idle.is_set() else _POLL_S if owners else 1.0)
-                if not ready and owners and self._idle.is_set():
-                    break
-                for key, _ in ready[: size - len(owners)]:
-                    try:
-                        key.data.recv_bytes_into(images[len(owners)].reshape(-1))
-                        owners.append(key.data)
-                    except (EOFError, OSError):
-                        self._drop(key.data)
-            self._filled.put((images, owners))
+            for key, _ in self._selector.select(1.0):
+                try:
+                    key.data.recv_bytes_into(image.reshape(-1))
+                except (EOFError, OSError):
+                    self._drop(key.data)
+                    continue
+                with self._changed:
+                    self._changed.wait_for(lambda: len(self._owners) < len(self._images))
+                    self._images[len(self._owners)] = image
+                    self._owners.append(key.data)
+                    self._changed.notify()
 
     def _drop(self, connection: Connection) -> None:
         try:
@@ -146,16 +152,20 @@ class _Served:
 
     def _compute(self) -> None:
         while True:
-            self._idle.set()
-            images, owners = self._filled.get()
-            self._idle.clear()
-            try:
-                found = self._program(images[: len(owners)])
-            except RuntimeError as error:  # the GPU went away: who is connected lets LiteRT compute
-                sys.stderr.write(f"the GPU does not compute: {error}\n")
-                sys.stderr.flush()
-                os._exit(1)
-            for owner, outputs in zip(owners, found, strict=True):
+            with self._changed:
+                self._changed.wait_for(lambda: self._owners)
+            with self._device:
+                with self._changed:  # what came while others computed, too
+                    images, owners = self._images, self._owners
+                    self._images, self._owners = self._empty(), []
+                    self._changed.notify()
+                try:
+                    found = self._program(images)
+                except RuntimeError as error:  # the GPU went away: who is connected lets LiteRT compute
+                    sys.stderr.write(f"the GPU does not compute: {error}\n")
+                    sys.stderr.flush()
+                    os._exit(1)
+            for owner, outputs in zip(owners, found, strict=False):
                 try:
                     owner.send_bytes(outputs.tobytes())
                 except (OSError, ValueError):
@@ -170,6 +180,7 @@ class Server:
         self._any_device, self._idle_s, self._batch = any_device, idle_s, batch
         self._served: dict[NetworkSpec, _Served] = {}
         self._locks: dict[NetworkSpec, threading.Lock] = {}
+        self._device = threading.Semaphore(_AT_ONCE)
         self._opening = 0
         # Programs of several networks compile side by side.
         self._openers = ThreadPoolExecutor(16)
@@ -199,7 +210,7 @@ class Server:
             try:
                 with self._locks.setdefault(spec, threading.Lock()):
                     if spec not in self._served:
-                        self._served[spec] = _Served(Program(spec, self._any_device, self._batch))
+                        self._served[spec] = _Served(Program(spec, self._any_device, self._batch), self._device)
             except Exception as error:  # noqa: BLE001 - whoever asked lets LiteRT compute and says why
                 lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
                 connection.send_bytes(json.dumps({"error": lines[0] if lines else type(error).__name__}).encode())

@@ -9,7 +9,6 @@ and does not compute. Where none is, LiteRT computes whatever was asked for: "cu
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import threading
 from collections import deque
@@ -20,8 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from pbl_pipeline.errors import PblError
 
 from . import gpu_address
 from .devices import asked_device, unavailable
@@ -160,20 +157,3 @@ class _Remote:
                 self._broken = gone
                 while self._waiting:
                     self._waiting.popleft().set_exception(gone)
-
-
-def read_network(spec: NetworkSpec) -> bytes:
-    """Return the bytes of the network's file with the wanted outputs. Raises `PblError` ASSET_CHECKSUM."""
-    from .tflite import keep_outputs
-
-    content = Path(spec.path).read_bytes()
-    found = hashlib.sha256(content).hexdigest()
-    if found != spec.sha256:
-        raise PblError(
-            "ASSET_CHECKSUM",
-            found=f"SHA-256 {found}",
-            expected=f"SHA-256 {spec.sha256}",
-            next_step="delete the file and run the command again so that it is fetched anew",
-            key=spec.path,
-        )
-    return content if spec.outputs is None else keep_outputs(content, spec.outputs)

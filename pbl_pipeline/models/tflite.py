@@ -10,6 +10,7 @@ same order, bit for bit.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import tempfile
@@ -61,6 +62,27 @@ def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
     return bytes(builder.Output())
 
 
+def read_network(path: str | Path, sha256: str, outputs: Collection[int] | None = None) -> bytes:
+    """Return the bytes of a network's file with the wanted outputs, None: all of them; those of the last networks stay
+    in memory. Raises `PblError` ASSET_CHECKSUM: the file is not the one of that hash."""
+    return _read_network(path, Path(path).stat().st_mtime_ns, sha256, None if outputs is None else tuple(outputs))
+
+
+@functools.lru_cache(maxsize=4)
+def _read_network(path: str | Path, _changed_ns: int, sha256: str, outputs: tuple[int, ...] | None) -> bytes:
+    content = Path(path).read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256:
+        raise PblError(
+            "ASSET_CHECKSUM",
+            found=f"SHA-256 {found}",
+            expected=f"SHA-256 {sha256}",
+            next_step="delete the file and run the command again so that it is fetched anew",
+            key=path,
+        )
+    return content if outputs is None else keep_outputs(content, outputs)
+
+
 _STDERR = 2
 _lock = threading.Lock()
 _done: set[bytes] = set()
@@ -108,22 +130,11 @@ class LiteModel:
         outputs: Collection[int] | None = None,
         num_threads: int = NUM_THREADS,
     ) -> None:
-        content = Path(path).read_bytes()
-        found = hashlib.sha256(content).hexdigest()
-        if found != sha256:
-            raise PblError(
-                "ASSET_CHECKSUM",
-                found=f"SHA-256 {found}",
-                expected=f"SHA-256 {sha256}",
-                next_step="delete the file and run the command again so that it is fetched anew",
-                key=path,
-            )
-        self.sha256 = found
+        content = read_network(path, sha256, outputs)
+        self.sha256 = sha256
         # Here and not above: whoever only fits or reads results does not wait for the runtime.
         from ai_edge_litert.interpreter import Interpreter
 
-        if outputs is not None:
-            content = keep_outputs(content, outputs)
         with without_notice(b"XNNPACK delegate"):
             self._interpreter = Interpreter(model_content=content, num_threads=min(num_threads, cores()))
             self._interpreter.allocate_tensors()

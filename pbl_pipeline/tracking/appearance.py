@@ -12,6 +12,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from pbl_pipeline.video import Frame
+
+from .tiling import size_of
+from .types import Scene
+
 #: Patches along the body axis in radii of the region of interest, from the middle of the hips: (from, to, half width),
 #: up positive.
 _PATCHES = ((0.06, 0.46, 0.14), (-0.62, -0.10, 0.16))
@@ -23,14 +28,14 @@ _SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)
 _COLOUR_RANGE = (88.0, 168.0)
 
 
-def appearance_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.ndarray:
+def appearance_of(scene: Scene, state: np.ndarray, turn_rad: float) -> np.ndarray:
     """Look (2 * (6 + 64),) of the body whose circle has centre x, centre y (px) and log side `state`, turned by
-    `turn_rad` clockwise, in `image` (H, W, 3) uint8 BGR.
+    `turn_rad` clockwise.
 
     Two histograms a patch, of lightness and of colour, each of sum 1. NaN where the body lies outside the picture.
     """
     x, y, radius = float(state[0]), float(state[1]), 0.5 * float(np.exp(state[2]))
-    height, width = image.shape[:2]
+    width, height = size_of(scene)
     if not (0 <= x < width and 0 <= y < height):
         return np.full(_SIZE, np.nan)
     turn = turn_rad if np.isfinite(turn_rad) else 0.0
@@ -41,16 +46,23 @@ def appearance_of(image: np.ndarray, state: np.ndarray, turn_rad: float) -> np.n
         top = np.array([x, y]) - down * high * radius - right * half * radius
         step_x, step_y = right * 2 * half * radius / columns, down * (high - low) * radius / rows
         to_picture = np.column_stack([step_x, step_y, top + (step_x + step_y) / 2])
-        patch = cv2.warpAffine(
-            image,
-            to_picture,
-            _PATCH_SIZE,
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        lab = cv2.cvtColor(patch, cv2.COLOR_BGR2Lab).reshape(-1, 3).astype(np.float64)
+        lab = cv2.cvtColor(_patch(scene, to_picture), cv2.COLOR_BGR2Lab).reshape(-1, 3).astype(np.float64)
+        if not len(lab):
+            return np.full(_SIZE, np.nan)
         parts += [_light(lab[:, 0]), _colour(lab[:, 1:])]
     return np.concatenate(parts)
+
+
+def _patch(scene: Scene, to_picture: np.ndarray) -> np.ndarray:
+    """Pixels (1, N, 3) of a patch: those in the picture, or all, those beyond it as at its edge."""
+    if not isinstance(scene, Frame):
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        all_of_it = cv2.warpAffine(scene, to_picture, _PATCH_SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return all_of_it.reshape(1, -1, 3)
+    row, column = np.indices(_PATCH_SIZE[::-1]).reshape(2, -1)
+    at = to_picture @ np.stack([column, row, np.ones(len(row))])
+    inside = ((at >= 0) & (at <= np.array(scene.size_px)[:, None] - 1)).all(axis=0)
+    return scene.cut(to_picture, _PATCH_SIZE).reshape(1, -1, 3)[:, inside]
 
 
 def appearance_similarity(a: np.ndarray, b: np.ndarray) -> float:

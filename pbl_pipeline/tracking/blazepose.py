@@ -54,7 +54,10 @@ class BlazePoseDetector:
 
     name = "blazepose"
 
-    def __init__(self, model_path: str | Path, min_score: float = 0.5, min_iou: float = 0.3) -> None:
+    def __init__(
+        self, model_path: str | Path, min_score: float = 0.5, min_iou: float = 0.3, cut_windows: bool = False
+    ) -> None:
+        self.window_px = LAYOUT.input_size if cut_windows else 0
         self._model = SsdModel(model_path, MODEL_SHA256, LAYOUT, min_score, min_iou)
         self.model_sha256 = self._model.sha256
 
@@ -70,4 +73,4 @@ class BlazePoseDetector:
 
 def blazepose(params: TrackingParams) -> BlazePoseDetector:
     """The detector of the method. Raises the `PblError`s of `assets.fetch`."""
-    return BlazePoseDetector(assets.fetch("blazepose_detector"), params.min_score)
+    return BlazePoseDetector(assets.fetch("blazepose_detector"), params.min_score, cut_windows=params.cut_windows)

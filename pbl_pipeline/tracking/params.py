@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from pbl_pipeline.paramset import later
+
 from .associate import AssociationParams
 from .detection_schedule import WatchParams
 from .identity_swaps import UncrossParams
@@ -23,6 +25,8 @@ class TrackingParams:
     watch, association, uncross, join: see `WatchParams`, `AssociationParams`, `UncrossParams`, `JoinParams`. Gaps up to
     the association's `max_gap_s` are bridged (observed=False), after a longer one a new person begins, unless `join`
     finds that it is the same one; such a gap stays without boxes.
+    cut_windows: a detector is shown windows cut from the planes of the decoded picture, square also at its edge (black
+    beyond it); otherwise each is a part of the converted picture.
     min_hits: a person must be seen surely (`sure_score` of the association) this often, and over `min_track_s`, or
     the track is dropped as false.
     """
@@ -38,3 +42,4 @@ class TrackingParams:
     association: AssociationParams = dataclasses.field(default_factory=AssociationParams)
     uncross: UncrossParams = dataclasses.field(default_factory=UncrossParams)
     join: JoinParams = dataclasses.field(default_factory=JoinParams)
+    cut_windows: bool = later(False)

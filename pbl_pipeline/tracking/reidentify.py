@@ -17,7 +17,7 @@ from .associate import AssociationParams, Trail, measure, pair_cost
 from .detection_schedule import window_around
 from .identity_swaps import line_near
 from .tiling import detect_in
-from .types import PersonDetector
+from .types import PersonDetector, Scene
 
 #: A person may be missed in so many of the kept frames on the way back.
 MAX_MISSES = 1
@@ -25,22 +25,22 @@ MAX_MISSES = 1
 
 def backtrack(
     trail: Trail,
-    kept: Sequence[tuple[int, float, np.ndarray]],
+    kept: Sequence[tuple[int, float, Scene]],
     others: Sequence[Trail],
     detector: PersonDetector,
     window_sizes: float,
     params: AssociationParams,
 ) -> Trail:
-    """The trail with sightings put before it, from frames `kept` (index, time_s, image) in order of time.
+    """The trail with sightings put before it, from frames `kept` (index, time_s, picture) in order of time.
 
     Ends where the person is not found any more, or where it would become one of `others`, who were seen there.
     """
     back = Trail.of(trail.frames[0], -trail.times[0], trail.detections[0])
     misses = 0
-    for index, time_s, image in reversed(kept):
+    for index, time_s, scene in reversed(kept):
         if time_s >= trail.times[0]:
             continue
-        found = detect_in(detector, image, [window_around(back.predict(-time_s), window_sizes)])
+        found = detect_in(detector, scene, [window_around(back.predict(-time_s), window_sizes)])
         taken = [d for t in others for d in t.detections[_at(t, index)]]
         free = [d for d in found if not any(_same(d, o) for o in taken)]
         # As forwards: the gate widens with time, but not for detections that are not sure.
@@ -49,7 +49,7 @@ def backtrack(
         excess = [pair_cost(back, -time_s, d, params) - g for d, g in zip(free, gates, strict=True)]
         if excess and min(excess) <= 0:
             seen = free[int(np.argmin(excess))]
-            seen = dataclasses.replace(seen, appearance=appearance_of(image, measure(seen), seen.roi_px[3]))
+            seen = dataclasses.replace(seen, appearance=appearance_of(scene, measure(seen), seen.roi_px[3]))
             back.add(index, -time_s, seen, params.memory_s)
             misses = 0
             continue

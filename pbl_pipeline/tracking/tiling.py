@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from pbl_pipeline.models import box_iou
+from pbl_pipeline.video import Frame
 
-from .types import Detection, PersonDetector
+from .types import Detection, PersonDetector, Scene
 
 #: A box that ends within this fraction of the window's width from its edge is taken as cut by it.
 CUT_SHARE = 0.02
@@ -38,30 +40,56 @@ def tiles(width: int, height: int, fraction: float, overlap: float) -> list[Wind
 
 
 def detect_in(
-    detector: PersonDetector, image: np.ndarray, windows: Sequence[Window], passing: Sequence[Window] = ()
+    detector: PersonDetector, scene: Scene, windows: Sequence[Window], passing: Sequence[Window] = ()
 ) -> list[Detection]:
-    """Run the detector in each window (clipped to the image) and merge what it found, in pixels of `image`.
+    """Run the detector in each window and merge what it found, in pixels of the picture.
 
     `windows` are laid around people and see them in the right size; `passing` are laid anywhere, are trusted half as
     much, and so only confirm whom another window saw.
     """
-    height, width = image.shape[:2]
+    width, height = size_of(scene)
     found: list[tuple[float, Detection]] = []
     for window, weight in [*((w, 1.0) for w in windows), *((w, 0.5 if windows else 1.0) for w in passing)]:
         x0, y0, x1, y1 = max(window[0], 0), max(window[1], 0), min(window[2], width), min(window[3], height)
         if x1 - x0 < 16 or y1 - y0 < 16:
             continue
-        for d in detector.detect(image[y0:y1, x0:x1]):
-            box = d.box_px + np.array([x0, y0, x0, y0])
-            if not np.isfinite(d.roi_px).all() and _cut(box, (x0, y0, x1, y1), (width, height)):
+        for d in _seen(detector, scene, window, (x0, y0, x1, y1)):
+            box, roi = d.box_px, d.roi_px
+            if not np.isfinite(roi).all() and _cut(box, (x0, y0, x1, y1), (width, height)):
                 continue
-            roi = d.roi_px + np.array([x0, y0, 0, 0])
             whole = _area(np.clip(box, 0, [width, height, width, height]))
             inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
             # A person cut by the window's edge is measured worse than in the neighbouring window that holds her whole.
             trust = weight * d.score * (inside / whole if whole > 0 else 0.0)
             found.append((trust, Detection(box_px=box, score=d.score, roi_px=roi)))
     return merge(found)
+
+
+def size_of(scene: Scene) -> tuple[int, int]:
+    """Width and height of the picture."""
+    return scene.size_px if isinstance(scene, Frame) else (scene.shape[1], scene.shape[0])
+
+
+def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window) -> list[Detection]:
+    """What the detector finds in a window, of which `inside` lies in the picture, in pixels of the picture."""
+    x, y, right, bottom = inside
+    scale = 1.0
+    if isinstance(scene, Frame):
+        n, side = detector.window_px, max(window[2] - window[0], window[3] - window[1])
+        scale = side / n
+        # Of the first pixel's centre.
+        x, y = ((window[i] + window[i + 2] - side + scale - 1) / 2 for i in (0, 1))
+        shown = scene.cut(np.array([[scale, 0.0, x], [0.0, scale, y]]), (n, n))
+    else:
+        shown = scene[y:bottom, x:right]
+    return [
+        dataclasses.replace(
+            d,
+            box_px=d.box_px * scale + np.array([x, y, x, y]),
+            roi_px=d.roi_px * np.array([scale, scale, scale, 1.0]) + np.array([x, y, 0, 0]),
+        )
+        for d in detector.detect(shown)
+    ]
 
 
 def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover: float = 0.6) -> list[Detection]:

@@ -26,7 +26,7 @@ from .methods import METHODS
 from .params import TrackingParams
 from .reidentify import backtrack, join_trails
 from .tiling import detect_in
-from .types import Detection, PersonDetector, PersonTrack, Tracking
+from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking
 
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.
@@ -86,7 +86,7 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
     watch = Watch((info.width_px, info.height_px), params.watch, slack)
     # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
-    kept: deque[tuple[int, float, np.ndarray]] = deque(maxlen=watch.n_turn)
+    kept: deque[tuple[int, float, Scene]] = deque(maxlen=watch.n_turn)
     n_frames = 0
     frames = prefetched(read_frames(video_path), FRAMES_AHEAD)
     for frame in progress.track(frames, "people", total=info.n_frames):
@@ -97,17 +97,18 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
         elsewhere = watch.elsewhere(now, associator.live)
         if not (due or elsewhere):
             continue
-        found = detect_in(detector, frame.image, watch.around(now, due), elsewhere)
-        found = [_with_appearance(d, frame.image) for d in found]
+        scene = frame if detector.window_px else frame.image
+        found = detect_in(detector, scene, watch.around(now, due), elsewhere)
+        found = [_with_appearance(d, scene) for d in found]
         for new in associator.step(frame.index, now, found, due):
-            sure = _confirmed(new, detector, frame.image, now, associator.live, params)
+            sure = _confirmed(new, detector, scene, now, associator.live, params)
             if sure is not None:
                 trail = Trail.of(frame.index, now, sure)
                 sizes = params.watch.window_sizes
                 associator.begin(backtrack(trail, kept, associator.trails(), detector, sizes, params.association))
         watch.detected(now, due, associator.live)
         if elsewhere:
-            kept.append((frame.index, now, frame.image))
+            kept.append((frame.index, now, scene))
     if n_frames != info.n_frames:
         raise PblError(
             "VIDEO_CHANGED",
@@ -122,7 +123,7 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
 def _confirmed(
     new: Detection,
     detector: PersonDetector,
-    image: np.ndarray,
+    scene: Scene,
     time_s: float,
     live: Sequence[Trail],
     params: TrackingParams,
@@ -136,14 +137,14 @@ def _confirmed(
     if any(_near(measure(new), k) for k in known):
         return None
     window = window_around(measure(new), params.watch.window_sizes)
-    again = [d for d in detect_in(detector, image, [window]) if d.score >= params.association.sure_score]
+    again = [d for d in detect_in(detector, scene, [window]) if d.score >= params.association.sure_score]
     if not again:
         return None
     overlap = box_iou(new.box_px, np.array([d.box_px for d in again]))
     best = again[int(np.argmax(overlap))]
     if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
         return None
-    return _with_appearance(best, image)
+    return _with_appearance(best, scene)
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
@@ -152,8 +153,8 @@ def _near(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(apart < SAME_BODY)
 
 
-def _with_appearance(detection: Detection, image: np.ndarray) -> Detection:
-    return dataclasses.replace(detection, appearance=appearance_of(image, measure(detection), detection.roi_px[3]))
+def _with_appearance(detection: Detection, scene: Scene) -> Detection:
+    return dataclasses.replace(detection, appearance=appearance_of(scene, measure(detection), detection.roi_px[3]))
 
 
 def _is_real(trail: Trail, params: TrackingParams) -> bool:

@@ -7,6 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from pbl_pipeline.video import Frame
+
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
@@ -23,11 +25,19 @@ class Detection:
     appearance: np.ndarray | None = None
 
 
+#: A frame as tracking looks at it: regions of its planes, or the whole picture (H, W, 3) uint8 BGR.
+Scene = Frame | np.ndarray
+
+
 class PersonDetector(Protocol):
-    """Finds people in one upright BGR frame. Implementations hold a loaded model and are not shared by threads."""
+    """Finds people in one upright BGR frame. Implementations hold a loaded model and are not shared by threads.
+
+    window_px: side of the square that it is shown of a window of the frame; 0: the window's own pixels.
+    """
 
     name: str
     model_sha256: str
+    window_px: int
 
     def detect(self, image: np.ndarray) -> list[Detection]: ...
 

@@ -18,6 +18,7 @@ from .clock import attitude_of, load_attitude
 from .file_facts import check_timing, packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
 from .frames import read_frames
 from .h264 import write_h264
+from .kept import frames_kept, release_frames
 from .lens_calibration import (
     LensCalibration,
     PhoneLens,

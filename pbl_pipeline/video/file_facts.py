@@ -29,6 +29,7 @@ from pbl_pipeline.qc import FAIL, PASS, Check
 from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
 from .frames import Orientation, orientation_of
+from .kept import keeping
 from .types import FirstPicture, VideoInfo
 
 #: A recorded rate that lies above the stored one by less than this fraction is rounding or a dropped frame.
@@ -175,7 +176,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     turn, pixel_format, width, height = Orientation(), "", 0, 0
     with Decoder(path, threads, exact=True) as decoder:
         stream, container = decoder.stream, decoder.container
-        for pts, frame in progress.track(decoder, "reading video", total=decoder.n_announced or None):
+        for pts, frame in progress.track(keeping(decoder), "reading video", total=decoder.n_announced or None):
             if not stamps:
                 turn = orientation_of(frame)
                 pixel_format = frame.format.name

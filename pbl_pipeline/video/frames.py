@@ -8,6 +8,7 @@ the same region for a tenth of the work.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import threading
@@ -20,6 +21,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from .decode import Decoder, check_file
+from .kept import kept
 from .types import Frame, coarser, cut_samples, square
 
 
@@ -155,7 +157,8 @@ def read_frames(
     Frame `index` has `time_s` equal to `probe(path).time_s[index]`, whatever `start` is. Decoding begins at the start
     of the file (frames count from there) and ends after the last frame asked for; only the frames asked for are
     converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in whichever thread does so. At most
-    a few frames are in memory beside those that the caller keeps.
+    a few frames are in memory beside those that the caller keeps, and those of `kept.frames_kept`, which are not
+    decoded again.
 
     Raises
     ------
@@ -190,16 +193,22 @@ class _ToBgr:
 def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | None) -> Iterator[Frame]:
     if stop is not None and stop <= start:
         return
-    with Decoder(path, threads) as decoder:
+    with contextlib.ExitStack() as stack:
+        pictures = kept(path)
+        if pictures is None:
+            decoder = stack.enter_context(Decoder(path, threads))
+            time_base, stamped = decoder.time_base, iter(decoder)
+        else:
+            time_base, stamped = pictures.time_base, iter(pictures.stamped)
         to_bgr = _ToBgr()
         turn, first_pts, last = Orientation(), 0, None if stop is None else range(start, stop, step)[-1]
-        for index, (pts, frame) in enumerate(decoder):
+        for index, (pts, frame) in enumerate(stamped):
             if index == 0:
                 turn, first_pts = orientation_of(frame), pts
             if index >= start and (index - start) % step == 0:
                 # Same arithmetic as probe, so that the stamps are equal to the last bit.
-                time_s = float(np.int64(pts - first_pts) * float(decoder.time_base))
-                whole = functools.partial(to_bgr, frame, turn)
-                yield Frame(index, time_s, whole, functools.partial(cut_planes, frame, turn))
+                time_s = float(np.int64(pts - first_pts) * float(time_base))
+                whole, part = functools.partial(to_bgr, frame, turn), functools.partial(cut_planes, frame, turn)
+                yield Frame(index, time_s, whole, part, turn.size(frame.width, frame.height))
             if last is not None and index >= last:
                 return

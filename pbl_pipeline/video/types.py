@@ -140,8 +140,10 @@ class Frame:
         time_s: float,
         convert: Callable[[], np.ndarray],
         cut: Callable[[np.ndarray, tuple[int, int]], np.ndarray | None] | None = None,
+        size_px: tuple[int, int] | None = None,
     ) -> None:
         self.index, self.time_s = index, time_s
+        self._size = size_px
         self._convert: Callable[[], np.ndarray] | None = convert
         self._cut = cut
 
@@ -151,6 +153,11 @@ class Frame:
         image = self._convert()
         self._convert = self._cut = None  # lets go of the decoder's own picture
         return image
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the upright picture."""
+        return self._size or (self.image.shape[1], self.image.shape[0])
 
     def cut(self, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """A region of the upright picture, (height, width, 3) uint8 BGR for `size_px` = (width, height).

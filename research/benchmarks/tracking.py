@@ -30,7 +30,7 @@ from pbl_pipeline.keypoints import BlazePoseLandmarks
 from pbl_pipeline.keypoints.crops import smooth_rois
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
-    BlazePoseDetector,
+    METHODS,
     Detection,
     PersonTrack,
     Tracking,
@@ -40,21 +40,25 @@ from pbl_pipeline.tracking import (
     track_people,
 )
 from pbl_pipeline.tracking import track as tracks
+from pbl_pipeline.tracking.blazepose import blazepose
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 from research.benchmarks.longer_video import repeated
 from research.paths import SHARED
 
 REAL = SHARED / "real"
 SMOOTH_S = 0.1
+USUAL = METHODS.find().params
 WAYS = {
-    "watch": TrackingParams(),
-    "often": TrackingParams(
+    "watch": USUAL,
+    "often": dataclasses.replace(
+        USUAL,
         watch=WatchParams(follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0),
     ),
-    "throughout": TrackingParams(
+    "throughout": dataclasses.replace(
+        USUAL,
         watch=WatchParams(
             follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0, search_interval_s=0.0, search_windows=99
-        )
+        ),
     ),
 }
 
@@ -63,8 +67,9 @@ class Counted:
     """The embedded detector, counting its calls."""
 
     def __init__(self) -> None:
-        self._detector = BlazePoseDetector(assets.fetch("blazepose_detector"), TrackingParams().min_score)
+        self._detector = blazepose(USUAL)
         self.name, self.model_sha256, self.calls = self._detector.name, self._detector.model_sha256, 0
+        self.window_px = self._detector.window_px
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         self.calls += 1

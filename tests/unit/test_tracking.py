@@ -80,7 +80,7 @@ def test_tiles_cover_the_frame_and_overlap(width, height, overlap):
 class Spots:
     """A detector that finds square spots: a spot of brightness 200 + n is a person n tens of px high."""
 
-    name, model_sha256 = "spots", "0" * 64
+    name, model_sha256, window_px = "spots", "0" * 64, 0
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         found = []
@@ -289,7 +289,7 @@ def test_unknown_detector_is_refused(spots_video):
 
 def test_paramset_names_the_model():
     method = METHODS["blazepose-tiles"]
-    assert (method.stage, method.version) == ("tracking", 2)
+    assert (method.stage, method.version) == ("tracking", 3)
     assert method.params.model_sha256 == TrackingParams().model_sha256
     assert len(method.hash) == 16
 

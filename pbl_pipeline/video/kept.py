@@ -1,0 +1,87 @@
+"""The decoded pictures of one video in memory, so that probe, tracking and keypoints share one decoding.
+
+Decoding costs as much as all that the three do beside the networks. Pictures are kept where `frames_kept` asks for it,
+and where those of the whole video fit into this process's share of the memory; longer videos are decoded each time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+
+import av
+
+from pbl_pipeline.resources import share_of_memory
+
+from .decode import Decoder
+
+#: Of the process's share of the memory, so much at most are pictures.
+_FRACTION = 1 / 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """The pictures of a video that was read to its end without an error, each with its stamp."""
+
+    file: tuple[object, ...]
+    time_base: Fraction
+    stamped: list[tuple[int, av.VideoFrame]]
+
+
+class _Shelf:
+    """What this process keeps: the last video that was read whole."""
+
+    def __init__(self) -> None:
+        self.wanted = 0
+        self.pictures: Pictures | None = None
+
+
+_shelf = _Shelf()
+
+
+@contextlib.contextmanager
+def frames_kept() -> Iterator[None]:
+    """Keep the pictures of the last video that `probe` read in this block, for `read_frames` of the same file."""
+    _shelf.wanted += 1
+    try:
+        yield
+    finally:
+        _shelf.wanted -= 1
+        if not _shelf.wanted:
+            release_frames()
+
+
+def release_frames() -> None:
+    """Give the memory back; what is kept will not be read again."""
+    _shelf.pictures = None
+
+
+def kept(path: Path) -> Pictures | None:
+    """Return the pictures of a file, if they are kept and the file is still the same."""
+    pictures = _shelf.pictures
+    return pictures if pictures is not None and pictures.file == _identity(path) else None
+
+
+def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Hand on what a decoder yields, and keep it where that is wanted and the end is reached."""
+    release_frames()
+    room = share_of_memory() * _FRACTION if _shelf.wanted else 0.0
+    file, stamped = _identity(decoder.path), []
+    for pts, frame in decoder:
+        # A picture that is decoded for others to be drawn from has its own memory, whoever else has it too.
+        room -= sum(plane.buffer_size for plane in frame.planes)
+        if room >= 0:
+            stamped.append((pts, frame))
+        else:
+            stamped.clear()
+        yield pts, frame
+    if room >= 0:
+        _shelf.pictures = Pictures(file, decoder.time_base, stamped)
+
+
+def _identity(path: Path) -> tuple[object, ...]:
+    state = path.stat()
+    return path.resolve(), state.st_ino, state.st_size, state.st_mtime_ns
