@@ -138,7 +138,7 @@ class MeasurementModel:
         return self if passes == 1 or self.jointly is None else self.jointly
 
 
-#: What differs between passes that are fitted alone and together.
+#: Fields whose values differ between passes fitted alone and passes fitted together.
 TERMS = ("person", "visit", "views", "widening")
 
 
