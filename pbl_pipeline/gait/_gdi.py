@@ -229,7 +229,7 @@ def score_gdi(
     if enough:
         if (model_of_error := _model_of_error(usable, basis, params)) is not None:
             passes = _passes(usable, vectors, basis)
-            expected = expected_index(estimate(model_of_error, passes), basis, model_of_error.widening)
+            expected = expected_index(estimate(model_of_error, passes), basis, model_of_error.of(len(passes)).widening)
             left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
             minimal_change = minimal_change_of(expected.sd_anew)
         else:

@@ -2,13 +2,14 @@
 
 A pass p in view v shows the scores y of a person's mean curves, of both sides in the components of a normative set:
 
-    y_p = m + b_v + G_v (s - m) + person + view + pass_p
+    y_p = m + b_v + G_v (s - m) + person + visit + view + pass_p
 
 s are the true scores, m their mean over people; b_v and G_v what detector and fit make of them (a prior draws postures
-together, so G is not 1); `person` is the same in all passes of a person, `view` in all of one view, `pass_p` is drawn
-anew. All terms are normal; their covariances are variance components of walks whose truth is known, on persons who are
-not held out (`research.corpus.measurement`; docs/measures.md). Of several passes, s is estimated at once: the mean and
-covariance of a normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, eq. A.6).
+together, so G is not 1); `person` is the same in all passes of a person, `visit` in all that are fitted together, with
+one body, `view` in all of one view, `pass_p` is drawn anew. All terms are normal; their covariances are variance
+components of walks whose truth is known, on persons who are not held out (`research.corpus.measurement`;
+docs/measures.md). Of several passes, s is estimated at once: the mean and covariance of a normal posterior (Rasmussen &
+Williams 2006, Gaussian Processes for Machine Learning, eq. A.6).
 """
 
 from __future__ import annotations
@@ -119,6 +120,7 @@ class MeasurementModel:
     mean: np.ndarray
     spread: np.ndarray
     person: np.ndarray  # covariance (2K, 2K) of the error that all passes of a person share
+    visit: np.ndarray  # and of the one that passes fitted together share
     #: By `GaitCycle.far_leg`: "left", "right", or "" where neither leg is behind the other (front, back).
     views: dict[str, View]
     #: Covariance (K, K) of a cycle's scores about the mean of its side, and how many cycles of a side the passes had.
@@ -129,6 +131,15 @@ class MeasurementModel:
     pass_cycles: float  # cycles of both sides of one pass, of which the gait measures are means
     #: Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
     measures: Mapping[str, Mapping[str, MeasureError]]
+    jointly: MeasurementModel | None = None  # with `TERMS` of passes that were fitted together, if they were measured
+
+    def of(self, passes: int) -> MeasurementModel:
+        """Return the model for a visit of so many passes, which are fitted together."""
+        return self if passes == 1 or self.jointly is None else self.jointly
+
+
+#: Fields whose values differ between passes fitted alone and passes fitted together.
+TERMS = ("person", "visit", "views", "widening")
 
 
 class Posterior(NamedTuple):
@@ -161,11 +172,20 @@ def load_model(name: str) -> MeasurementModel:
     """Return a model that ships, by its name."""
     data: dict[str, Any] = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
     del data["made_by"]
-    views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
-    views[RIGHT] = views[LEFT].mirrored()
+    jointly = data.pop("jointly", None)
     errors = {k: {n: MeasureError(*e) for n, e in view.items()} for k, view in data.pop("measures").items()}
-    arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "cycle")}
-    return MeasurementModel(**data, **arrays, views=views, measures=errors)
+    arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "cycle")}
+    terms = _terms({n: data.pop(n) for n in TERMS})
+    model = MeasurementModel(**data, **arrays, **terms, measures=errors)
+    return (
+        model if jointly is None else dataclasses.replace(model, jointly=dataclasses.replace(model, **_terms(jointly)))
+    )
+
+
+def _terms(data: dict[str, Any]) -> dict[str, Any]:
+    views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data["views"].items()}
+    views[RIGHT] = views[LEFT].mirrored()
+    return data | {"views": views, "person": np.array(data["person"]), "visit": np.array(data["visit"])}
 
 
 @functools.cache
@@ -176,12 +196,13 @@ def model_of_fit(params_hash: str) -> str:
 
 def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
     """Estimate the scores of a person from all passes of a visit together. At least one pass has cycles of a side."""
-    size = len(model.mean)
+    model, size = model.of(len(passes)), len(model.mean)
     views = [model.views[p.far_leg] for p in passes]
     scores = np.concatenate([np.concatenate(p.scores) for p in passes])
     gain = np.vstack([v.gain for v in views])
     expected = np.concatenate([model.mean + v.bias - v.gain @ model.mean for v in views])
     anew = _blocks(v.anew + _fewer_cycles(model, p) for v, p in zip(views, passes, strict=True))
+    anew += np.tile(model.visit, (len(passes), len(passes)))
     error = anew + np.tile(model.person, (len(passes), len(passes)))
     for far_leg, view in model.views.items():
         same = np.repeat([p.far_leg == far_leg for p in passes], size)
@@ -241,7 +262,7 @@ def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: Normati
     for far_leg in model.views:
         typical = Pass((unseen, unseen), (cycles, cycles), far_leg)
         then = now._replace(covariance=estimate(model, [*passes, typical]).covariance)
-        out[far_leg] = expected_index(then, norm, model.widening).sd
+        out[far_leg] = expected_index(then, norm, model.of(len(passes) + 1).widening).sd
     return out
 
 

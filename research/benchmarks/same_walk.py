@@ -134,7 +134,8 @@ def main(folder: Path, clips: Sequence[str], params: str) -> None:
             first = first or fit
             indices.append(index_of(fit))
             cells.append(f"{indices[-1]:8.1f} {angles_apart(first, fit, variant == 'mirrored'):4.1f} deg")
-        spread = float(np.std(indices, ddof=1)) if len(indices) > 1 else float("nan")
+        shown = [i for i in indices if np.isfinite(i)]  # an index that is withheld does not spread
+        spread = float(np.std(shown, ddof=1)) if len(shown) > 1 else float("nan")
         spreads.append(spread)
         click.echo(f"{name:10}" + "".join(f"{c:>16}" for c in cells) + f"{spread:7.2f}")
     known = [s for s in spreads if np.isfinite(s)]

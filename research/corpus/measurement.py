@@ -24,6 +24,7 @@ from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
     IMPORTANT_CHANGE,
+    TERMS,
     MeasureError,
     MeasurementModel,
     Pass,
@@ -35,7 +36,7 @@ from pbl_pipeline.gait.measurement import (
     measure_error,
 )
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
-from research.corpus.passes import ANGLES, STEP_DEG
+from research.corpus.passes import ANGLES, PASSES, SESSIONS, STEP_DEG
 from research.corpus.walks import HEALTHY
 
 #: The leg behind the other, by view of the corpus.
@@ -47,19 +48,10 @@ OTHER = {LEFT: RIGHT, RIGHT: LEFT, "": ""}
 RIDGE = 300.0
 #: Least variance (deg^2) of a pass' error in any direction.
 LEAST = 1.0
-#: Passes of one visit that make a session: how many of each view.
-SESSIONS: dict[str, dict[str, int]] = {
-    "left": {"sagittal": 1},
-    "right": {"sagittal_right": 1},
-    "front": {"frontal": 1},
-    "back": {"rear": 1},
-    "obliquely": {"oblique": 1},
-    "both sides": {"sagittal": 1, "sagittal_right": 1},
-    "both sides twice": {"sagittal": 2, "sagittal_right": 2},
-    "sides, front, back": {"sagittal": 1, "sagittal_right": 1, "frontal": 1, "rear": 1},
-}
 #: Groups of persons who are left out in turn.
 FOLDS = 5
+#: How a pass was fitted.
+ALONE, TOGETHER = "fitted alone", "fitted together"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,6 +65,7 @@ class Seen:
     severity: float
     view: str
     visit: int
+    session: tuple[str, int]  # that it was fitted in: kind (of `SESSIONS`) and number
     scores: np.ndarray
     true: np.ndarray
     n_cycles: tuple[int, int]
@@ -83,6 +76,11 @@ class Seen:
     @property
     def walk(self) -> tuple[str, str, float]:
         return self.person, self.condition, self.severity
+
+    @property
+    def alone(self) -> bool:
+        """Whether it was fitted alone."""
+        return sum(SESSIONS[self.session[0]].values()) == 1
 
     def mirrored(self) -> Seen:
         """The same pass of the mirrored person."""
@@ -99,14 +97,14 @@ class Seen:
         return Pass((self.scores[0], self.scores[1]), self.n_cycles, FAR_LEG[self.view])
 
 
-def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> list[Seen]:
-    """The passes of `passes-*.npz` that have cycles of both sides, with `events` "detected" or "known"."""
+def read_passes(folder: Path, norm: NormativeSet) -> list[Seen]:
+    """The passes of all `passes-*.npz` of a folder and those in it that have cycles of both sides."""
     out = []
-    for path in sorted(folder.glob("*.npz")):
+    for path in sorted(folder.rglob("*.npz")):
         with np.load(path, allow_pickle=False) as file:
             data = dict(file)
-        columns = zip(_scores(data, events, norm), _scores(data, "true", norm), strict=True)
-        angles = list(zip(_angles(data, events), _angles(data, "true"), strict=True))
+        columns = zip(_scores(data, "detected", norm), _scores(data, "true", norm), strict=True)
+        angles = list(zip(_angles(data, "detected"), _angles(data, "true"), strict=True))
         for i, (found, true) in enumerate(columns):
             if min(map(len, found)) == 0 or min(map(len, true)) == 0:
                 continue
@@ -120,6 +118,7 @@ def read_passes(folder: Path, norm: NormativeSet, events: str = "detected") -> l
                     float(data["severity"][i]),
                     str(data["view"][i]),
                     int(data["visit"][i]),
+                    (str(data["session"][i]), int(data["number"][i])),
                     np.array([side.mean(axis=0) for side in found]),
                     np.array([side.mean(axis=0) for side in true]),
                     (len(found[0]), len(found[1])),
@@ -155,7 +154,8 @@ def _angles(data: dict[str, np.ndarray], kind: str) -> Iterator[np.ndarray]:
 def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], widening: float = 1.0) -> MeasurementModel:
     """Bias and gain of each view by ridge regression of the error on the true scores, and the rest's variance
     components by the means of products of two passes of a walk: of different views `person`; of one view at two visits
-    `person` and `view`; of a pass with itself all. Mirrored passes count as well: left and right are alike."""
+    `person` and `view`; of different views in one fit `person` and `visit`; of a pass with itself all. Mirrored passes
+    count as well: left and right are alike. Of passes fitted alone `visit` is 0."""
     both = [*seen, *(s.mirrored() for s in seen)]
     true = np.array([s.true.ravel() for s in both])
     mean, spread = true.mean(axis=0), np.cov(true.T)
@@ -177,27 +177,35 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
     products: dict[tuple[str, str], list[np.ndarray]] = {}
     for group in by_walk.values():
         for (a, x), (b, y) in itertools.combinations(group, 2):
-            if a.view != b.view:
+            of_one_fit = (a.visit, a.session) == (b.visit, b.session)
+            if of_one_fit and a.view != b.view:
+                products.setdefault(("visit", ""), []).append(_symmetric(x, y))
+            elif a.visit == b.visit and not (a.alone and b.alone):
+                continue  # the same recordings are in several fits
+            elif a.view != b.view:
                 products.setdefault(("person", ""), []).append(_symmetric(x, y))
             elif a.visit != b.visit:
                 products.setdefault(("view", FAR_LEG[a.view]), []).append(_symmetric(x, y))
         for s, x in group:
             products.setdefault(("all", FAR_LEG[s.view]), []).append(np.outer(x, x))
     person = _positive(np.mean(products["person", ""], axis=0))
+    common = products.get(("visit", ""), [person])
+    visit = _positive(np.mean(common, axis=0) - person)
     views = {}
     for far_leg in ("", LEFT):
         bias, slope = terms[far_leg]
         view = _positive(np.mean(products["view", far_leg], axis=0) - person)
-        anew = _positive(np.mean(products["all", far_leg], axis=0) - person - view) + LEAST * np.eye(len(mean))
+        anew = _positive(np.mean(products["all", far_leg], axis=0) - person - visit - view) + LEAST * np.eye(len(mean))
         views[far_leg] = View(bias, np.eye(len(mean)) + slope, view, anew)
     freedom = sum(sum(s.n_cycles) - 2 for s in seen)
     return MeasurementModel(
-        "blazepose-33",
+        "",
         norm.name,
         tuple(fits),
         mean,
         spread,
         person,
+        visit,
         views | {RIGHT: views[LEFT].mirrored()},
         np.sum([s.within for s in seen], axis=0) / freedom,
         float(np.median([n for s in seen for n in s.n_cycles])),
@@ -248,23 +256,32 @@ def _positive(matrix: np.ndarray) -> np.ndarray:
 
 
 def sessions_of(seen: Iterable[Seen]) -> Iterator[tuple[str, int, list[Seen]]]:
-    """The sessions that passes of one visit make: kind, visit, passes."""
+    """Sessions of the passes of one visit: kind, visit, passes. Those that were fitted together, and all that passes
+    fitted alone make."""
     visits: dict[tuple, dict[str, list[Seen]]] = {}
+    together: dict[tuple, list[Seen]] = {}
     for s in seen:
-        visits.setdefault((s.walk, s.visit), {}).setdefault(s.view, []).append(s)
+        if s.alone:
+            visits.setdefault((s.walk, s.visit), {}).setdefault(s.view, []).append(s)
+        else:
+            together.setdefault((s.walk, s.visit, s.session), []).append(s)
     for (_, visit), views in visits.items():
         for kind, wanted in SESSIONS.items():
-            for first in range(2 if max(wanted.values()) == 1 else 1):
+            for first in range(PASSES + 1 - max(wanted.values())):
                 passes = [views.get(v, [])[first : first + n] for v, n in wanted.items()]
                 if all(len(p) == n for p, n in zip(passes, wanted.values(), strict=True)):
                     yield kind, visit, [s for p in passes for s in p]
+    for (_, visit, (kind, _)), passes in together.items():
+        if len(passes) == sum(SESSIONS[kind].values()):
+            yield kind, visit, passes
 
 
 def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) -> pd.DataFrame:
     """A row per session: whose, the true index, the found one with its errors, and that of the plain mean curves."""
     rows = []
     for kind, visit, passes in sessions_of(seen):
-        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, model.widening)
+        widening = model.of(len(passes)).widening
+        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, widening)
         plain, true = (np.mean([getattr(s, n) for s in passes], axis=0) for n in ("scores", "true"))
         first = passes[0]
         rows.append(
@@ -534,8 +551,13 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value
 
-    content = {f.name: plain(getattr(model, f.name)) for f in dataclasses.fields(model)}
-    content["views"] = {k: plain(v) for k, v in model.views.items() if k != RIGHT}
+    def written(model: MeasurementModel, names: Iterable[str]) -> dict[str, Any]:
+        views = {k: plain(v) for k, v in model.views.items() if k != RIGHT}
+        return {n: plain(getattr(model, n)) for n in names} | {"views": views}
+
+    content = written(model, [f.name for f in dataclasses.fields(model) if f.name != "jointly"])
+    if model.jointly is not None:
+        content["jointly"] = written(model.jointly, TERMS)
     path.write_text(json.dumps({"made_by": made_by, **content}, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
@@ -548,36 +570,55 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
     """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
     basis, method = load_norm(norm), METHODS[fit]
     seen = read_passes(folder, basis)
-    tuning = [s for s in seen if not s.held_out]
-    held = [s for s in seen if s.held_out]
-    out = left_out_in_turn(tuning, basis)
-    model = fit_model(tuning, basis, [method.hash], widening_of(out))
-    people = [len({s.person for s in part}) for part in (tuning, held)]
-    click.echo(f"{len(tuning)} passes of {people[0]} tuning persons, {len(held)} of {people[1]} held out; {method.key}")
-    by_person, drawn = coverage_by_chance(out, model.widening, people[1])
-    factors = out.groupby("kind")["ratio"].quantile(0.9) / Z90
-    click.echo(f"widening {model.widening}; by session: " + ", ".join(f"{k} {f:.2f}" for k, f in factors.items()))
-    click.echo(f"90 % intervals of tuning persons left out in turn hold {np.round(by_person, 2).tolist()}")
-    click.echo(
-        f"of {people[1]} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
-    )
-    for title, part in (("held out", held), ("tuning", tuning)):
-        frame = judged(part, model, basis)
-        click.echo(f"\n{title}: error of the index\n{error_table(frame).to_string(index=False, float_format='%.2f')}")
-        click.echo(f"\n{title}: gait measures\n{measure_errors(part).to_string(index=False, float_format='%.3f')}")
-        click.echo(f"\n{title}: angles\n{angle_errors(part).to_string(index=False, float_format='%.1f')}")
-        click.echo(f"\n{title}: stated\n{stated_errors(part, model).to_string(index=False, float_format='%.3f')}")
+    parts = {
+        (title, fitted): [s for s in seen if s.held_out == held and s.alone == (fitted == ALONE)]
+        for title, held in (("held out", True), ("tuning", False))
+        for fitted in (ALONE, TOGETHER)
+    }
+    people = [len({s.person for s in parts[title, ALONE]}) for title in ("tuning", "held out")]
+    click.echo(f"{method.key}, {people[0]} tuning persons, {people[1]} held out")
+    models = {}
+    for fitted in (ALONE, TOGETHER):
+        if own := parts["tuning", fitted]:
+            out = left_out_in_turn(own, basis)
+            models[fitted] = fit_model(own, basis, [method.hash], widening_of(out))
+            click.echo(f"\n{fitted}: {len(own)} passes, {len(parts['held out', fitted])} held out")
+            _echo_left_out(out, models[fitted].widening, people[1])
+    for (title, fitted), part in parts.items():
+        if not part:
+            continue
+        about = f"{title}, {fitted}"
+        frame = judged(part, models[fitted], basis)
+        _echo(f"{about}: error of the index", error_table(frame))
+        if fitted == TOGETHER:
+            _echo(f"{about}, by the model of passes fitted alone", error_table(judged(part, models[ALONE], basis)))
+        else:
+            _echo(f"{about}: gait measures", measure_errors(part), 3)
+            _echo(f"{about}: angles", angle_errors(part), 1)
+            _echo(f"{about}: stated", stated_errors(part, models[ALONE]), 3)
         pairs = change_pairs(frame)
-        for what, table in (
-            ("which part of what visits have in common remains", remains_table(pairs)),
-            ("probability of a change, as stated and as found", probability_table(pairs)),
-            ("probability of a change, by session", probability_errors(pairs)),
-        ):
-            click.echo(f"\n{title}: {what}\n{table.to_string(index=False, float_format='%.3f')}")
-        click.echo(f"\n{title}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
+        _echo(f"{about}: which part of what visits have in common remains", remains_table(pairs), 3)
+        _echo(f"{about}: probability of a change, as stated and as found", probability_table(pairs), 3)
+        _echo(f"{about}: probability of a change, by session", probability_errors(pairs), 3)
+        click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
+        model = dataclasses.replace(models[ALONE], name=write.stem, jointly=models.get(TOGETHER))
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
         click.echo(f"\n{write}")
+
+
+def _echo(title: str, table: pd.DataFrame, digits: int = 2) -> None:
+    click.echo(f"\n{title}\n{table.to_string(index=False, float_format=f'%.{digits}f')}")
+
+
+def _echo_left_out(out: pd.DataFrame, widening: float, n_held_out: int) -> None:
+    by_person, drawn = coverage_by_chance(out, widening, n_held_out)
+    factors = out.groupby("kind")["ratio"].quantile(0.9) / Z90
+    click.echo(f"widening {widening}; by session: " + ", ".join(f"{k} {f:.2f}" for k, f in factors.items()))
+    click.echo(f"90 % intervals of tuning persons left out in turn hold {np.round(by_person, 2).tolist()}")
+    click.echo(
+        f"of {n_held_out} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
+    )
 
 
 if __name__ == "__main__":

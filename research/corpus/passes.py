@@ -1,8 +1,9 @@
 """`python -m research.corpus.passes`: mean curves of many passes of known walks, with the detector's errors drawn anew.
 
 What the measurement model of the index is estimated from (`research.corpus.measurement`): each walk is seen at two
-visits, in two passes from every view, each a session. Nothing random is common to two passes but where the points lie
-on the person's body, and the picture's size to those of one visit.
+visits, in two passes from every view. Nothing random is common to two passes but where the points lie on the person's
+body, and the picture's size to those of one visit. A pass is fitted alone and in sessions of several, with one body for
+all: the same passes, so that what the common body changes is not mixed with chance.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from multiprocessing.pool import AsyncResult
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -25,7 +27,6 @@ from pbl_pipeline.synthetic import IMPAIRMENTS
 from research.corpus.walks import (
     CAMERAS,
     SEVERITIES,
-    VIEWS,
     Case,
     Walk,
     detector_model,
@@ -35,10 +36,21 @@ from research.corpus.walks import (
     synthetic_walk,
 )
 
-#: Walks whose passes are fitted together.
-GROUP = 24
+#: Walks whose passes are fitted in one call.
+GROUP = 32
 #: Visits of a walk, and passes in each view at each of them.
 VISITS, PASSES = 2, 2
+#: Sessions of one visit: how many passes of each view. Of those with one pass of each view there are `PASSES`.
+SESSIONS: dict[str, dict[str, int]] = {
+    "left": {"sagittal": 1},
+    "right": {"sagittal_right": 1},
+    "front": {"frontal": 1},
+    "back": {"rear": 1},
+    "obliquely": {"oblique": 1},
+    "both sides": {"sagittal": 1, "sagittal_right": 1},
+    "both sides twice": {"sagittal": 2, "sagittal_right": 2},
+    "sides, front, back": {"sagittal": 1, "sagittal_right": 1, "frontal": 1, "rear": 1},
+}
 #: Angles of the index, in its order.
 ANGLES = ("hip_flexion", "hip_adduction", "knee_flexion")
 #: Degrees of a stored integer.
@@ -67,34 +79,45 @@ def walk_of(which: tuple) -> Walk:
     return recorded_walks(which[1])[which[2]]
 
 
-def cases_of(walk: Walk, detector: str, views: Iterable[str]) -> list[Case]:
-    """Each pass of a walk. The camera is held at one visit and stands at the other."""
+class Fitted(NamedTuple):
+    """A session: its kind (of `SESSIONS`), which one of its kind at the visit, its passes and what is seen in them."""
+
+    kind: str
+    number: int
+    cases: Sequence[Case]
+    keypoints: Sequence[Keypoints]
+
+    def as_input(self) -> SessionInput:
+        names = [f"{c.view} {c.recording}" for c in self.cases]
+        return SessionInput(self.keypoints, names, self.cases[0].camera)
+
+
+def observed(which: tuple, detector: str, kinds: Sequence[str]) -> list[Fitted]:
+    """The sessions of a walk at each visit. The camera is held at one visit and stands at the other."""
+    walk = walk_of(which)
     first = len(walk.person) + int(10 * walk.severity)
-    return [
-        Case(walk, view, CAMERAS[(first + visit) % 2], detector, visit, 1 + number)
-        for visit in range(VISITS)
-        for view in views
-        for number in range(PASSES)
-    ]
-
-
-def observed(which: tuple, detector: str, views: Sequence[str]) -> list[tuple[Case, Keypoints]]:
-    """Each pass of a walk and what the detector sees of it."""
-    return [(c, c.keypoints()) for c in cases_of(walk_of(which), detector, views)]
+    out = []
+    for visit in range(VISITS):
+        views = dict.fromkeys(v for kind in kinds for v in SESSIONS[kind])
+        cases = {
+            v: [Case(walk, v, CAMERAS[(first + visit) % 2], detector, visit, 1 + i) for i in range(PASSES)]
+            for v in views
+        }
+        seen = {v: [c.keypoints() for c in cases[v]] for v in views}
+        for kind in kinds:
+            wanted = SESSIONS[kind]
+            for number in range(PASSES + 1 - max(wanted.values())):
+                own = [(v, number + i) for v, n in wanted.items() for i in range(n)]
+                out.append(Fitted(kind, number, [cases[v][i] for v, i in own], [seen[v][i] for v, i in own]))
+    return out
 
 
 def _curves(cycles: Sequence) -> dict[str, np.ndarray]:
-    """Curves (N, 3, 51) of the used cycles as integers of `STEP_DEG`, their sides, and the mean sd of each side."""
+    """Curves (N, 3, 51) of the used cycles as integers of `STEP_DEG`, and their sides."""
     used = [c for c in cycles if c.used and all(a in c.curves for a in ANGLES)]
     values = np.array([[c.curves[a] for a in ANGLES] for c in used]).reshape(-1, 3, 51)
     sides = np.array([c.side == "right" for c in used], bool)
-    spread = np.full((2, 3, 51), np.nan)
-    if used and all(a in c.curves_sd for c in used for a in ANGLES):
-        sd = np.array([[c.curves_sd[a] for a in ANGLES] for c in used])
-        for k in (0, 1):
-            if (sides == k).any():
-                spread[k] = sd[sides == k].mean(axis=0)
-    return {"curves": np.round(values / STEP_DEG).astype(np.int16), "right": sides, "sd": spread.astype(np.float32)}
+    return {"curves": np.round(values / STEP_DEG).astype(np.int16), "right": sides}
 
 
 def _measures(cycles: Sequence) -> np.ndarray:
@@ -102,22 +125,24 @@ def _measures(cycles: Sequence) -> np.ndarray:
     return np.array([np.nan if (m := found.get(name)) is None else m.mean for name in MEASURES], np.float32)
 
 
-def row_of(case: Case, trial: TrialFit) -> dict[str, Any]:
-    """Curves and measures of a fitted pass, with the true and with detected events, beside the true ones."""
-    walk = case.walk
-    try:
-        detected = find_cycles(detect_events(feet_from_fit(trial)).events, trial)
-    except PblError:
-        detected = []
-    cycles = {
-        "known": find_cycles(walk.events, trial),
-        "detected": detected,
-        "true": find_cycles(walk.events, walk.fit()),
-    }
-    row = {"person": walk.person, "held_out": walk.held_out, "source": walk.source, "condition": walk.condition}
-    row |= {"severity": walk.severity, "view": case.view, "camera": case.camera, "visit": case.visit}
-    row |= {"recording": case.recording, "measures": _measures(detected), "true_measures": _measures(cycles["true"])}
-    return row | {f"{name}_{k}": v for name, found in cycles.items() for k, v in _curves(found).items()}
+def rows_of(session: Fitted, trials: Sequence[TrialFit]) -> list[dict[str, Any]]:
+    """A row for each pass of a fitted session: curves and measures with detected events, beside the true ones."""
+    walk = session.cases[0].walk
+    true = find_cycles(walk.events, walk.fit())
+    rows = []
+    for case, trial in zip(session.cases, trials, strict=True):
+        try:
+            detected = find_cycles(detect_events(feet_from_fit(trial)).events, trial)
+        except PblError:
+            detected = []
+        row = {"person": walk.person, "held_out": walk.held_out, "source": walk.source, "condition": walk.condition}
+        row |= {"severity": walk.severity, "session": session.kind, "number": session.number, "view": case.view}
+        row |= {"camera": case.camera, "visit": case.visit, "recording": case.recording}
+        row |= {"measures": _measures(detected), "true_measures": _measures(true)}
+        for name, found in (("detected", detected), ("true", true)):
+            row |= {f"{name}_{k}": v for k, v in _curves(found).items()}
+        rows.append(row)
+    return rows
 
 
 def save_rows(path: Path, rows: Sequence[dict]) -> None:
@@ -140,14 +165,23 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
 @click.option("--people", default=12, show_default=True, help="Synthetic people, half of them held out.")
 @click.option("--tuning", default=0, show_default=True, help="Further synthetic people who are not held out.")
 @click.option("--detector", default="blazepose-heavy", show_default=True, metavar="NAME", help="Error model.")
-@click.option("--views", default=",".join(VIEWS), metavar="VIEW,...", help="Which of them (default: all).")
+@click.option(
+    "--session", "kinds", multiple=True, type=click.Choice(list(SESSIONS)), help="Kind of session (default: all)."
+)
 @click.option("--processes", default=os.cpu_count(), help="Processes that see the walks and measure the fits.")
 @click.option("--seconds", default=1e9, help="Begin no further group of walks after so many seconds.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write passes-N.npz there.")
 def main(
-    motions: Path | None, people: int, tuning: int, detector: str, views: str, processes: int, seconds: float, out: Path
+    motions: Path | None,
+    people: int,
+    tuning: int,
+    detector: str,
+    kinds: Sequence[str],
+    processes: int,
+    seconds: float,
+    out: Path,
 ) -> None:
-    """Fit every pass as a session and keep its curves and measures beside the true ones."""
+    """Fit every session and keep the curves and measures of its passes beside the true ones."""
     begin = time.perf_counter()
     out.mkdir(parents=True, exist_ok=True)
     model = detector_model(detector)
@@ -156,22 +190,34 @@ def main(
     walks = [walks[i] for i in np.random.default_rng(0).permutation(len(walks))]  # any part of them has all kinds
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes, which leave a GPU to this one
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        jobs = [pool.apply_async(observed, (w, detector, views.split(","))) for w in walks]
-        for number, first in enumerate(range(0, len(jobs), GROUP)):
+
+        def see(first: int) -> AsyncResult[list[list[Fitted]]]:
+            some = [(w, detector, kinds or tuple(SESSIONS)) for w in walks[first : first + GROUP]]
+            return pool.starmap_async(observed, some, chunksize=1)
+
+        def keep(first: int, measured: AsyncResult[list[list[dict]]]) -> None:
+            rows = [row for of_session in measured.get() for row in of_session]
+            save_rows(out / f"passes-{first}.npz", rows)
+            click.echo(f"{min(first + GROUP, len(walks))} of {len(walks)} walks: {len(rows)} passes are kept")
+
+        # While a group is fitted, the next one is seen and the one before is measured.
+        ahead, before = see(0), None
+        for first in range(0, len(walks), GROUP):
             if time.perf_counter() - begin > seconds:
                 break
-            seen = [found for job in jobs[first : first + GROUP] for found in job.get()]
+            seen, ahead = [s for found in ahead.get() for s in found], see(first + GROUP)
             ready = time.perf_counter()
-            fits = fit_sessions([SessionInput([k], ["pass"], c.camera) for c, k in seen], method)
-            fitted = time.perf_counter()
-            done = [(c, f.trials[0]) for (c, _), f in zip(seen, fits, strict=True) if not isinstance(f, PblError)]
-            rows = pool.starmap(row_of, done, chunksize=4)
-            save_rows(out / f"passes-{number}.npz", rows)
+            fits = fit_sessions([s.as_input() for s in seen], method)
+            done = [(s, f.trials) for s, f in zip(seen, fits, strict=True) if not isinstance(f, PblError)]
             click.echo(
-                f"{min(first + GROUP, len(walks))} of {len(walks)} walks, {len(rows)} passes of {len(seen)}, "
-                f"{method.key}: seen at {ready - begin:.0f} s, fitted {fitted - ready:.0f} s, "
-                f"measured {time.perf_counter() - fitted:.0f} s"
+                f"{len(done)} of {len(seen)} sessions, {method.key}: seen at {ready - begin:.0f} s, "
+                f"fitted {time.perf_counter() - ready:.0f} s"
             )
+            if before is not None:
+                keep(*before)
+            before = first, pool.starmap_async(rows_of, done, chunksize=4)
+        if before is not None:
+            keep(*before)
         pool.terminate()
 
 
