@@ -90,7 +90,7 @@ def work(options: Options, pipe: Connection) -> None:
     if options.gpus:
         os.environ[VISIBLE] = options.gpus[0]
     if options.phone:
-        os.environ["JAX_PLATFORMS"] = "cpu"
+        os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
     if options.processes > 1:
         # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

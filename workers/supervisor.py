@@ -118,7 +118,8 @@ class Supervisor:
         process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
         with shared_cores(1 if options.phone else self.options.processes):
             process.start()
-        if self.options.phones and not options.phone and hasattr(os, "setpriority"):
+        if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
+            # From here, before its libraries start threads of their own, which keep the priority they began with.
             with contextlib.suppress(OSError):  # it has ended
                 os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + BATCH_NICE)
         there.close()

@@ -18,8 +18,8 @@ from workers.supervisor import Supervisor
 
 #: Variable by which JAX does not reserve a GPU's memory for one process.
 MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
-#: Variable by which JAX computes on what is listed alone.
-PLATFORM = "JAX_PLATFORMS"
+#: Variables by which JAX and ONNX networks compute on the CPU.
+CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
 
 
 @pytest.mark.parametrize(
@@ -62,12 +62,13 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
         monkeypatch.setattr(f"workers.process.{name}", lambda *_: False)  # it ends where it would connect
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
-        for name in (VISIBLE, MEMORY, PLATFORM):
+        for name in (VISIBLE, MEMORY, *CPU):
             monkeypatch.setenv(name, "")
             monkeypatch.delenv(name)
         process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
-        seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, PLATFORM))))
-    assert seen == [("4", None, None), ("7", None, None), ("7", "false", None), (None, None, "cpu")]
+        seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, *CPU))))
+    no = (None, None)
+    assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
 
 
 def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):
