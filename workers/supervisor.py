@@ -119,7 +119,7 @@ class Supervisor:
         with shared_cores(1 if options.phone else self.options.processes):
             process.start()
         if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
-            # From here, before its libraries start threads of their own, which keep the priority they began with.
+            # From here, before its libraries start threads, which keep the priority they began with.
             with contextlib.suppress(OSError):  # it has ended
                 os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + BATCH_NICE)
         there.close()
