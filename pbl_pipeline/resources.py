@@ -64,20 +64,15 @@ def share_of_memory() -> float:
     return memory_bytes() * cores() / max(cores(stated=False), 1)
 
 
-def divide_cores(processes: int) -> None:
-    """Let each of several processes that are started from now on use its share of the cores only. Variables that are
-    set already stay."""
+@contextlib.contextmanager
+def shared_cores(processes: int) -> Iterator[None]:
+    """Let each of several processes that are started in this block use its share of the cores only. Variables of the
+    libraries that are set already stay."""
+    before = {name: os.environ.get(name) for name in (CORES, *_THREADS)}
     share = str(max(1, cores() // processes))
     os.environ[CORES] = share
     for name in _THREADS:
         os.environ.setdefault(name, share)
-
-
-@contextlib.contextmanager
-def shared_cores(processes: int) -> Iterator[None]:
-    """As `divide_cores`, for processes that are started in this block."""
-    before = {name: os.environ.get(name) for name in (CORES, *_THREADS)}
-    divide_cores(processes)
     try:
         yield
     finally:

@@ -90,8 +90,21 @@ log = logging.getLogger("pbl.worker")
 IDLE_S = (0.5, 20.0)
 #: An idle worker looks at all tables when no worker has done so for as long.
 REFRESH_EVERY_S = 60.0
-#: Condition on a job that it is not of a long recording.
+#: Pause of the process for phones between two looks: it is never longer, and of milliseconds where nothing waits.
+PHONE_S = 1.0
+#: The other processes leave a job of a phone's recording to that process for so long (s): longer than its pause.
+LEAVE_S = 3
+#: Conditions on a job: not of a long recording; of a phone's; of none, or one that had waited for `LEAVE_S`.
 _IS_SHORT = f"priority NOT IN ({','.join(map(str, registry.LONG.values()))})"
+_IS_FIRST = f"priority = {registry.FIRST}"
+_IS_LEFT = f"(priority != {registry.FIRST} OR scheduled_time < CURRENT_TIMESTAMP(3) - INTERVAL {LEAVE_S} SECOND)"
+
+
+def takes(short: bool, phones: bool, phone: bool) -> str | None:
+    """Condition on the jobs that a process takes (`process.Options`): None where it takes all."""
+    if phone:
+        return _IS_FIRST
+    return " AND ".join(([_IS_SHORT] if short else []) + ([_IS_LEFT] if phones else [])) or None
 
 
 @dataclasses.dataclass
@@ -101,7 +114,8 @@ class Worker:
     tables: the computed tables it serves. stop: set when it is to end after the running job. report: called with each
     job before it and while it waits for the database (without an outcome), and after it. batch: fits per batch.
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
-    job but of these recordings; called before each look, as sets come and go. short: takes no job of a long recording.
+    job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
+    phone: looks often, and for nothing but jobs that are queued.
     """
 
     tables: Sequence[Any]
@@ -111,7 +125,8 @@ class Worker:
     batch: int = 1
     limit: int | None = None
     only: Callable[[], Scope] | None = None
-    short: bool = False
+    takes: str | None = None
+    phone: bool = False
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -147,10 +162,10 @@ class Worker:
             if once and found is not None:
                 return
             self._let_go()
-            self.heartbeat.doing("idle")
+            self.heartbeat.doing("waits for a recording of a phone" if self.phone else "idle")
             # Not all at the same moment: workers that were started together would go on asking together.
             self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
-            idle = min(2 * idle, IDLE_S[1])
+            idle = min(2 * idle, PHONE_S if self.phone else IDLE_S[1])
 
     def step(self) -> int:
         """Take jobs of the table that is most urgent, and do them; returns how many."""
@@ -185,7 +200,7 @@ class Worker:
     def _conditions(self) -> dict[Any, str | None]:
         """The tables of which jobs may be taken, and the condition on their keys."""
         if self.only is None:
-            return dict.fromkeys(self.tables, _IS_SHORT if self.short else None)
+            return dict.fromkeys(self.tables, self.takes)
         scope = self.only()
         return {table: where for table in self.tables if (where := scope.where(table)) is not None}
 
@@ -248,7 +263,7 @@ class Worker:
                 return True
             held = [(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None]
             return None if any(len(jobs) for jobs in held) else False
-        if time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0:
+        if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
         tables_version.refuse_newer()  # migrated while this worker ran: it ends, and its successor does not start
         self.heartbeat.doing("looks at all tables")

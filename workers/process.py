@@ -51,8 +51,9 @@ SELFTEST_FAILED = 3
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
-    time limits of the tables. gpus: dealt to the processes in turn, one to each. short: takes no job of a long
-    recording."""
+    time limits of the tables. gpus: dealt to the processes in turn, one to each. phones: one process more takes only
+    recordings of phones, and has precedence on the cores. Of one process: short: takes no job of a long recording;
+    phone: is that process."""
 
     resource: str = "all"
     processes: int = 1
@@ -63,11 +64,21 @@ class Options:
     limit_factor: float = 1.0
     selftest: bool = True
     gpus: tuple[str, ...] = ()
+    phones: bool = False
     short: bool = False
+    phone: bool = False
+
+    @property
+    def all_processes(self) -> int:
+        """Number of processes, with the one for phones, which is the last."""
+        return self.processes + self.phones
 
     def of_process(self, number: int) -> Options:
         """The options of one of the processes: its GPU, and how many processes share that; the first of several is for
-        short recordings, so that long ones never hold them all."""
+        short recordings, so that long ones never hold them all. The one for phones uses no GPU: its memory is for the
+        others."""
+        if number == self.processes:
+            return dataclasses.replace(self, phone=True, processes=1, batch=1, gpus=(), max_jobs=None)
         one = dataclasses.replace(self, short=number == 0 and self.processes > 1)
         if not self.gpus:
             return one
@@ -79,6 +90,8 @@ def work(options: Options, pipe: Connection) -> None:
     """Run a working process (`Options.of_process`): connect, run the self-test, work."""
     if options.gpus:
         os.environ[VISIBLE] = options.gpus[0]
+    if options.phone:
+        os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
     if options.processes > 1:
         # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -122,7 +135,8 @@ def work(options: Options, pipe: Connection) -> None:
             stop.set()
 
     with heartbeat.Heartbeat(options.resource) as beats:
-        worker = loop.Worker(tables, beats, stop, report, options.batch, short=options.short)
+        takes = loop.takes(options.short, options.phones, options.phone)
+        worker = loop.Worker(tables, beats, stop, report, options.batch, takes=takes, phone=options.phone)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
             with frames_kept():

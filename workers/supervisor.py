@@ -12,6 +12,7 @@ supervisor ends, and restarting it is left to them.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import multiprocessing
@@ -24,6 +25,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import shared_cores
 from schemas import connection
 
 from . import queue, recover, registry, run_job
@@ -41,6 +43,8 @@ RESTART_S = (0.5, 60.0)
 HEALTHY_S = 60.0
 #: After so many processes in a row that died earlier and without a job, the supervisor ends with an error.
 HOPELESS = 5
+#: Nice value of the other processes where one is for phones: it then gets nine tenths of each core that it wants.
+BATCH_NICE = 10
 #: After the grace period a process has this long to put its job back; then it is killed (s).
 LAST_S = 15.0
 
@@ -65,7 +69,7 @@ class _Child:
 
 
 class Supervisor:
-    """Keeps `options.processes` working processes alive until told to stop; `run` returns the exit code."""
+    """Keeps `options.all_processes` working processes alive until told to stop; `run` returns the exit code."""
 
     def __init__(self, options: Options, metrics: Metrics | None = None, target: Callable[..., None] | None = None):
         """`target` replaces `work` as the function that the processes run: tests and benchmarks install stand-ins."""
@@ -92,13 +96,15 @@ class Supervisor:
         """Watch until every process has ended (`once`), or until SIGTERM or SIGINT."""
         before = {s: signal.signal(s, self.stop) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
-            self._children = [self._launch(number) for number in range(self.options.processes)]
+            self._children = [self._launch(number) for number in range(self.options.all_processes)]
             code = 0
             while self._children:
                 self._listen(0.5)
                 self._send_due()
                 self._end_overdue()
                 code = max(code, self._reap())
+                if not self._stopping and {c.number for c in self._children} == {self.options.processes}:
+                    self.stop()  # the process for phones does not outlive the others
                 self._settle()
             return code
         finally:
@@ -110,7 +116,12 @@ class Supervisor:
         here, there = self._start.Pipe(duplex=False)
         options = self.options.of_process(number)
         process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
-        process.start()
+        with shared_cores(1 if options.phone else self.options.processes):
+            process.start()
+        if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
+            # From here, before its libraries start threads, which keep the priority they began with.
+            with contextlib.suppress(OSError):  # it has ended
+                os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + BATCH_NICE)
         there.close()
         return _Child(process, here, time.monotonic(), number=number)
 

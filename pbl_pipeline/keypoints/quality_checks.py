@@ -121,8 +121,8 @@ ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
 CUT_WARN, CUT_FAIL = 0.1, 0.5
 #: Head to feet in the picture.
 HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
-#: Brightness (0..255) of the brightest twentieth of the person.
-BRIGHT_WARN, BRIGHT_FAIL = 30.0, 15.0
+#: Brightness (0..255) of the brightest twentieth of the person. In about half of it people are not found any more.
+BRIGHT_WARN, BRIGHT_FAIL = 60.0, 15.0
 #: Finest detail as a fraction of the person's size.
 DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 #: Frames a second.

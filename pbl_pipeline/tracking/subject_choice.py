@@ -217,14 +217,14 @@ def carried_choice(
     """
     found = same_person(decided, person_id, tracking)
     if found is not None:
-        reason = f"Person {found} is the one whom somebody chose by hand in the tracking {method}."
+        reason = f"Person {found} was recognised: chosen by hand in the tracking {method}."
         return dataclasses.replace(choose_subject(tracking, params, found), status="CHOSEN", reason=reason)
     choice = choose_subject(tracking, params)
     if choice.person_id is None:
         return choice
     reason = (
-        f"In the tracking {method} person {person_id} was chosen by hand, whom nobody here surely is. A person has to "
-        "choose again."
+        f"Person {person_id} of the tracking {method} was chosen by hand and cannot be recognised for "
+        "certain here. Choose the person again."
     )
     return dataclasses.replace(choice, status="NEEDS_CHOICE", person_id=None, reason=reason)
 

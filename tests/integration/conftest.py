@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +68,9 @@ def drop(tables: None, tmp_path: Path) -> Path:
     folder = tmp_path / "uploads"
     folder.mkdir()
     return folder
+
+
+@pytest.fixture(scope="session")
+def axe() -> str:
+    """axe-core as a script."""
+    return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")

@@ -349,10 +349,10 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     assert len(gait.EventCorrection()) == len(gait.EventCorrection.Event()) == 0
 
 
-def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str):
+def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     before = event_corrections.shown(1)
     assert before is not None
-    with web.shown(chromium, name="A. First", size=(1200, 900), refused=True) as page:
+    with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:
         page.goto("/recordings/1")
         page.wait_for_selector("[data-ready]")
         page.get_by_text("Correct the events").click()
@@ -375,6 +375,23 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str):
         marks.nth(marks.count() - 1).focus()
         page.keyboard.press("Delete")
         assert marks.count() == len(before.detected) - 1
+        # Each of three marks that are at most a frame apart can be hit.
+        for shown in ("5", "6"):
+            page.locator("#position").fill(shown)
+            page.wait_for_selector(f"canvas.body[data-frame='{shown}']")
+            page.get_by_role("button", name="+ Left: initial contact").click()
+        page.get_by_role("button", name="+ Left: toe-off").click()
+        page.evaluate(axe)
+        found = page.evaluate("axe.run('.track', { runOnly: ['target-size'] })")
+        assert sum(len(rule["nodes"]) for rule in found["passes"]) == marks.count() == len(before.detected) + 2
+        assert not found["violations"]
+        for what in (
+            f"toe-off at {6 / 30:.2f}",
+            f"initial contact at {6 / 30:.2f}",
+            f"initial contact at {5 / 30:.2f}",
+        ):
+            page.get_by_label(f"Left {what} s").click()
+            page.keyboard.press("Delete")
         # What the server refuses is said, and the marks stay.
         page.locator("#position").fill("5")
         page.wait_for_selector("canvas.body[data-frame='5']")

@@ -266,6 +266,20 @@ def test_the_advice_of_every_check_has_its_german(english: set[str]):
     assert not {t: f for t, f in untold.items() if "leg was behind the" not in t}
 
 
+def test_a_choice_carried_to_another_tracking_has_its_german():
+    """As this version writes it and as rows of earlier versions hold it."""
+    for reason in (
+        "Person 3 was recognised: chosen by hand in the tracking old-v1.",
+        "Person 2 of the tracking old-v1 was chosen by hand and cannot be recognised for certain here. Choose the "
+        "person again.",
+        "Person 3 is the one whom somebody chose by hand in the tracking old-v1.",
+        "In the tracking old-v1 person 2 was chosen by hand, whom nobody here surely is. A person has to choose again.",
+    ):
+        told = str(texts.library("de", reason))
+        assert "old-v1" in told
+        assert "<span" not in told
+
+
 @pytest.mark.parametrize("code", REASONS)
 def test_the_reason_for_missing_forces_has_its_german(code: str):
     assert texts.library_words("de", REASONS[code]) != REASONS[code]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +79,6 @@ def visits(chromium: Any, module_tables: Path) -> None:
     of_screen = (np.pad(f, ((20, 20), (0, 0), (0, 0))) for f in numbered_frames(60, 72, 128))
     register(write_video(module_tables / "screen.mp4", of_screen, constant_rate(60)), subject="P003")
     populate()
-
-
-@pytest.fixture(scope="module")
-def axe() -> str:
-    """axe-core as a script."""
-    return (files("axe_playwright_python") / "axe.min.js").read_text("utf-8")
 
 
 def go(page: Any, kind: str) -> None:

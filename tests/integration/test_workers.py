@@ -31,12 +31,13 @@ from schemas.operations import embedded
 from schemas.reading.status import live_workers, pipeline_status, queue_counts
 from schemas.reading.why import why
 from tests.rows import register
+from tests.slurm import until
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
-from workers.loop import Worker
+from workers.loop import LEAVE_S, Worker, takes
 from workers.process import Options
 from workers.recover import CRASHES
-from workers.supervisor import Supervisor
+from workers.supervisor import BATCH_NICE, Supervisor
 
 from . import chain, worker_target
 
@@ -239,12 +240,31 @@ def test_a_long_recording_waits_behind_the_short_ones_of_its_kind(of_lengths: di
 def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[str, int]):
     first, second = (Options(processes=2).of_process(number) for number in (0, 1))
     taken: list[queue.Claim] = []
-    work(report=lambda job, _: taken.append(job), short=first.short)
+    work(report=lambda job, _: taken.append(job), takes=takes(first.short, phones=False, phone=False))
     assert order_of("Tracking", taken) == [of_lengths[name] for name in ("filmed", "walk", "again")]
     assert jobs_left() == {"Tracking": {"pending": 2}}
-    work(short=second.short)
+    work(takes=takes(second.short, phones=False, phone=False))
     assert jobs_left() == {}
     assert not Options(processes=1).of_process(0).short  # it does everything
+
+
+def test_one_process_takes_recordings_of_phones_alone_and_the_others_leave_them_to_it(of_lengths: dict[str, int]):
+    def queued(seconds_ago: int) -> None:
+        now = f"CURRENT_TIMESTAMP(3) - INTERVAL {seconds_ago} SECOND"
+        jobs.connection.query(f"UPDATE {jobs.full_table_name} SET scheduled_time={now}")
+
+    jobs, others = video.VideoInfo.jobs, takes(short=False, phones=True, phone=False)
+    queued(0)
+    assert [queue.most_urgent(video.VideoInfo, where) for where in (None, others)] == [registry.FIRST, registry.NEW]
+    queued(LEAVE_S + 1)  # the process has another one in hand
+    assert queue.most_urgent(video.VideoInfo, others) == registry.FIRST
+    taken: list[queue.Claim] = []
+    one = work(report=lambda job, _: taken.append(job), takes=takes(False, True, phone=True), phone=True)
+    assert {*order_of("VideoInfo", taken)} == {of_lengths["filmed"], of_lengths["hour_filmed"]}
+    assert order_of("Tracking", taken) == order_of("Keypoints", taken) == [of_lengths["filmed"]]  # the other is long
+    assert {job.priority for job in taken} == {registry.FIRST}
+    assert one.failed == 0
+    assert jobs_left() == {"VideoInfo": {"pending": 3}, "Tracking": {"pending": 1}}
 
 
 def test_a_full_store_delays_the_job_and_says_why(tables: None, tmp_path: Path, monkeypatch):
@@ -423,6 +443,40 @@ def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path
             lab.Subject.delete(prompt=False, part_integrity="cascade")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
     assert all(w["worker_stopped"] for w in worker.Worker.to_dicts())
+
+
+def test_a_phone_does_not_wait_for_the_job_in_hand(tables: None, tmp_path: Path, quick: None):
+    """The only other process of the worker never ends its job; it has a lower priority on the cores."""
+    register(*videos(tmp_path, "hangs"))
+    boss = Supervisor(Options(resource="decode", selftest=False, grace_s=0.0, phones=True), target=worker_target.work)
+    seen: dict[str, int] = {}
+
+    def film() -> None:
+        try:
+            until(lambda: bool(len(video.VideoInfo.jobs.reserved)) and len(live_workers()) == 2, 120)
+            (filmed,) = register(*videos(tmp_path, "filmed"), session_label="filmed")
+            queue.fill(video.VideoInfo, [{"video_id": filmed}], registry.FIRST)
+            until(lambda: len(video.VideoInfo()) == 1, 120)
+            until(lambda: any(w["worker_doing"].startswith("waits") for w in live_workers()), 120)
+            seen.update({w["worker_doing"]: os.getpriority(os.PRIO_PROCESS, w["worker_pid"]) for w in live_workers()})
+        finally:
+            boss.stop()
+
+    filming = threading.Thread(target=film)
+    filming.start()
+    assert boss.run() == 0
+    filming.join()
+    assert len(seen) == 2
+    phone = seen.pop("waits for a recording of a phone")
+    assert phone == os.getpriority(os.PRIO_PROCESS, 0)
+    assert [*seen.values()] == [min(phone + BATCH_NICE, 19)]
+
+
+def test_the_process_for_phones_ends_with_the_others(tables: None, tmp_path: Path):
+    register(*videos(tmp_path, "walk"))
+    assert Supervisor(Options("decode", max_jobs=1, selftest=False, phones=True), target=worker_target.work).run() == 0
+    assert len(video.VideoInfo()) == 1
+    assert len(worker.Worker & "worker_stopped IS NOT NULL") == 2
 
 
 def _stop_when_begun(boss: Supervisor, begun: Path) -> None:

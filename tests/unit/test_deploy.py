@@ -257,7 +257,10 @@ def test_the_slurm_script_ends_its_worker_in_order(tmp_path: Path):
     job = subprocess.Popen(start, env=environment, stdout=subprocess.PIPE, text=True)
     assert job.stdout is not None
     host, *words = job.stdout.readline().split()
-    assert (host, words[:-1]) == ("db.example", ["worker", "--resource", "gpu", "--processes", "auto", "--grace"])
+    assert (host, words[:-1]) == (
+        "db.example",
+        ["worker", "--resource", "gpu", "--processes", "auto", "--no-phones", "--grace"],
+    )
     assert float(words[-1]) + LAST_S < SLURM_KILL_WAIT_S
     job.send_signal(signal.SIGTERM)
     said, _ = job.communicate(timeout=120)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from multiprocessing import Pipe
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from pbl_pipeline import resources
 from schemas.operations.embedded import process
 from tests.command import pbl
+from tests.ended_process import Ended
 from workers import supervisor
 from workers.process import Options
 
@@ -72,32 +75,35 @@ def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("asked", "processes", "share"), [((), 1, "16"), (("--processes", "5"), 5, "3"), (("--processes", "auto"), 8, "2")]
+    ("asked", "shares"),
+    [
+        (("--resource", "fit"), ["16"]),
+        (("--no-phones", "--processes", "5"), ["3"] * 5),
+        (("--processes", "auto"), [*["2"] * 8, "16"]),  # the last one is for phones
+    ],
 )
-def test_a_worker_divides_the_cores_by_its_processes(
-    sixteen, tmp_path: Path, monkeypatch, asked: tuple, processes: int, share: str
-):
+def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, monkeypatch, asked: tuple, shares: list):
     groups(tmp_path, monkeypatch, "0::/", {})
     monkeypatch.setattr("schemas.activate", lambda **_: None)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
-    found: list[Options] = []
-    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+    seen: list[dict[str, str]] = []
+    names = (resources.CORES, *resources._THREADS)
+
+    class Process(Ended):
+        def start(self) -> None:
+            seen.append({name: os.environ[name] for name in names})
+
+    monkeypatch.setattr("multiprocessing.get_context", lambda _: SimpleNamespace(Process=Process, Pipe=Pipe))
     monkeypatch.setattr("workers.process.given_gpus", tuple)
-    with monkeypatch.context() as patch:
-        for name in {resources.CORES, *resources._THREADS} - {"OMP_NUM_THREADS"}:
-            patch.setenv(name, "x")
-            patch.delenv(name)
-        assert pbl("worker", *asked).code == 0
-        assert [o.processes for o in found] == [processes]
-        left = {name: os.environ[name] for name in (resources.CORES, *resources._THREADS)}
-    assert left == dict.fromkeys(left, share) | {"OMP_NUM_THREADS": "7"}
+    assert pbl("worker", *asked).code == 0
+    assert seen == [dict.fromkeys(names, share) | {"OMP_NUM_THREADS": "7"} for share in shares]
+    assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
 
 
 def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatch):
     groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(13 * GB)})
     monkeypatch.setattr("schemas.activate", lambda **_: None)
     monkeypatch.setattr("workers.process.given_gpus", tuple)
-    monkeypatch.setattr("pbl_pipeline.resources.divide_cores", lambda _: None)
     found: list[Options] = []
     monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
     assert pbl("worker", "--processes", "auto").code == 0
@@ -116,8 +122,8 @@ def test_the_numerical_library_keeps_to_its_share():
         for name in (resources.CORES, *resources._THREADS):
             patch.setenv(name, "x")
             patch.delenv(name)
-        resources.divide_cores(1000)
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+        with resources.shared_cores(1000):
+            done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"
 
 

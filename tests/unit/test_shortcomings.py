@@ -168,8 +168,8 @@ def measured(image: np.ndarray) -> Picture:
     [
         ({}, "picture_brightness", "PASS"),
         ({}, "picture_detail_share", "PASS"),
-        ({"gain": 0.3}, "picture_brightness", "PASS"),
-        ({"gain": 0.1}, "picture_brightness", "WARN"),
+        ({"gain": 0.5}, "picture_brightness", "PASS"),
+        ({"gain": 0.25}, "picture_brightness", "WARN"),
         ({"gain": 0.04}, "picture_brightness", "FAIL"),
         ({"blur_x": 60}, "picture_detail_share", "WARN"),
         ({"blur_x": 110}, "picture_detail_share", "FAIL"),

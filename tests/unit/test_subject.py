@@ -65,7 +65,7 @@ def test_a_decision_is_carried_to_another_tracking():
     assert same_person(decided, 1, video_of(beside, here)) == 7
     choice = carried_choice(decided, 2, "old-v1", video_of(beside, here))
     assert (choice.status, choice.person_id) == ("CHOSEN", 3)
-    assert choice.reason == "Person 3 is the one whom somebody chose by hand in the tracking old-v1."
+    assert choice.reason == "Person 3 was recognised: chosen by hand in the tracking old-v1."
     # Who walks close beside her is not she, and of her of whom a quarter is left nobody can say it.
     near = dataclasses.replace(therapist, box_px=patient.box_px + np.array([25.0, 0.0, 25.0, 0.0]))
     assert same_person(video_of(near, patient), 2, video_of(near)) is None
@@ -73,7 +73,7 @@ def test_a_decision_is_carried_to_another_tracking():
     for people in ((beside, here), (beside,), (here,)):
         choice = carried_choice(decided, 2, "old-v1", video_of(*people))
         assert (choice.status, choice.person_id) == ("NEEDS_CHOICE", None)
-        assert "person 2 was chosen by hand" in choice.reason
+        assert choice.reason.startswith("Person 2 of the tracking old-v1 was chosen by hand and cannot be recognised")
     empty = dataclasses.replace(decided, persons=())
     assert carried_choice(decided, 2, "old-v1", empty).status == "NO_PERSON"
     assert same_person(decided, 2, video_of(track(1, x=300.0, n=N // 2))) is None

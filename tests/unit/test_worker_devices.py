@@ -11,12 +11,15 @@ from unittest import mock
 import pytest
 
 from tests.command import program
+from tests.ended_process import Ended
 from workers import process
 from workers.process import VISIBLE, Options, given_gpus
 from workers.supervisor import Supervisor
 
 #: Variable by which JAX does not reserve a GPU's memory for one process.
 MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
+#: Variables by which JAX and ONNX networks compute on the CPU.
+CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
 
 
 @pytest.mark.parametrize(
@@ -48,39 +51,35 @@ def test_processes_are_dealt_to_the_gpus_evenly():
     assert (alone.gpus, alone.processes) == (("b",), 1)
     assert Options(processes=2).of_process(1) == Options(processes=2)
     assert [options.of_process(i).short for i in range(5)] == [True, *[False] * 4]
+    phone = Options(processes=2, gpus=("a", "b"), batch=128, max_jobs=9, phones=True).of_process(2)
+    assert phone == Options(phones=True, phone=True)  # no GPU, all cores, one session at a time, for as long as others
 
 
 def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
-    """What JAX finds in the environment of the two processes of two GPUs, and of the fourth of four."""
+    """What JAX finds in the environment of the two processes of two GPUs, of the fourth of four, and of the one for
+    phones."""
     for name in ("_connected", "to_stderr", "signal.signal"):
         monkeypatch.setattr(f"workers.process.{name}", lambda *_: False)  # it ends where it would connect
     seen = []
-    for number, processes in ((0, 2), (1, 2), (3, 4)):
-        for name in (VISIBLE, MEMORY):
+    for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
+        for name in (VISIBLE, MEMORY, *CPU):
             monkeypatch.setenv(name, "")
             monkeypatch.delenv(name)
-        process.work(Options(processes=processes, gpus=("4", "7")).of_process(number), mock.Mock())
-        seen.append((os.environ.get(VISIBLE), os.environ.get(MEMORY)))
-    assert seen == [("4", None), ("7", None), ("7", "false")]
+        process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
+        seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, *CPU))))
+    no = (None, None)
+    assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
 
 
 def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):
     started: list[Options] = []
 
-    class Process:
-        """A process that has ended at once; the second one died."""
+    class Process(Ended):
+        """The second one died."""
 
-        def __init__(self, args: tuple, **_: object) -> None:
-            self.sentinel, self._other_end = Pipe()
+        def start(self) -> None:
             self.exitcode = 1 if len(started) == 1 else 0
-            started.append(args[0])
-
-        def start(self) -> None: ...
-
-        def join(self) -> None: ...
-
-        def is_alive(self) -> bool:
-            return False
+            started.append(self.options)
 
     boss = Supervisor(Options(processes=2, gpus=("4", "7"), once=True))
     monkeypatch.setattr(boss, "_start", SimpleNamespace(Process=Process, Pipe=Pipe))

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from workers.registry import FIT, GROUPS
+from workers.registry import DETECTOR, FIT, GROUPS
 
 #: Share of a process of `--processes auto`: more cores bring one recording little, and its memory is what a long
 #: recording takes (bytes).
@@ -51,6 +51,10 @@ class Processes(click.ParamType):
     "--limit-factor", type=click.FloatRange(min=0.001), default=1.0, show_default=True,
     help="Multiplies the time limits of the tables.",
 )  # fmt: skip
+@click.option(
+    "--no-phones", is_flag=True,
+    help="Do without the process that takes only recordings of phones; also where detection is not served, or --once.",
+)  # fmt: skip
 @click.option("--metrics-port", type=click.IntRange(1, 65535), help="Serve Prometheus metrics on this port.")
 @click.option("--metrics-host", default="127.0.0.1", show_default=True, help="Address of the metrics.")
 @click.option("--no-selftest", is_flag=True, help="Skip the known jobs that each process does first.")
@@ -62,6 +66,7 @@ def worker(
     max_jobs: int | None,
     grace_s: float,
     limit_factor: float,
+    no_phones: bool,
     metrics_port: int | None,
     metrics_host: str,
     no_selftest: bool,
@@ -77,7 +82,7 @@ def worker(
     Example: pbl worker --resource gpu --batch 32 --metrics-port 9108
     """
     import schemas
-    from pbl_pipeline.resources import cores, divide_cores, memory_bytes
+    from pbl_pipeline.resources import cores, memory_bytes
     from schemas import connection
     from workers.log import to_stderr
     from workers.process import Options, given_gpus
@@ -88,11 +93,9 @@ def worker(
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
         processes = len(gpus) or max(1, min(cores() // CORES_EACH, memory_bytes() // MEMORY_EACH))
-    n = int(processes or len(gpus) or 1)
-    divide_cores(n)
     options = Options(
         resource=resource,
-        processes=n,
+        processes=int(processes or len(gpus) or 1),
         # Among so many sessions are enough of one size to be solved together.
         batch=batch or (128 if gpus else 1),
         gpus=gpus,
@@ -101,6 +104,7 @@ def worker(
         grace_s=grace_s,
         limit_factor=limit_factor,
         selftest=not no_selftest,
+        phones=not (no_phones or once) and DETECTOR in GROUPS[resource],
     )
     supervisor = Supervisor(options)
     if metrics_port is not None:

@@ -5,17 +5,32 @@ import { seconds } from "./recording.js";
 
 /** @typedef {{time: number, side: "l"|"r", event: "d"|"u", changed: boolean}} Mark */
 
-/** Pixels of a second. */
-const SECOND = 90;
+/** Pixels of a second; of a mark: its width, and from one lane to the next; of what is above and below all lanes, and between the sides. */
+const SECOND = 90, WIDTH = 26, LANE = 40, EDGE = 6, BETWEEN = 16;
 
 /** The events of a form's text, such as "1.2345ld 1.9ru". @param {string} text @returns {Mark[]} */
 export function marksOf(text) {
   return [...text.matchAll(/(\d+(?:\.\d+)?)([lr])([du])/g)].map((m) => ({ time: +m[1], side: /** @type {"l"|"r"} */ (m[2]), event: /** @type {"d"|"u"} */ (m[3]), changed: false }));
 }
 
+/** The marks in order of time. @param {Mark[]} marks */
+const ordered = (marks) => [...marks].sort((a, b) => a.time - b.time);
+
+/** The lane of each mark of one side: those nearer to each other than a mark is wide lie in different ones, so that each can be hit.
+ * @param {Mark[]} marks @returns {Map<Mark, number>} */
+export function lanesOf(marks) {
+  /** @type {number[]} */ const free = [], lanes = new Map();
+  for (const m of ordered(marks)) {
+    const at = m.time * SECOND, fits = free.findIndex((from) => from <= at), lane = fits < 0 ? free.length : fits;
+    free[lane] = at + WIDTH;
+    lanes.set(m, lane);
+  }
+  return lanes;
+}
+
 /** The text of events, in order of time. @param {Mark[]} marks */
 export function textOf(marks) {
-  return [...marks].sort((a, b) => a.time - b.time).map((m) => `${m.time.toFixed(4)}${m.side}${m.event}`).join(" ");
+  return ordered(marks).map((m) => `${m.time.toFixed(4)}${m.side}${m.event}`).join(" ");
 }
 
 /** The frame whose time is nearest. @param {number[]} times @param {number} at */
@@ -53,7 +68,17 @@ function edit(form, look, times) {
     button.setAttribute("aria-pressed", String(m === chosen));
     button.className = `mark ${m.side} ${m.event}${m.changed ? " changed" : ""}`;
   };
-  const told = () => { find(".save").disabled = find(".reset").disabled = !changed(); find(".delete").disabled = !chosen; };
+  const stack = () => {
+    let top = EDGE;
+    for (const side of ["l", "r"]) {
+      const lanes = lanesOf(marks.filter((m) => m.side === side));
+      for (const [m, lane] of lanes) { const button = shown.get(m); if (button) button.style.top = `${top + lane * LANE}px`; }
+      top += LANE * Math.max(1, ...[...lanes.values()].map((lane) => lane + 1));
+      if (side === "l") { track.style.setProperty("--between", `${top}px`); top += BETWEEN; }
+    }
+    track.style.height = `${top + EDGE}px`;
+  };
+  const told = () => { stack(); find(".save").disabled = find(".reset").disabled = !changed(); find(".delete").disabled = !chosen; };
   const choose = (/** @type {Mark|null} */ m) => {
     const last = chosen;
     chosen = m;
@@ -72,7 +97,7 @@ function edit(form, look, times) {
     told();
   };
   const remove = (/** @type {Mark} */ m) => {
-    const order = [...marks].sort((a, b) => a.time - b.time), at = order.indexOf(m), next = order[at + 1] ?? order[at - 1];
+    const order = ordered(marks), at = order.indexOf(m), next = order[at + 1] ?? order[at - 1];
     marks = marks.filter((other) => other !== m);
     shown.get(m)?.remove();
     shown.delete(m);
@@ -128,7 +153,7 @@ function edit(form, look, times) {
       second.textContent = `${s} s`;
       track.append(second);
     }
-    for (const m of [...marks].sort((a, b) => a.time - b.time)) add(m);  // Tab goes through them in order of time
+    for (const m of ordered(marks)) add(m);  // Tab goes through them in order of time
     told();
   };
   build();
