@@ -231,13 +231,13 @@ def trial_series(
 def _vertical(
     body: Body, fit: TrialFit, d: Dynamics, contact: np.ndarray, model: VerticalModel, rng: np.random.Generator | None
 ) -> np.ndarray:
-    """Return the vertical force (N/kg) of both feet: of one camera weighed against `model`, else as the motion needs
-    it. A fit that states no error cannot be weighed."""
+    """Return the vertical force (N/kg) of both feet: of one camera whose set of points `model` knows weighed against
+    it, else as the motion needs it. A fit that states no error cannot be weighed."""
     stands = (contact == 1) & np.all(np.isfinite(contact), axis=1, keepdims=True)
     needed = needed_vertical(d, stands)
-    if is_metric(fit) or not np.isfinite(fit.qpos_sd).any():
+    noise = model.noise.get(fit.marker_set)
+    if noise is None or is_metric(fit) or not np.isfinite(fit.qpos_sd).any():
         return needed
-    noise = model.noise.get(fit.marker_set, model.noise["blazepose_33"])
     speed = dimensionless_speed(d.centre_m, stature_m(body, fit.scale))
     force = vertical_force(needed / GRAVITY, stands, speed, model, noise)
     return GRAVITY * (force.mean if rng is None else force.draw(rng))

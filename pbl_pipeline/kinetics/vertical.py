@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve, toeplitz
-from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.runs import runs
@@ -65,7 +64,7 @@ class VerticalModel:
     noise_memory_s
         How long the noise stays alike.
     noise
-        By marker set.
+        By marker set of one camera; the force of other sets stays as the motion needs it.
     """
 
     name: str
@@ -215,7 +214,7 @@ def _kernel(n: int, memory_s: float) -> np.ndarray:
 
 def _alike(rng: np.random.Generator, n: int, memory_s: float) -> np.ndarray:
     """Draw a process of variance 1 whose correlation is that of `_kernel`."""
-    width = GRID_HZ * memory_s / np.sqrt(2.0)
-    pad = int(5 * width) + 1
-    white = gaussian_filter1d(rng.standard_normal(n + 2 * pad), width)[pad:-pad]
-    return white * np.sqrt(2.0 * np.sqrt(np.pi) * width)
+    # A kernel of this shape convolved with itself is that of `_kernel`.
+    reach = int(5 * GRID_HZ * memory_s) + 1
+    weights = np.exp(-((np.arange(-reach, reach + 1) / (GRID_HZ * memory_s)) ** 2))
+    return np.convolve(rng.standard_normal(n + 2 * reach), weights / np.linalg.norm(weights), "valid")

@@ -7,7 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbl_pipeline.kinetics import METHODS
+from pbl_pipeline.body import load_body
+from pbl_pipeline.gait import gait_metrics
+from pbl_pipeline.kinetics import METHODS, segment_inertia
+from pbl_pipeline.kinetics.compute import trial_series
 from pbl_pipeline.kinetics.vertical import (
     Noise,
     VerticalModel,
@@ -16,10 +19,13 @@ from pbl_pipeline.kinetics.vertical import (
     support_phase,
     vertical_force,
 )
+from tests.walking_fit import walking_fit
 
 SHIPPED = load_vertical_model(METHODS.find().params.vertical_model)
+NOISE = SHIPPED.noise["blazepose_33"]
 SPEED = SHIPPED.speed
 N = 300
+BODY = load_body()
 
 
 def steps(n: int = N) -> np.ndarray:
@@ -49,26 +55,46 @@ def test_the_posterior_of_a_constant_is_the_closed_form() -> None:
 
 
 def test_what_is_certain_stays() -> None:
-    time = np.arange(N) / 100
-    needed = 1.0 + 0.6 * np.sin(2 * np.pi * 1.3 * time)  # like no walk: it has another rhythm than the steps
-    found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0))
-    np.testing.assert_allclose(found.mean, needed, atol=2e-3)
-    assert np.abs(found.draw(np.random.default_rng(0)) - needed).max() < 0.01
-
-
-@pytest.mark.parametrize(("points", "least"), [("bml_movi_87", 0.9), ("blazepose_33", 0.6)])
-def test_a_force_unlike_that_of_healthy_people_survives(points: str, least: float) -> None:
-    """Somebody whose force hardly changes, as few who walk at that speed."""
-    found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, SHIPPED.noise[points])
     usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    assert np.std(found.mean) < (1.0 - least) * np.std(usual)
+    needed = usual + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
+    found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0))
+    np.testing.assert_allclose(found.mean[::3], needed[::3], atol=1e-3)
+    assert np.sqrt(np.mean((found.mean - needed) ** 2)) < 0.02
+    assert np.abs(found.draw(np.random.default_rng(0)) - found.mean)[::3].max() < 0.001
+
+
+def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed() -> None:
+    method = METHODS.find()
+    fit = walking_fit(BODY.joint_names, BODY.sha256, n_frames=240, start_m=(6.0, -4.5, -0.2))
+    fit = dataclasses.replace(
+        fit, orientation_source="measured: phone", marker_set="blazepose_33", qpos_sd=np.full_like(fit.qpos, 0.01)
+    )
+    events = gait_metrics([fit]).trials[0].events.events
+
+    def vertical(**changes) -> np.ndarray:
+        changed = dataclasses.replace(fit, **changes)
+        inertia = segment_inertia(BODY, fit.scale)
+        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, method.params)
+        assert series is not None
+        return series.force_bw[:, :, 2].sum(axis=1)
+
+    needed = vertical(orientation_source="measured: calibration")
+    assert np.nanmax(np.abs(vertical() - needed)) > 0.02
+    for changes in ({"marker_set": "bml_movi_87"}, {"qpos_sd": np.full_like(fit.qpos, np.nan)}):
+        np.testing.assert_array_equal(vertical(**changes), needed)
+
+
+def test_a_force_unlike_that_of_healthy_people_survives() -> None:
+    """A person whose force hardly changes, as few at that speed, keeps most of that."""
+    found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, NOISE)
+    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
+    assert np.std(found.mean) < 0.4 * np.std(usual)
 
 
 def test_noise_is_weighed_against_people() -> None:
     usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    noise = SHIPPED.noise["blazepose_33"]
-    off = np.repeat(np.random.default_rng(1).normal(0.0, noise.sd, N // 6), 6)
-    found = vertical_force(1.0 + noise.gain * (usual - 1.0) + off, steps(), SPEED, SHIPPED, noise)
+    off = np.repeat(np.random.default_rng(1).normal(0.0, NOISE.sd, N // 6), 6)
+    found = vertical_force(1.0 + NOISE.gain * (usual - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
     assert np.std(found.mean - usual) < 0.7 * np.std(off)
 
 
@@ -76,7 +102,7 @@ def test_where_no_foot_stands_the_force_is_as_it_was() -> None:
     stands = steps()
     stands[100:150] = False
     needed = np.linspace(0.8, 1.2, N)
-    found = vertical_force(needed, stands, SPEED, SHIPPED, SHIPPED.noise["blazepose_33"])
+    found = vertical_force(needed, stands, SPEED, SHIPPED, NOISE)
     np.testing.assert_array_equal(found.mean[100:150], needed[100:150])
     assert not np.allclose(found.mean[:100], needed[:100])
 
@@ -101,6 +127,7 @@ def test_long_recordings_are_estimated_in_parts() -> None:
     n = 4000
     time = np.arange(n) / 100
     needed = 1.0 + 0.1 * np.sin(2 * np.pi * time / 0.6)
-    found = vertical_force(needed, steps(n), SPEED, SHIPPED, SHIPPED.noise["blazepose_33"])
-    assert np.abs(np.diff(found.mean)).max() < 0.15
+    found = vertical_force(needed, steps(n), SPEED, SHIPPED, NOISE)
+    onset = slice(59, None, 60)  # of double support
+    assert np.delete(np.abs(np.diff(found.mean)), np.arange(n - 1)[onset]).max() < 0.15
     assert found.draw(np.random.default_rng(0)).shape == (n,)
