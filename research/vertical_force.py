@@ -9,8 +9,8 @@ Two sources, half of the persons of each held out:
 - adults: 10 persons with 60 steps each at 0.7 to 2.2 m/s on a pressure plate (Pataky et al. 2008, J Biomech
   41:1987-1994), the files `ex_grf_subj*.npy` and `ex_grf_speeds.npy` that the Python package spm1d carries; FOLDER
   holds them. Only mean curves and their components are kept here. The plate's scale is unknown: each step is scaled so
-  that its impulse carries the weight. Times of stance and double support at each speed, and the stature, which the files do not
-  tell, are means of adults (Bovi et al. 2011, Gait Posture 33:6-13).
+  that its impulse carries the weight. Times of stance and double support at each speed, and the stature, are not in the
+  files: they are means of adults (Bovi et al. 2011, Gait Posture 33:6-13).
 """
 
 from __future__ import annotations
@@ -164,7 +164,9 @@ def degraded(model: stage.VerticalModel, person: Person, noise: stage.Noise, rng
 def report(model: stage.VerticalModel, people: list[Person]) -> None:
     """Print errors on both groups of persons, and what remains of forces unlike those of healthy people."""
     for points, noise in model.noise.items():
-        click.echo(f"\n{points}: root mean square (% BW) as a phone's motion has it, of the model's mean, of the posterior;")
+        click.echo(
+            f"\n{points}: root mean square (% BW) as a phone's motion has it, of the model's mean, of the posterior;"
+        )
         click.echo("share of times in the posterior's 90 % interval")
         for kind in ("adult", "child"):
             for tuning in (True, False):
@@ -173,7 +175,9 @@ def report(model: stage.VerticalModel, people: list[Person]) -> None:
                 rows = [degraded(model, p, noise, rng) for p in group for _ in range(5)]
                 off = [[r[i] - r[0] for i in (1, 2)] for r in rows]
                 known = [f - model.expected(s) for p in group for f, s in zip(p.force, p.speed, strict=True)]
-                rms = [100.0 * np.sqrt(np.mean(np.square(v))) for v in ([o[0] for o in off], known, [o[1] for o in off])]
+                rms = [
+                    100.0 * np.sqrt(np.mean(np.square(v))) for v in ([o[0] for o in off], known, [o[1] for o in off])
+                ]
                 held = np.mean([np.abs(r[2] - r[0]) < WIDTH_SD * r[3] for r in rows])
                 name = f"{kind}, {'tuning' if tuning else 'held out'} ({len(group)})"
                 click.echo(f"  {name:24}" + "".join(f"{v:8.1f}" for v in rms) + f"{held:8.0%}")

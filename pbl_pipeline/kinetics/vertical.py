@@ -131,7 +131,7 @@ def load_vertical_model(name: str) -> VerticalModel:
     file = resources.files("pbl_pipeline.kinetics").joinpath("vertical_models", f"{name}.json")
     data: dict[str, Any] = parse_json(file.read_text(encoding="utf-8"))
     del data["made_by"]
-    arrays = {k: np.array(data.pop(k)) for k in ("phase", "mean", "slope", "person")}
+    arrays: dict[str, Any] = {k: np.array(data.pop(k)) for k in ("phase", "mean", "slope", "person")}
     noise = {k: Noise(*v) for k, v in data.pop("noise").items()}
     return VerticalModel(**data, **arrays, noise=noise)
 
@@ -143,7 +143,9 @@ def support_phase(stands: np.ndarray) -> Float[np.ndarray, " N"]:
     feet = stands.sum(axis=1)
     out = np.full(len(feet), np.nan)
     for n, begin in ((2, 0.0), (1, 1.0)):
-        seen = [(r, r.start > 0 and feet[r.start - 1] > 0, r.stop < len(feet) and feet[r.stop] > 0) for r in runs(feet == n)]
+        seen = [
+            (r, r.start > 0 and feet[r.start - 1] > 0, r.stop < len(feet) and feet[r.stop] > 0) for r in runs(feet == n)
+        ]
         whole = [r.stop - r.start for r, began, ended in seen if began and ended]
         for r, began, ended in seen:
             length = r.stop - r.start
@@ -159,7 +161,11 @@ def dimensionless_speed(centre_m: Float[np.ndarray, "N 3"], stature_m: float) ->
 
 
 def vertical_force(
-    needed_bw: Float[np.ndarray, " N"], stands: Float[np.ndarray, "N 2"], speed: float, model: VerticalModel, noise: Noise
+    needed_bw: Float[np.ndarray, " N"],
+    stands: Float[np.ndarray, "N 2"],
+    speed: float,
+    model: VerticalModel,
+    noise: Noise,
 ) -> VerticalForce:
     """Estimate the vertical force of both feet.
 
