@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import SLIDES as PLACE
-from pbl_pipeline.body import Body, load_body
+from pbl_pipeline.body import Body, load_body, stature_m
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitEvent
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
@@ -17,7 +17,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
-from .ground import GroundReaction, contact_of, ground_reaction
+from .ground import GroundReaction, contact_of, ground_reaction, needed_vertical
 from .inertia import Inertia, segment_inertia
 from .joints import knee_adduction, leg_moments
 from .measures import cycle_table, split_table
@@ -32,6 +32,7 @@ from .types import (
     TrialKinetics,
     Walk,
 )
+from .vertical import VerticalModel, dimensionless_speed, load_vertical_model, vertical_force
 
 #: What the method itself gets wrong of a measure of one leg (root mean square), from force plates: the tuning children
 #: of `python -m research.benchmarks.kinetics`, each with courses that were fitted to the other children. Their motion
@@ -169,14 +170,15 @@ def trial_kinetics(fit: TrialFit, gait: Walk, params: KineticsParams, *, aid: st
     body = load_body()
     inertia = segment_inertia(body, fit.scale)
     qpos = np.asarray(fit.qpos, float)
-    series = trial_series(body, fit, inertia, qpos, gait.events.events, params.cutoff_hz)
+    series = trial_series(body, fit, inertia, qpos, gait.events.events, params)
     if series is None:
         return TrialKinetics(fit.name, EMPTY, "TOO_SHORT", REASONS["TOO_SHORT"])
     table = cycle_table(series, gait.cycles)
+    rng = np.random.default_rng(40)
     drawn = [
         cycle_table(s, gait.cycles)
         for noise in _noise(fit, params)
-        if (s := trial_series(body, fit, inertia, qpos + noise, gait.events.events, params.cutoff_hz)) is not None
+        if (s := trial_series(body, fit, inertia, qpos + noise, gait.events.events, params, rng)) is not None
     ]
     samples = np.array(drawn) if drawn else None
     sd = np.full_like(table, np.nan) if samples is None else samples.std(axis=0, ddof=1)
@@ -204,17 +206,41 @@ def _code_against(fit: TrialFit, gait: Walk, aid: str) -> str:
 
 
 def trial_series(
-    body: Body, fit: TrialFit, inertia: Inertia, qpos: np.ndarray, events: Sequence[GaitEvent], cutoff_hz: float
+    body: Body,
+    fit: TrialFit,
+    inertia: Inertia,
+    qpos: np.ndarray,
+    events: Sequence[GaitEvent],
+    params: KineticsParams,
+    rng: np.random.Generator | None = None,
 ) -> Series | None:
-    """Return forces and moments over time of a trial's motion `qpos` (T, Q); None where no stretch is long enough."""
+    """Return forces and moments over time of a trial's motion `qpos` (T, Q); None where no stretch is long enough. With
+    `rng` the vertical force is drawn from its posterior, else it is the mean."""
     parts = []
-    for motion in smooth_motion(fit.time_s, qpos, cutoff_hz):
+    for motion in smooth_motion(fit.time_s, qpos, params.cutoff_hz):
         d = inverse_dynamics(body, fit.scale, inertia, motion)
-        parts.append(series_of(body, motion, d, ground_reaction(body, fit.scale, d, contact_of(motion.time_s, events))))
+        contact = contact_of(motion.time_s, events)
+        vertical = _vertical(body, fit, d, contact, load_vertical_model(params.vertical_model), rng)
+        parts.append(series_of(body, motion, d, ground_reaction(body, fit.scale, d, contact, vertical)))
     if not parts:
         return None
     names = [f.name for f in dataclasses.fields(Series)]
     return Series(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
+def _vertical(
+    body: Body, fit: TrialFit, d: Dynamics, contact: np.ndarray, model: VerticalModel, rng: np.random.Generator | None
+) -> np.ndarray:
+    """Return the vertical force (N/kg) of both feet: of one camera whose set of points `model` knows weighed against
+    it, else as the motion needs it. A fit that states no error cannot be weighed."""
+    stands = (contact == 1) & np.all(np.isfinite(contact), axis=1, keepdims=True)
+    needed = needed_vertical(d, stands)
+    noise = model.noise.get(fit.marker_set)
+    if noise is None or is_metric(fit) or not np.isfinite(fit.qpos_sd).any():
+        return needed
+    speed = dimensionless_speed(d.centre_m, stature_m(body, fit.scale))
+    force = vertical_force(needed / GRAVITY, stands, speed, model, noise)
+    return GRAVITY * (force.mean if rng is None else force.draw(rng))
 
 
 def series_of(body: Body, motion: Motion, d: Dynamics, ground: GroundReaction) -> Series:

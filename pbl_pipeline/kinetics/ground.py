@@ -126,12 +126,20 @@ def contact_of(time_s: np.ndarray, events: Sequence[GaitEvent]) -> Float[np.ndar
     return contact
 
 
-def ground_reaction(body: Body, scale: np.ndarray, d: Dynamics, contact: Float[np.ndarray, "N 2"]) -> GroundReaction:
-    """Return each foot's ground reaction of the motion `d`. `contact` (N, 2): `contact_of` its times."""
+def ground_reaction(
+    body: Body,
+    scale: np.ndarray,
+    d: Dynamics,
+    contact: Float[np.ndarray, "N 2"],
+    vertical_n: Float[np.ndarray, " N"] | None = None,
+) -> GroundReaction:
+    """Return each foot's ground reaction of the motion `d`. `contact` (N, 2): `contact_of` its times. `vertical_n`: the
+    vertical force of both feet, where it is not `needed_vertical`."""
     known = np.all(np.isfinite(contact), axis=1)
     stands = (contact == 1) & known[:, None]
     centre = np.stack([_pressure(body, scale, d, contact[:, k], k) for k in (0, 1)], axis=1)
-    vertical = _shares(stands) * np.maximum(d.force_n[:, 2] + _transient(d.force_n[:, 2], stands), 0.0)[:, None]
+    whole = needed_vertical(d, stands) if vertical_n is None else vertical_n
+    vertical = _shares(stands) * np.maximum(whole, 0.0)[:, None]
     turns = d.moment_nm - np.cross(d.centre_m, d.force_n)
     past = np.stack([-turns[:, 1], turns[:, 0]], axis=1) / np.maximum(d.force_n[:, 2:], 0.1 * GRAVITY)
     level = _leans(stands)[..., None] * _towards(d, centre, vertical, past, stands)
@@ -155,6 +163,12 @@ def trailing_share(phase: np.ndarray) -> np.ndarray:
 
 def _course(phase: np.ndarray, values: Sequence[float]) -> np.ndarray:
     return np.interp(phase, np.linspace(0.0, 1.0, len(values)), values)
+
+
+def needed_vertical(d: Dynamics, stands: np.ndarray) -> Float[np.ndarray, " N"]:
+    """Return the vertical force (N/kg) of both feet that the motion needs, with the sharp changes that it lacks
+    (`TRANSIENT`). `stands` (N, 2): whether [left, right] is on the floor."""
+    return d.force_n[:, 2] + _transient(d.force_n[:, 2], stands)
 
 
 def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:

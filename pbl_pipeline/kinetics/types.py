@@ -47,7 +47,8 @@ class KineticsParams:
 
     cutoff_hz: of the low-pass of the joint values; samples: how many motions are drawn from the fit's uncertainty for
     the intervals; varying_turns, varying_slides: the fraction of its variance that varies over a walk, of joint angles
-    and of the pelvis' place; memory_s: how long an error stays alike.
+    and of the pelvis' place; memory_s: how long an error stays alike; vertical_model: against which the vertical force
+    of one camera is weighed (`vertical.load_vertical_model`).
     """
 
     cutoff_hz: float = 6.0
@@ -55,6 +56,7 @@ class KineticsParams:
     varying_turns: float = 0.05
     varying_slides: float = 0.002
     memory_s: float = 0.2
+    vertical_model: str = "vertical-force-1"
 
 
 class Walk(Protocol):

@@ -108,9 +108,9 @@ def forces(known: Known, view: str, detector: str) -> tuple[TrialFit, TrialFit, 
 
 def vertical_rms(walk: Walk, fit: TrialFit, exact: TrialFit) -> float:
     """Return the root mean square error of the vertical force of a foot on the floor (% BW), under the true events."""
-    body, cutoff = load_body(), METHODS.find().params.cutoff_hz
+    body, params = load_body(), METHODS.find().params
     ours, true = (
-        trial_series(body, f, segment_inertia(body, f.scale), np.asarray(f.qpos, float), walk.events, cutoff)
+        trial_series(body, f, segment_inertia(body, f.scale), np.asarray(f.qpos, float), walk.events, params)
         for f in (fit, exact)
     )
     assert ours is not None

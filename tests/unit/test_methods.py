@@ -37,7 +37,7 @@ SHIPPED = {
     ("gdi", "pbl-2025-three-angles", 6): "fa0e247c66df42b3",
     ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
     ("gdi", "paper-2025", 1): "a51bf145c1179652",
-    ("kinetics", "newton-euler", 2): "954f0a0e47d5081b",
+    ("kinetics", "newton-euler", 3): "c25f7a34f5843ef0",
 }
 EVERY = [m for name in methods.STAGES for m in of_stage(name).values()]
 
