@@ -304,8 +304,9 @@ def error_table(frame: pd.DataFrame) -> pd.DataFrame:
     """Per kind of session: bias, sd and rms of the error, of the plain mean curves beside it; the fraction of 90 %
     intervals that hold the truth; the fraction of pairs of visits without a change that lie within the minimal one."""
     rows: list[dict[str, Any]] = []
-    groups = [("one pass, any view", frame[frame["passes"] == 1]), *frame.groupby("kind", sort=False)]
-    for name, group in groups:
+    single = frame[frame["passes"] == 1]
+    groups = [("one pass, any view", single)] if len(single) else []
+    for name, group in [*groups, *frame.groupby("kind", sort=False)]:
         off, plain = group["found"] - group["true"], group["plain"] - group["true"]
         keys = ["kind", "person", "condition", "severity"]
         visits: Any = group.groupby([*keys, "visit"])[["found", "sd_anew"]].first().unstack("visit").dropna()
@@ -511,14 +512,15 @@ def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def left_out_in_turn(seen: Sequence[Seen], norm: NormativeSet) -> pd.DataFrame:
-    """Sessions of tuning persons, each judged by a model of the others (`judged`), with the error by its sd."""
+def left_out_in_turn(seen: Sequence[Seen], sessions: Sequence[Seen], norm: NormativeSet) -> pd.DataFrame:
+    """Sessions of tuning persons, each judged by a model of what is seen of the others (`judged`), with the error by
+    its sd."""
     people = sorted({s.person for s in seen})
     frames = []
     for fold in range(FOLDS):
         out = set(people[fold::FOLDS])
         model = fit_model([s for s in seen if s.person not in out], norm, ())
-        frame = judged([s for s in seen if s.person in out], model, norm)
+        frame = judged([s for s in sessions if s.person in out], model, norm)
         frames.append(frame.assign(ratio=(frame["found"] - frame["true"]).abs() / frame["sd"]))
     return pd.concat(frames)
 
@@ -580,10 +582,14 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
     models = {}
     for fitted in (ALONE, TOGETHER):
         if own := parts["tuning", fitted]:
-            out = left_out_in_turn(own, basis)
+            out = left_out_in_turn(own, own, basis)
             models[fitted] = fit_model(own, basis, [method.hash], widening_of(out))
             click.echo(f"\n{fitted}: {len(own)} passes, {len(parts['held out', fitted])} held out")
             _echo_left_out(out, models[fitted].widening, people[1])
+            if fitted == TOGETHER:
+                click.echo("\nthe same by models of passes fitted alone")
+                out = left_out_in_turn(parts["tuning", ALONE], own, basis)
+                _echo_left_out(out, models[ALONE].widening, people[1])
     for (title, fitted), part in parts.items():
         if not part:
             continue
@@ -619,6 +625,7 @@ def _echo_left_out(out: pd.DataFrame, widening: float, n_held_out: int) -> None:
     click.echo(
         f"of {n_held_out} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
     )
+    _echo("tuning persons left out in turn: error of the index", error_table(out.assign(sd=out["sd"] * widening)))
 
 
 if __name__ == "__main__":
