@@ -17,7 +17,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS
 from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_visible
 from pbl_pipeline.models.gpu_server import Server
-from pbl_pipeline.models.network import NetworkSpec, read_network
+from pbl_pipeline.models.network import NetworkSpec
+from pbl_pipeline.models.tflite import read_network
 from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
 from research.benchmarks.many_videos import differences
@@ -52,7 +53,7 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
 )
 def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
-    model = read_model(read_network(spec))
+    model = read_model(read_network(spec.path, spec.sha256, spec.outputs))
     shown = [spec.entered(p) for p in pictures(model.image_shape[0], 2)]
     got = model(model.weights, jnp.stack(shown))
     lite = LiteModel(spec.path, spec.sha256, spec.outputs)
@@ -68,7 +69,7 @@ def test_unknown_operation_is_named() -> None:
     from ai_edge_litert import schema_py_generated as schema
 
     spec = spec_of("blazepose_landmarks")
-    content = schema.ModelT.InitFromObj(schema.Model.GetRootAs(read_network(spec), 0))
+    content = schema.ModelT.InitFromObj(schema.Model.GetRootAs(read_network(spec.path, spec.sha256, spec.outputs), 0))
     assert content.operatorCodes is not None
     for code in content.operatorCodes:
         if code.builtinCode == schema.BuiltinOperator.LOGISTIC:
