@@ -60,7 +60,7 @@ class VerticalModel:
     speed_range
         Least and greatest dimensionless speed (speed over the root of gravity times stature) of the walks.
     step_sd, step_memory_s
-        What a step has of its own.
+        Standard deviation and memory of a step's own part.
     noise_memory_s
         How long the noise stays alike.
     noise

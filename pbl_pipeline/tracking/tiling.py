@@ -71,7 +71,7 @@ def size_of(scene: Scene) -> tuple[int, int]:
 
 
 def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window) -> list[Detection]:
-    """What the detector finds in a window, of which `inside` lies in the picture, in pixels of the picture."""
+    """Return the detections in a window, of which `inside` lies in the picture, in pixels of the picture."""
     x, y, right, bottom = inside
     scale = 1.0
     if isinstance(scene, Frame):

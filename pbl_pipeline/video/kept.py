@@ -32,7 +32,7 @@ class Pictures:
 
 
 class _Shelf:
-    """What this process keeps: the last video that was read whole."""
+    """The last video that was read whole in this process, where pictures are to be kept."""
 
     def __init__(self) -> None:
         self.wanted = 0
