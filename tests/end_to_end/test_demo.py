@@ -194,6 +194,7 @@ def test_a_second_populate_does_nothing(home, out):
     assert pbl(home, "db", "stop").returncode == 0
 
 
+@pytest.mark.long
 def test_reports_and_exports_come_from_a_named_server_without_posix(home, out, tmp_path):
     assert pbl(home, "db", "start").returncode == 0
     folder = Folder(home / "db")

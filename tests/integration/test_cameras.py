@@ -71,6 +71,7 @@ def added(file: Path, *more: object) -> str:
     return done.out
 
 
+@pytest.mark.long
 def test_a_phone_is_registered_once(tmp_path: Path):
     apple = recording(tmp_path, "apple", APPLE)
     stands = upright(tmp_path, "stands", APPLE)

@@ -157,6 +157,7 @@ def test_the_password_comes_from_the_file_even_where_the_variable_is_set(databas
         assert server.ping() is None
 
 
+@pytest.mark.long
 def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path):
     """Commands that work and commands that fail, with all logging on: neither output nor files name the secrets."""
     right = Folder(database / "db").credentials().app_password

@@ -97,6 +97,7 @@ def test_what_a_decision_made_pending_is_computed_of_this_visit_alone(visits: No
     assert len(tracking.Tracking & {"video_id": later[0]}) == 0  # another visit's work is left to workers
 
 
+@pytest.mark.long
 def test_a_visit_waits_for_the_one_before_and_says_so(visits: None, browser: Any, hold: Path):
     (hold / "hold").touch()
     mark(browser, 1)

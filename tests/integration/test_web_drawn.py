@@ -81,6 +81,7 @@ def test_a_report_is_served_without_scripts_and_says_what_it_is_of(visit: Path, 
     assert browser.get("/recordings/99/overlay").status_code == 404
 
 
+@pytest.mark.long
 def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
     visit: Path, browser: Any, monkeypatch: pytest.MonkeyPatch
 ):

@@ -103,6 +103,7 @@ def serious(page: Any, kind: str, run: object) -> dict[str, list[tuple[str, str]
     }
 
 
+@pytest.mark.long
 def test_axe_finds_nothing_serious_and_every_width_holds_the_page(chromium: Any, visits: None, axe: str):
     found: dict[str, object] = {}
     with web.shown(chromium, "reviewer,operator", (1200, 900), bypass_csp=True, refused=True) as page:
