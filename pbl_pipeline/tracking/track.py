@@ -97,7 +97,7 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
         elsewhere = watch.elsewhere(now, associator.live)
         if not (due or elsewhere):
             continue
-        scene = frame if detector.window_px else frame.image
+        scene = frame if getattr(detector, "window_px", 0) else frame.image  # one of a laboratory may have none
         found = detect_in(detector, scene, watch.around(now, due), elsewhere)
         found = [_with_appearance(d, scene) for d in found]
         for new in associator.step(frame.index, now, found, due):
