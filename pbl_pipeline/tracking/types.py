@@ -32,7 +32,8 @@ Scene = Frame | np.ndarray
 class PersonDetector(Protocol):
     """Finds people in one upright BGR frame. Implementations hold a loaded model and are not shared by threads.
 
-    window_px: side of the square that it is shown of a window of the frame; 0: the window's own pixels.
+    window_px: side of the square that it is shown of a window of the frame; 0, or a detector without it: the window's
+    own pixels.
     """
 
     name: str
