@@ -77,7 +77,7 @@ def test_the_box_is_between_numpys_percentiles_of_the_points_seen():
     k = seen()
     rng = np.random.default_rng(0)
     k = dataclasses.replace(
-        k, confidence=np.where(rng.random(k.confidence.shape) < 0.5, 0.0, 0.9), time_s=40 * k.time_s
+        k, confidence=np.where(rng.random(k.confidence.shape) < 0.5, 0.0, k.confidence), time_s=40 * k.time_s
     )
     points = np.where(k.confidence[..., None] > 0, k.xy_px, np.nan)
     low, high = np.nanpercentile(points, (5, 95), axis=1)
