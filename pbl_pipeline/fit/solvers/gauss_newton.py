@@ -16,7 +16,7 @@ from .linear import BorderedBandedSystem, solve
 from .result import Result
 
 #: A step of a frame's unknown is cut to this.
-LONGEST_STEP = 0.8
+LONGEST_STEP = 0.5
 #: Damping of the first step, the least at all and after a step that was refused (less changes no step), and the most.
 DAMPING_START, DAMPING_LEAST, DAMPING_REFUSED, DAMPING_MOST = 1e-2, 1e-7, 1e-3, 1e7
 #: Where no unknown of a frame moves further than `NEAR`, the step is as many Gauss-Newton steps long as a secant says,
