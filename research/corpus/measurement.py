@@ -331,6 +331,24 @@ def error_table(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def lasting_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Parts of the index's error by kind of session, as standard deviations: what all walks of a person have in common,
+    bias included, what both visits of a walk have in common beside it, and what is drawn anew at each. More passes of a
+    kind lessen the last alone. Means of products of two errors, as in `fit_model`."""
+    keys = ["person", "condition", "severity"]
+    rows = []
+    for kind, own in frame.assign(off=frame["found"] - frame["true"]).groupby("kind", sort=False):
+        visits: Any = own.groupby([*keys, "visit"])["off"].mean().unstack("visit").dropna()
+        of_person: Any = own.groupby(keys)["off"].mean().groupby("person")
+        n, total, squares = of_person.size(), of_person.sum(), of_person.agg(lambda v: (v**2).sum())
+        several = n > 1
+        person = np.average(((total**2 - squares) / (n * (n - 1)))[several], weights=n[several])
+        walk = (visits[0] * visits[1]).mean() - person
+        parts = np.array([person, walk, (own["off"] ** 2).mean() - person - walk])
+        rows.append({"session": kind, **dict(zip(("person", "walk", "anew"), np.sqrt(parts.clip(0.0)), strict=True))})
+    return pd.DataFrame(rows)
+
+
 def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     """Of the true change of synthetic people between healthy and the severest impairment, the fraction that is found,
     by impairment and kind of session; impairments that change the index by less than 3 points in the mean are left
@@ -626,6 +644,7 @@ def _echo_left_out(out: pd.DataFrame, widening: float, n_held_out: int) -> None:
         f"of {n_held_out} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
     )
     _echo("tuning persons left out in turn: error of the index", error_table(out.assign(sd=out["sd"] * widening)))
+    _echo("tuning persons left out in turn: parts of the error", lasting_table(out))
 
 
 if __name__ == "__main__":
