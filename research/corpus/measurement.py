@@ -24,7 +24,6 @@ from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
     IMPORTANT_CHANGE,
-    TERMS,
     MeasureError,
     MeasurementModel,
     Pass,
@@ -280,8 +279,7 @@ def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) ->
     """A row per session: whose, the true index, the found one with its errors, and that of the plain mean curves."""
     rows = []
     for kind, visit, passes in sessions_of(seen):
-        widening = model.of(len(passes)).widening
-        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, widening)
+        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, model.widening)
         plain, true = (np.mean([getattr(s, n) for s in passes], axis=0) for n in ("scores", "true"))
         first = passes[0]
         rows.append(
@@ -337,9 +335,10 @@ def lasting_table(frame: pd.DataFrame) -> pd.DataFrame:
     kind lessen the last alone. Means of products of two errors, as in `fit_model`."""
     keys = ["person", "condition", "severity"]
     rows = []
-    for kind, own in frame.assign(off=frame["found"] - frame["true"]).groupby("kind", sort=False):
+    kinds: Any = frame.assign(off=frame["found"] - frame["true"]).groupby("kind", sort=False)
+    for kind, own in kinds:
         visits: Any = own.groupby([*keys, "visit"])["off"].mean().unstack("visit").dropna()
-        of_person: Any = own.groupby(keys)["off"].mean().groupby("person")
+        of_person = own.groupby(keys)["off"].mean().groupby("person")
         n, total, squares = of_person.size(), of_person.sum(), of_person.agg(lambda v: (v**2).sum())
         several = n > 1
         person = np.average(((total**2 - squares) / (n * (n - 1)))[several], weights=n[several])
@@ -571,13 +570,8 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value
 
-    def written(model: MeasurementModel, names: Iterable[str]) -> dict[str, Any]:
-        views = {k: plain(v) for k, v in model.views.items() if k != RIGHT}
-        return {n: plain(getattr(model, n)) for n in names} | {"views": views}
-
-    content = written(model, [f.name for f in dataclasses.fields(model) if f.name != "jointly"])
-    if model.jointly is not None:
-        content["jointly"] = written(model.jointly, TERMS)
+    content = {f.name: plain(getattr(model, f.name)) for f in dataclasses.fields(model)}
+    del content["views"][RIGHT]  # that of the left, mirrored
     path.write_text(json.dumps({"made_by": made_by, **content}, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
@@ -626,7 +620,7 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
         _echo(f"{about}: probability of a change, by session", probability_errors(pairs), 3)
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
-        model = dataclasses.replace(models[ALONE], name=write.stem, jointly=models.get(TOGETHER))
+        model = dataclasses.replace(models[ALONE], name=write.stem)
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
         click.echo(f"\n{write}")
 
