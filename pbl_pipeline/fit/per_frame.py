@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline import progress
@@ -23,14 +23,13 @@ from pbl_pipeline.jax_setup import compile_seconds
 from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
-from .normal_equations import Linearised, linearise, moved
+from .lanes import Found, begin_one, fetch, fit_many, fit_one
 from .params import GaussNewtonParams
 from .phone_error import phone_variance
-from .problem import Problem, State, pixels_alone, power_of_2
+from .problem import Problem, State, pixels_alone
 from .session import Session
-from .solution import Outcome, Solution, outcome
-from .solvers.gauss_newton import Limits, Progress, before_first, minimise
-from .solvers.linear import marginal_variance
+from .solution import Solution
+from .solvers.gauss_newton import Limits, Progress
 from .solvers.result import Result
 from .weights import Weights
 
@@ -39,23 +38,6 @@ from .weights import Weights
 STANDING_FRACTION, STANDING_M_PER_S, STANDING_S = 0.25, 0.2, 0.03
 #: Knees at their straight end in more than this fraction of the frames may belong to a body that faces the wrong way.
 BACKWARDS_FRACTION = 0.2
-
-
-@dataclasses.dataclass(frozen=True)
-class _Found:
-    """Where an iteration ended, on the host; the points there or, of the last one, the variances (F, U) of the frames'
-    unknowns and the outcome."""
-
-    end: Progress
-    x: np.ndarray | None  # (F, P, 3)
-    variance: np.ndarray | None = None
-    outcome: Outcome | None = None
-
-    @property
-    def trace(self) -> np.ndarray:
-        """(K, 2): iteration and cost after it."""
-        n = int(self.end.iteration)
-        return np.stack([np.arange(1, n + 1), np.asarray(self.end.trace)[:n]], axis=1).astype(np.float64)
 
 
 def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]) -> list[Solution]:
@@ -129,53 +111,14 @@ def _with_detector(start: State, params: GaussNewtonParams) -> State:
     return dataclasses.replace(start, lean=seen[0], depth_m=seen[1])
 
 
-def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
-    """What `fit_problem` begins with."""
-    return before_first(lambda state: linearise(body, p, w, state), start)
-
-
-def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before."""
-    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits)
-
-
-def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
-    """Variances of the frames' unknowns as far as the residuals tell (dispersion times the inverse curvature's
-    diagonal), and the outcome."""
-    system = latest.system
-    own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
-    # What nothing holds gets a variance that is large, not infinite: each joint on its own scale, so that the pelvis'
-    # curvature does not make the toes look sure.
-    held = system.diagonal + jnp.diag(1e-6 * jnp.max(own, axis=0))
-    corner = system.corner + 1e-6 * jnp.max(jnp.diagonal(system.corner)) * jnp.eye(system.corner.shape[0])
-    variance, _ = marginal_variance(dataclasses.replace(system, diagonal=held, corner=corner))
-    return variance * latest.dispersion, outcome(p, latest.x, R_nc)
-
-
-_begin_one = jax.jit(begin_of, static_argnames="body")
-_one = jax.jit(fit_problem, static_argnames="body")
-_finish_one = jax.jit(finish)
-_finish_many = jax.jit(jax.vmap(finish))
-
-
-@functools.partial(jax.jit, static_argnames="body")
-def _begin_many(body: Body, p: Problem, w: Weights, start: State) -> Progress:
-    return jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
-
-
-@functools.partial(jax.jit, static_argnames="body")
-def _many(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    return jax.vmap(functools.partial(fit_problem, body), in_axes=(0, None, 0, None))(p, w, begin, limits)
-
-
 def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """`_one` with a bar that moves with each iteration; all at once where nobody looks at it."""
+    """`fit_one` with a bar that moves with each iteration; all at once where nobody looks at it."""
     if not progress.enabled():
-        return _one(body, p, w, begin, limits)
+        return fit_one(body, p, w, begin, limits)
     most, at = int(limits.iterations), begin
     with progress.bar("fit", unit=" iterations") as update:
         for n in range(most + 1):  # the first one evaluates the start
-            at = _one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
+            at = fit_one(body, p, w, at, dataclasses.replace(limits, iterations=jnp.asarray(n, jnp.int32)))
             update(min(n, 1), f"of at most {most}, cost {float(at.cost):.4g}")
             if int(at.result) != Result.BOUND:
                 break
@@ -188,27 +131,18 @@ def _solve(
     starts: Sequence[State],
     params: GaussNewtonParams,
     last: bool,
-) -> list[_Found]:
-    body, alone = sessions[0].body, len(sessions) == 1
+) -> list[Found]:
+    body = sessions[0].body
     w = Weights.of(body, params, size_unseen=pixels_alone(sessions[0].problem))
     limits = limits_of(params)
-    given = list(zip(problems, starts, strict=True))
-    if not alone:
-        # The last one stands in for those that are missing, so that a worker compiles a program for few sizes.
-        given += [given[-1]] * (power_of_2(len(given)) - len(given))
-    # Stacked on the host, so that each array goes to the device once.
-    p, start = jax.device_put(given[0] if alone else jax.tree.map(lambda *a: np.stack(a), *given))
     with one_blas_thread():
-        begin = (_begin_one if alone else _begin_many)(body, p, w, start)
-        end = (_step_by_step if alone else _many)(body, p, w, begin, limits)
-        rest = (_finish_one if alone else _finish_many)(p, end.latest, end.state.R_nc) if last else ()
-        x = None if last else end.latest.x
-        found = jax.device_get((dataclasses.replace(end, latest=None, candidate=None), x, *rest))
-    each = [found] if alone else [jax.tree.map(lambda a, i=i: a[i], found) for i in range(len(sessions))]
-    return [_Found(*f) for f in each]
+        if len(sessions) > 1:
+            return fit_many(body, list(zip(problems, starts, strict=True)), w, limits, last)
+        p, start = jax.device_put((problems[0], starts[0]))
+        return [fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), last)]
 
 
-def _on_floor(session: Session, found: _Found) -> tuple[Problem, State]:
+def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
     """The problem with the frames in which feet stand, as a solution shows them, and that solution to start from."""
     p, state = session.problem, found.end.state
     assert found.x is not None
@@ -234,7 +168,7 @@ def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> 
 def _solution(
     session: Session,
     spread: tuple[np.ndarray, np.ndarray],
-    found: _Found,
+    found: Found,
     scale: np.ndarray,
     trace: np.ndarray,
     pelvis_told: np.ndarray | None,

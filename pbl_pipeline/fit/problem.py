@@ -161,7 +161,10 @@ SMOOTH_S = 0.02
 
 
 def pad_frames(n: int, coarse: bool = False) -> int:
-    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ...; `coarse`: 256 or more of these."""
+    """The size to which `n` frames are padded: 64, 96, 128, 192, 256, 384 ...; `coarse`: 256, 320, 384, 448, 512, then
+    768 and more of these."""
+    if coarse and n <= 2 * COARSE_FRAMES:
+        return max(COARSE_FRAMES, -(-n // MIN_FRAMES) * MIN_FRAMES)
     size = COARSE_FRAMES if coarse else MIN_FRAMES
     while size < n:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3

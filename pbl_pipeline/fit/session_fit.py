@@ -33,8 +33,9 @@ from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
 
-#: Sessions solved at once on a GPU: enough to fill it, few enough that the next ones are packed meanwhile.
-BATCH = 32
+#: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
+#: packed meanwhile.
+BATCH = 128
 #: Threads that pack them and make their results: numpy's larger steps run beside each other.
 PACKERS = 4
 
@@ -93,8 +94,8 @@ def fit_sessions(
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
-    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once, padded to a
-    power of 2 (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
+    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once
+    (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """

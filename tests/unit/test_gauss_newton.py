@@ -33,10 +33,11 @@ from pbl_pipeline.fit.keypoint_terms import (
     residual_2d_px,
     residual_3d_cm,
 )
+from pbl_pipeline.fit.lanes import begin_of, finish, fit_problem
 from pbl_pipeline.fit.linearised import linearised
 from pbl_pipeline.fit.normal_equations import linearise, moved
 from pbl_pipeline.fit.objective import TERMS, total
-from pbl_pipeline.fit.per_frame import begin_of, finish, fit_problem, limits_of, standing, start_of
+from pbl_pipeline.fit.per_frame import limits_of, standing, start_of
 from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual_phone_deg
 from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session

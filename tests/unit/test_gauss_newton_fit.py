@@ -24,6 +24,7 @@ from pbl_pipeline.fit import (
     TrialFit,
     fit_session,
     fit_sessions,
+    lanes,
     per_frame,
     problem,
     session_fit,
@@ -280,6 +281,16 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
         assert (check.check, check.outcome, check.advice) == (other.check, other.outcome, other.advice)
         assert (check.value is None) == (other.value is None)
         assert check.value is None or check.value == pytest.approx(other.value, rel=1e-2)
+
+
+def test_more_sessions_than_lanes_are_each_as_alone(walkers, one_by_one, monkeypatch):
+    """Two lanes for five sessions: who ended makes room, and the last one moves to a program of one."""
+    monkeypatch.setattr(lanes, "LANES", 2)
+    monkeypatch.setattr(lanes, "FEW", 1)
+    together = fit_sessions([*walkers, *walkers[:2]], PARAMSET, batch=5)
+    for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
+        assert isinstance(fit, SessionFit)
+        assert_same(alone, fit)
 
 
 def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monkeypatch):

@@ -1,0 +1,168 @@
+"""The compiled solve of one problem, and of many side by side on a GPU, each for as long as it takes.
+
+Problems differ in how many iterations they need (8 to 43 of 256 walks), and a batch that is solved together waits for
+its slowest. So a program has lanes: after every few iterations those that have ended make room for the next.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pbl_pipeline.body import Body
+
+from .normal_equations import Linearised, linearise, moved
+from .problem import Problem, State, power_of_2
+from .solution import Outcome, outcome
+from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
+from .solvers.linear import marginal_variance
+from .solvers.result import Result
+from .weights import Weights
+
+#: Lanes of a program: enough to fill a GPU, where an iteration takes longer with each lane from 16 on; and of the one
+#: that the last problems move to.
+LANES, FEW = 32, 8
+#: Most frames of all lanes together, which bounds the memory.
+MOST_FRAMES = 32768
+#: Iterations between two looks at which have ended.
+ROUND = 4
+
+#: Problems and where each stands.
+_Lanes = tuple[Problem, Progress]
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """Where an iteration ended, on the host; the points there or, where it was the last one, the variances (F, U) of
+    the frames' unknowns and the outcome."""
+
+    end: Progress
+    x: np.ndarray | None  # (F, P, 3)
+    variance: np.ndarray | None = None
+    outcome: Outcome | None = None
+
+    @property
+    def trace(self) -> np.ndarray:
+        """(K, 2): iteration and cost after it."""
+        n = int(self.end.iteration)
+        return np.stack([np.arange(1, n + 1), np.asarray(self.end.trace)[:n]], axis=1).astype(np.float64)
+
+
+def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
+    """What `fit_problem` begins with."""
+    return before_first(lambda state: linearise(body, p, w, state), start)
+
+
+def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
+    """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before."""
+    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits)
+
+
+def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
+    """Variances of the frames' unknowns as far as the residuals tell (dispersion times the inverse curvature's
+    diagonal), and the outcome."""
+    system = latest.system
+    own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
+    # What nothing holds gets a variance that is large, not infinite: each joint on its own scale, so that the pelvis'
+    # curvature does not make the toes look sure.
+    held = system.diagonal + jnp.diag(1e-6 * jnp.max(own, axis=0))
+    corner = system.corner + 1e-6 * jnp.max(jnp.diagonal(system.corner)) * jnp.eye(system.corner.shape[0])
+    variance, _ = marginal_variance(dataclasses.replace(system, diagonal=held, corner=corner))
+    return variance * latest.dispersion, outcome(p, latest.x, R_nc)
+
+
+begin_one = jax.jit(begin_of, static_argnames="body")
+fit_one = jax.jit(fit_problem, static_argnames="body")
+_finish_one = jax.jit(finish)
+_finish_many = jax.jit(jax.vmap(finish))
+
+
+def fetch(p: Problem, end: Progress, last: bool, several: bool = False) -> Found:
+    """What is to be known on the host of an iteration that ended; of `several` lanes with a first axis more."""
+    rest = (_finish_many if several else _finish_one)(p, end.latest, end.state.R_nc) if last else ()
+    kept = dataclasses.replace(end, latest=None, candidate=None, direction=None)
+    return Found(*jax.device_get((kept, None if last else end.latest.x, *rest)))
+
+
+def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool) -> list[Found]:
+    """Fit problems of the same sizes from their starts, in their order: see `fetch`.
+
+    The result does not depend on which problems are given together beyond rounding.
+    """
+    n = min(LANES, power_of_2(len(given)), max(1, MOST_FRAMES // given[0][0].weight.shape[0]))
+    waiting = deque(range(len(given)))
+    holds = [waiting.popleft() if waiting else None for _ in range(n)]
+    # Stacked on the host, so that each array goes to the device once; the last one stands in for those missing.
+    p, start = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *[given[-1 if i is None else i] for i in holds]))
+    lanes = p, _begin(body, p, w, start)
+    ended, slots = jax.tree.map(jnp.zeros_like, lanes), list[int]()
+    found: dict[int, Found] = {}
+    most = min(int(limits.iterations), MOST_ITERATIONS)
+    while any(i is not None for i in holds):
+        lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits)
+        result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
+        for lane, i in enumerate(holds):
+            if i is None or (result[lane] == Result.BOUND and iteration[lane] < most):
+                continue
+            ended = _move(ended, lanes, len(slots), lane)
+            slots.append(i)
+            holds[lane] = waiting.popleft() if waiting else None
+            if holds[lane] is not None:
+                lanes = _put(body, w, lanes, given[holds[lane]], lane)
+            if len(slots) == n:
+                found |= _separate(fetch(ended[0], ended[1], last, several=True), slots)
+        busy = [lane for lane, i in enumerate(holds) if i is not None]
+        if not waiting and 0 < len(busy) <= FEW < len(holds):
+            at = (busy * FEW)[:FEW]
+            lanes, holds = _some(lanes, np.asarray(at)), [holds[i] for i in busy] + [None] * (FEW - len(busy))
+    if slots:
+        found |= _separate(fetch(ended[0], ended[1], last, several=True), slots)
+    return [found[i] for i in range(len(given))]
+
+
+def _separate(found: Found, slots: list[int]) -> dict[int, Found]:
+    """What each problem found; empties `slots`, the numbers of the problems in these lanes."""
+    parts = found.end, found.x, found.variance, found.outcome
+    out = {i: Found(*jax.tree.map(lambda a, k=k: a[k], parts)) for k, i in enumerate(slots)}
+    slots.clear()
+    return out
+
+
+@functools.partial(jax.jit, static_argnames="body")
+def _begin(body: Body, p: Problem, w: Weights, start: State) -> Progress:
+    return jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
+
+
+@functools.partial(jax.jit, static_argnames="body")
+def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits) -> Progress:
+    """`ROUND` iterations more of each lane that has not ended."""
+
+    def more(p: Problem, at: Progress) -> Progress:
+        most = jnp.minimum(limits.iterations, at.iteration + ROUND)
+        return fit_problem(body, p, w, at, dataclasses.replace(limits, iterations=most))
+
+    return jax.vmap(more)(p, at)
+
+
+@functools.partial(jax.jit, donate_argnames="into")
+def _move(into: _Lanes, lanes: _Lanes, slot: Any, lane: Any) -> _Lanes:
+    return jax.tree.map(lambda a, b: a.at[slot].set(b[lane]), into, lanes)
+
+
+@functools.partial(jax.jit, static_argnames="body", donate_argnames="lanes")
+def _put(body: Body, w: Weights, lanes: _Lanes, given: tuple[Problem, State], lane: Any) -> _Lanes:
+    p, start = given
+    return jax.tree.map(lambda a, b: a.at[lane].set(b), lanes, (p, begin_of(body, p, w, start)))
+
+
+@jax.jit
+def _some(lanes: _Lanes, at: Any) -> _Lanes:
+    return jax.tree.map(lambda a: a[at], lanes)
