@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.bounded import parse_json
+from pbl_pipeline.shipped import shipped_model
 
 from .cycle_measures import Z90
 from .events import LEFT, RIGHT
@@ -170,13 +170,11 @@ def model_names() -> tuple[str, ...]:
 @functools.cache
 def load_model(name: str) -> MeasurementModel:
     """Return a model that ships, by its name."""
-    data: dict[str, Any] = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
-    del data["made_by"]
+    data = shipped_model(f"gait/measurement_models/{name}.json", ("mean", "spread", "cycle"))
     jointly = data.pop("jointly", None)
     errors = {k: {n: MeasureError(*e) for n, e in view.items()} for k, view in data.pop("measures").items()}
-    arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "cycle")}
     terms = _terms({n: data.pop(n) for n in TERMS})
-    model = MeasurementModel(**data, **arrays, **terms, measures=errors)
+    model = MeasurementModel(**data, **terms, measures=errors)
     return (
         model if jointly is None else dataclasses.replace(model, jointly=dataclasses.replace(model, **_terms(jointly)))
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 from collections.abc import Mapping
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain
+from pbl_pipeline.shipped import shipped_text
 
 SIDES = ("left", "right", "both")
 #: Points of a curve, in percent of the gait cycle.
@@ -33,9 +33,8 @@ class Column:
 
 
 def _frames() -> dict[str, tuple[Column, ...]]:
-    text = resources.files("pbl_pipeline.study").joinpath("frame_columns.csv").read_text(encoding="utf-8")
     found: dict[str, list[Column]] = {}
-    for row in csv.DictReader(text.splitlines()):
+    for row in csv.DictReader(shipped_text("study/frame_columns.csv").splitlines()):
         column = Column(row["name"], row["kind"], row["unit"], row["meaning"], row["optional"] == "yes")
         found.setdefault(row["frame"], []).append(column)
     found["curves"] += [
