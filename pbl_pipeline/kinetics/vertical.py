@@ -128,7 +128,8 @@ class _Part:
 def load_vertical_model(name: str) -> VerticalModel:
     """Return a model that ships."""
     data = shipped_model(f"kinetics/vertical_models/{name}.json", ("phase", "mean", "slope", "person"))
-    return VerticalModel(**data | {"noise": {k: Noise(*v) for k, v in data["noise"].items()}})
+    noise = {k: Noise(*v) for k, v in data.pop("noise").items()}
+    return VerticalModel(**data, noise=noise)
 
 
 def support_phase(stands: np.ndarray) -> Float[np.ndarray, " N"]:

@@ -29,6 +29,16 @@ from .tables import Tables, on_disk
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
 _on_disk = functools.partial(on_disk, "tell who runs the server")
+_busy = functools.partial(
+    PblError,
+    "DB_REFUSED",
+    found="recordings of the drop folder are being taken over",
+    expected="one import at a time",
+    next_step="send it again in some minutes",
+)
+_no_file = functools.partial(
+    PblError, "USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it"
+)
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
@@ -148,7 +158,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             if done is not None:
                 return done
             await asyncio.sleep(1.0)
-        return [Outcome(one.name, "refused", error=_busy(one.name)) for one, _ in good]
+        return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
 
     return [
         *page("/visits/new", new, "decide"),
@@ -229,17 +239,3 @@ def _visits_of_person_of(session_id: int) -> list[int]:
 
 def _populations() -> list[str]:
     return [str(p) for p in lab.Population().to_arrays("population") if p != "unknown"]
-
-
-def _no_file() -> PblError:
-    return PblError("USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it")
-
-
-def _busy(name: str) -> PblError:
-    return PblError(
-        "DB_REFUSED",
-        found="recordings of the drop folder are being taken over",
-        expected="one import at a time",
-        next_step="send it again in some minutes",
-        key=name,
-    )
