@@ -92,7 +92,7 @@ class YoloxDetector:
         ]
 
     def _invalid(self, found: str, expected: str) -> PblError:
-        return model_invalid(self._model.folder, found, expected)
+        return model_invalid(found, expected, key=self._model.folder)
 
 
 def yolox(params: TrackingParams) -> YoloxDetector:
