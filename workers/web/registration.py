@@ -19,7 +19,7 @@ from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
 from ..incoming import VIDEO_ENDINGS, Copy
 from ..refresh import queue_visit
-from .access import BODY_BYTES, Refused, Session, check_fields, check_token, form_of
+from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
@@ -62,8 +62,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def register(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
-        number, errors = await tables.ask(visit_forms.register_visit, fields, session.name)
+        number, errors = await tables.ask(visit_forms.register_visit, fields, sender(request))
         if errors:
             return await new_page(request, fields, errors)
         if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
@@ -91,9 +90,8 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def correct(request: Request) -> Response:
         fields = dict(await form_of(request))
-        session: Session = request.state.session
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_forms.correct, number, fields, session.name, seen, reason)
+        changed, errors = await tables.ask(visit_forms.correct, number, fields, sender(request), seen, reason)
         if errors:
             return await facts_page(request, fields, errors)
         if changed:
@@ -150,10 +148,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def taken_in(
         request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
     ) -> list[Outcome]:
-        session: Session = request.state.session
         for _ in range(int(_WAIT_S) if good else 0):
             done = await tables.ask(
-                browser_uploads.register, to, good, stated["activity"], stated["pace"], session.name
+                browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
             )
             if done is not None:
                 return done
