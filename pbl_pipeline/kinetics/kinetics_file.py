@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,9 @@ import numpy as np
 from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
 from pbl_pipeline.paramset import structured
-from pbl_pipeline.qc import Check
 
 from .joints import MOMENTS
-from .types import CURVES, CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
+from .types import CURVES, CycleKinetics, Kinetics, Series, TrialKinetics
 
 _SERIES = tuple(f.name for f in dataclasses.fields(Series))
 _OF_CYCLES = ("cycle_no", "names", "percent", "curve", "curve_sd")
@@ -26,30 +25,24 @@ def content_of(kinetics: Kinetics) -> dict[str, Any]:
     """Return the content of kinetics.json."""
     own = ("status", "code", "reason", "mass_kg", "residual_bw", "method", "params_hash")
     return {
-        **{name: getattr(kinetics, name) for name in own},
+        **_own(kinetics, *own),
         "measures": {name: m.to_dict() for name, m in kinetics.measures.items()},
         "reasons": dict(kinetics.reasons),
         "qc": [c.to_dict() for c in kinetics.qc],
         "trials": [
-            {
-                "name": t.name,
-                "status": t.status,
-                "code": t.code,
-                "reason": t.reason,
-                "cycles": [
-                    {
-                        "number": c.number,
-                        "side": c.side,
-                        "used": c.used,
-                        "measures": {name: round(v, 5) for name, v in c.measures.items()},
-                        "missing": c.missing,
-                    }
-                    for c in t.cycles
-                ],
-            }
+            {**_own(t, "name", "status", "code", "reason"), "cycles": [_cycle(c) for c in t.cycles]}
             for t in kinetics.trials
         ],
     }
+
+
+def _cycle(cycle: CycleKinetics) -> dict[str, Any]:
+    measures = {name: round(v, 5) for name, v in cycle.measures.items()}
+    return {**_own(cycle, "number", "side", "used"), "measures": measures, "missing": cycle.missing}
+
+
+def _own(found: Any, *names: str) -> dict[str, Any]:
+    return {name: getattr(found, name) for name in names}
 
 
 def save_content(kinetics: Kinetics, path: Path) -> None:
@@ -57,44 +50,19 @@ def save_content(kinetics: Kinetics, path: Path) -> None:
     path.write_text(json.dumps(content_of(kinetics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | None, Sequence[Mapping]]]) -> Kinetics:
+def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | None, Mapping]]) -> Kinetics:
     """Return the kinetics of a kinetics.json. `arrays`: by trial, what `load_arrays` returned.
 
     Raises KeyError, TypeError, ValueError, AttributeError where the content is not that of a kinetics.json.
     """
-    measures = {}
-    for name, told in content["measures"].items():
-        measures[str(name)] = structured({k: v for k, v in told.items() if k != "interval"}, KineticMeasure)
     trials = []
-    for t in content["trials"]:
-        series, curves = arrays.get(t["name"], (None, ()))
-        of_cycle = {int(c["number"]): c for c in curves}
-        cycles = tuple(
-            CycleKinetics(
-                number=int(c["number"]),
-                side=str(c["side"]),
-                used=bool(c["used"]),
-                curves=of_cycle.get(int(c["number"]), {}).get("curves", {}),
-                curves_sd=of_cycle.get(int(c["number"]), {}).get("curves_sd", {}),
-                measures={str(k): float(v) for k, v in c["measures"].items()},
-                missing=str(c["missing"]),
-            )
-            for c in t["cycles"]
-        )
-        trials.append(TrialKinetics(str(t["name"]), str(t["status"]), str(t["code"]), str(t["reason"]), cycles, series))
-    numbers = {k: None if content[k] is None else float(content[k]) for k in ("mass_kg", "residual_bw")}
-    return Kinetics(
-        status=str(content["status"]),
-        code=str(content["code"]),
-        reason=str(content["reason"]),
-        measures=measures,
-        reasons={str(k): str(v) for k, v in content["reasons"].items()},
-        **numbers,
-        method=str(content["method"]),
-        params_hash=str(content["params_hash"]),
-        trials=tuple(trials),
-        qc=tuple(structured(c, Check) for c in content["qc"]),
-    )
+    for told in content["trials"]:
+        series, curves = arrays.get(told["name"], (None, {}))
+        cycles = [{**c, **curves.get(c["number"], {})} for c in told["cycles"]]
+        trials.append(dataclasses.replace(structured({**told, "cycles": cycles}, TrialKinetics), series=series))
+    measures = {name: {k: v for k, v in told.items() if k != "interval"} for name, told in content["measures"].items()}
+    found = structured({**content, "measures": measures, "trials": ()}, Kinetics)
+    return dataclasses.replace(found, trials=tuple(trials))
 
 
 def save_arrays(trial: TrialKinetics, path: Path) -> None:
@@ -119,8 +87,8 @@ def save_arrays(trial: TrialKinetics, path: Path) -> None:
     )
 
 
-def load_arrays(path: Path) -> tuple[Series | None, list[dict[str, Any]]]:
-    """Return forces and moments over time, and of each cycle `number`, `curves` and `curves_sd`.
+def load_arrays(path: Path) -> tuple[Series | None, dict[int, dict[str, Any]]]:
+    """Return forces and moments over time, and by number of the cycle its `curves` and `curves_sd`.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """
@@ -150,4 +118,4 @@ def load_arrays(path: Path) -> tuple[Series | None, list[dict[str, Any]]]:
         return {name: row for name, row in zip(names, rows, strict=True) if np.isfinite(row).all()}
 
     rows = zip(data["cycle_no"].ravel(), data["curve"], data["curve_sd"], strict=True)
-    return series, [{"number": int(i), "curves": known(a), "curves_sd": known(b)} for i, a, b in rows]
+    return series, {int(i): {"curves": known(a), "curves_sd": known(b)} for i, a, b in rows}
