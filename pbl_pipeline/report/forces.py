@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pbl_pipeline import charts
-from pbl_pipeline.kinetics import KineticMeasure, Kinetics
+from pbl_pipeline.kinetics import GRAVITY, KineticMeasure, Kinetics
 from pbl_pipeline.kinetics.types import WIDTH_SD
 from pbl_pipeline.qc import PASS
 from pbl_pipeline.report.words import plural, sentence
@@ -37,7 +37,7 @@ def forces_section(visit: Visit) -> dict | None:
     peak = kinetics.measures.get("vertical_peak_loading_bw")
     sure = peak is not None and peak.sd is not None and WIDTH_SD * peak.sd <= _UNSURE_BW
     weight = kinetics.mass_kg
-    in_newtons = "" if weight is None else f" 1 BW is {number(9.80665 * weight, 0)} N."
+    in_newtons = "" if weight is None else f" 1 BW is {number(GRAVITY * weight, 0)} N."
     residual = kinetics.residual_bw
     left_over = "" if residual is None else f" Carried by no foot: {number(100 * residual, 1)} % of the weight."
     doubts = [c for c in kinetics.qc if c.outcome != PASS]
