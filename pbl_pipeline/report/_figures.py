@@ -13,6 +13,7 @@ from markupsafe import Markup
 from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, leg_angles
+from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
 from pbl_pipeline.report.curves import Ranges, cycle_curves
 from pbl_pipeline.report.words import plural
@@ -29,7 +30,6 @@ class Picture:
     image: np.ndarray
 
 
-_SIDES = ("left", "right")
 _JPEG_QUALITY = 84
 
 
@@ -55,10 +55,10 @@ def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
     if not np.isfinite(fit.qpos).any():
         return []
     sides = leg_angles(fit)
-    spans = {s: stance_spans(events.events, s) for s in _SIDES} if events is not None else {}
+    spans = {s: stance_spans(events.events, s) for s in SIDES} if events is not None else {}
     drawn = []
     for name, (title, positive) in ANGLES.items():
-        curves = {side: sides[side][name] for side in _SIDES if name in sides[side]}
+        curves = {side: sides[side][name] for side in SIDES if name in sides[side]}
         label = f"{title} in degrees over the {fit.time_s[-1]:.1f} seconds of the recording."
         drawn.append({"name": title, "note": positive, "svg": charts.time_chart(label, fit.time_s, curves, spans)})
     return drawn
@@ -70,13 +70,13 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
         return None
     counts = ", ".join(
         f"{side} foot down {len(events.times(side, 'foot_down'))} and up {len(events.times(side, 'foot_up'))} times"
-        for side in _SIDES
+        for side in SIDES
     )
     return charts.contact_chart(
         f"Foot contacts over the recording: {counts}.",
         float(fit.time_s[-1]),
         known_spans(fit),
-        {s: stance_spans(events.events, s) for s in _SIDES},
+        {s: stance_spans(events.events, s) for s in SIDES},
         [(e.time_s, e.side, e.event) for e in events.events],
     )
 

@@ -10,11 +10,10 @@ from markupsafe import Markup
 
 from pbl_pipeline import charts
 from pbl_pipeline.gait import GaitCycle, NormalBands, far_leg_of
+from pbl_pipeline.gait.events import SIDES
 
 #: Of each side the lowest and highest value (deg) of its mean curve.
 Ranges = dict[str, tuple[float, float]]
-
-_SIDES = ("left", "right")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,11 +45,11 @@ def cycle_curves(
     """
     usable = [c for c in cycles if c.used and c.curves]
     faint = far_leg_of(usable) if usable else ""
-    off = {s: [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in usable if c.side == s] for s in _SIDES}
+    off = {s: [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in usable if c.side == s] for s in SIDES}
     foot_off = {s: float(np.mean(values)) for s, values in off.items() if values}
     drawn = []
     for name, (title, positive) in names.items():
-        by_side = {s: [c.curves[name] for c in usable if c.side == s and name in c.curves] for s in _SIDES}
+        by_side = {s: [c.curves[name] for c in usable if c.side == s and name in c.curves] for s in SIDES}
         if not any(by_side.values()):
             continue
         band = (bands.percent, *bands.curves[name]) if name in bands.curves else None

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pbl_pipeline import charts
+from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.kinetics import GRAVITY, KineticMeasure, Kinetics
 from pbl_pipeline.kinetics.types import WIDTH_SD
 from pbl_pipeline.qc import PASS
@@ -14,7 +15,6 @@ from pbl_pipeline.report.words import plural, sentence
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 
-_SIDES = ("left", "right")
 #: Smallest range of a chart by unit.
 _LEAST = {"BW": 0.2, "Nm/kg": 0.5, "W/kg": 1.0}
 #: The section is folded where the 90 % interval of the loading peak reaches further than this from it (body weights).
@@ -96,7 +96,7 @@ def force_charts(kinetics: Kinetics, label: Callable[[str, str, int], str]) -> l
     cycles = [c for t in kinetics.trials for c in t.cycles if c.used and c.curves]
     drawn = []
     for name, (title, unit) in KINETICS_CURVES.items():
-        by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in _SIDES}
+        by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in SIDES}
         known = [curve for curves in by_side.values() for curve in curves]
         if not known or any(text in name for text in hidden):
             continue
