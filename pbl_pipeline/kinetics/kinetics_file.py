@@ -12,6 +12,7 @@ import numpy as np
 
 from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
+from pbl_pipeline.gait.metrics_file import curve_table, known_curves
 from pbl_pipeline.paramset import structured
 
 from .joints import MOMENTS
@@ -67,12 +68,6 @@ def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | 
 
 def save_arrays(trial: TrialKinetics, path: Path) -> None:
     """Write a trial's forces and moments over time, and its cycles' curves, to one .npz (float32, time_s float64)."""
-    unknown = np.full(len(REPORT_PERCENT), np.nan)
-    tables = {
-        name: [[of(c).get(n, unknown) for n in CURVES] for c in trial.cycles]
-        for name, of in (("curve", lambda c: c.curves), ("curve_sd", lambda c: c.curves_sd))
-    }
-    shape = (len(trial.cycles), len(CURVES), len(REPORT_PERCENT))
     over_time = {}
     if trial.series is not None:
         over_time = {n: np.asarray(getattr(trial.series, n), float if n == "time_s" else np.float32) for n in _SERIES}
@@ -82,7 +77,8 @@ def save_arrays(trial: TrialKinetics, path: Path) -> None:
         cycle_no=np.asarray([c.number for c in trial.cycles], np.int16),
         names=np.asarray(CURVES, dtype=str),
         percent=np.asarray(REPORT_PERCENT, np.float32),
-        **{name: np.asarray(rows, np.float32).reshape(shape) for name, rows in tables.items()},
+        curve=curve_table([c.curves for c in trial.cycles], CURVES),
+        curve_sd=curve_table([c.curves_sd for c in trial.cycles], CURVES),
         **over_time,
     )
 
@@ -113,9 +109,5 @@ def load_arrays(path: Path) -> tuple[Series | None, dict[int, dict[str, Any]]]:
         }
         check_numbers(path, data, shapes)
         series = Series(**{name: np.asarray(data[name], float) for name in _SERIES})
-
-    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: row for name, row in zip(names, rows, strict=True) if np.isfinite(row).all()}
-
     rows = zip(data["cycle_no"].ravel(), data["curve"], data["curve_sd"], strict=True)
-    return series, {int(i): {"curves": known(a), "curves_sd": known(b)} for i, a, b in rows}
+    return series, {int(i): {"curves": known_curves(names, a), "curves_sd": known_curves(names, b)} for i, a, b in rows}
