@@ -49,7 +49,7 @@ CODES: dict[str, str] = {
     "FIT_INPUT": "the keypoints cannot be fitted: too few frames, time stamps out of order, nothing seen",
     "VIEWS_DISAGREE": "the cameras of a trial do not see one person where the calibration says",
     "AUGMENTER_INPUT": "the points do not suffice to predict anatomical markers",
-    "FIT_DIVERGED": "the optimisation ended in values that are not finite",
+    "FIT_DIVERGED": "the optimisation ended in values that are not finite, or lengths that are not positive",
     "SOLVER_UNKNOWN": "no solver or paramset has that name",
     "GAIT_INPUT": "the trajectories cannot be searched for gait events",
     "EVENTS_IMPLAUSIBLE": "gait events that were set by hand cannot be those of walking",

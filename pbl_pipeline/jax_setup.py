@@ -17,16 +17,17 @@ from pbl_pipeline import settings
 
 #: Programs that compile faster than this are not worth a file.
 MIN_COMPILE_SECONDS = 0.3
-#: Flags of XLA for the fit (see `configure`); with them the convolutions of detection take a slow path.
-FIT_FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
+#: Flags of XLA (see `configure`).
+FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
 
 
 @functools.cache
-def keep_programs() -> None:
-    """Set JAX's persistent compilation cache: `jax/` of the user's cache folder. Idempotent.
+def configure() -> None:
+    """Set JAX up for the fit and the networks of detection. Call before the first array; idempotent.
 
-    JAX's own environment variables win: what `JAX_COMPILATION_CACHE_DIR` or `JAX_PERSISTENT_CACHE_*` say, or a program
-    set in `jax.config` before, stays.
+    Compiled programs are kept in `jax/` of the user's cache folder; JAX's own environment variables win: what
+    `JAX_COMPILATION_CACHE_DIR` or `JAX_PERSISTENT_CACHE_*` say, or a program set in `jax.config` before, stays. So do
+    XLA's flags that are set. Precision stays JAX's default, float32.
     """
     # JAX makes its options attributes at run time, which a type checker cannot see.
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
@@ -41,19 +42,11 @@ def keep_programs() -> None:
     _default("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     # -1 keeps small programs too; the limit is meant for file systems on which small files are slow.
     _default("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-@functools.cache
-def configure() -> None:
-    """Set JAX up for the fit: `keep_programs`, XLA's flags. Call before the first array; idempotent. Precision stays
-    JAX's default, float32.
-    """
-    keep_programs()
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
-    # neither: 0.98 s and 14 s). Read when the first device is asked for. Detection
-    # needs the trials and is another process.
-    for flag in FIT_FLAGS:
+    # neither: 0.98 s and 14 s). Read when the first device is asked for. The networks have no convolutions
+    # (`models.tflite_jax`), which would need the trials.
+    for flag in FLAGS:
         flags = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()

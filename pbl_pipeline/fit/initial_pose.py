@@ -35,13 +35,15 @@ ARM_DEG = {
 NEARER_M, FURTHEST_M = 0.10, 0.15
 #: Marker sets whose places in the postures are kept.
 SETS = 8
-#: Arms are looked at every so many frames, and interpolated.
-ARMS_EVERY = 15
+#: The body is placed, and its arms are looked at, every so many frames, and interpolated.
+PLACED_EVERY, ARMS_EVERY = 3, 15
 
 
-def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray:
-    """qpos (T, 40) of one trial; `flip`: facing the other way."""
-    arrays = session.arrays[trial]
+def placed_poses(session: Session, trial: int, flip: bool = False, every: int = PLACED_EVERY) -> np.ndarray:
+    """qpos (T, 40) of one trial; `flip`: facing the other way; `every`: look at every so many frames."""
+    n = len(session.arrays[trial].used)
+    looked = np.arange(0, n, every)
+    arrays = _at(session.arrays[trial], looked)
     points, c = world_points(arrays)
     body, markers = session.body, session.markers
     trunk = trunk_of(markers)
@@ -57,11 +59,17 @@ def placed_poses(session: Session, trial: int, flip: bool = False) -> np.ndarray
         about = R @ middle + x
         R = R @ np.diag([-1.0, -1.0, 1.0])  # half a turn about the standing body's vertical
         x = about - R @ middle
-    qpos = _poses(body, R, x, known)
-    seen = np.flatnonzero(known)[::ARMS_EVERY]
+    qpos = _poses(body, R[known], x[known], looked[known], n)
+    seen = np.flatnonzero(known)[:: ARMS_EVERY // every]
     on_body = np.einsum("tji,tmj->tmi", R[seen], points[seen] - x[seen, None])
-    _place_arms(qpos, body, markers, seen, on_body, c[seen])
+    _place_arms(qpos, body, markers, looked[seen], on_body, c[seen])
     return qpos
+
+
+def _at(arrays: TrialArrays, frames: np.ndarray) -> TrialArrays:
+    """Some frames of a trial."""
+    rows = {f.name: getattr(arrays, f.name) for f in dataclasses.fields(arrays) if not f.name.startswith("phone")}
+    return TrialArrays(**{k: v[frames] for k, v in rows.items()})
 
 
 def _place_arms(
@@ -177,15 +185,13 @@ def align(template: np.ndarray, points: np.ndarray, weight: np.ndarray) -> tuple
     return R, b - (R @ a[..., None])[..., 0]
 
 
-def _poses(body: Body, R: np.ndarray, x: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Poses with the pelvis of the standing template turned by R and moved to x; frames not known in between."""
+def _poses(body: Body, R: np.ndarray, x: np.ndarray, frames: np.ndarray, n: int) -> np.ndarray:
+    """Poses (n, Q) with the pelvis of the standing template turned by R and moved to x in some frames, and between."""
     column = {n: k for k, n in enumerate(body.joint_names)}
-    qpos = np.tile(_bent(body), (len(x), 1))
+    qpos = np.tile(_bent(body), (n, 1))
     stands = pelvis_rest(body)[0]
-    values = pelvis_values(body, R[known] @ stands, x[known])
-    index, at = np.flatnonzero(known), np.arange(len(x))
-    for name, value in values.items():
-        qpos[:, column[name]] = np.interp(at, index, value)
+    for name, value in pelvis_values(body, R @ stands, x).items():
+        qpos[:, column[name]] = np.interp(np.arange(n), frames, value)
     return qpos
 
 
@@ -257,7 +263,7 @@ def paper_pose(session: Session, trial: int, distance_m: float, middle: Float[np
 def median_pose(session: Session, trial: int) -> np.ndarray:
     """qpos (Q,) of the standing body at the medians over the trial of pelvis position and heading."""
     body, used = session.body, session.arrays[trial].used
-    poses = placed_poses(session, trial)[used]
+    poses = placed_poses(session, trial, every=1)[used]
     angle = poses[:, body.joint_names.index("pelvis_rotation")]
     mean = np.angle(np.mean(np.exp(1j * angle)))  # circular, so that +179 and -179 deg agree
     heading = mean + np.median(np.angle(np.exp(1j * (angle - mean))))

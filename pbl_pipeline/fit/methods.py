@@ -11,7 +11,7 @@ from .per_frame import solve_per_frame
 #: starts to a `Solution` of each, or the `PblError` of one that cannot be solved.
 METHODS: Stage[Params] = Stage("fit", "solver", "blazepose")
 METHODS.register("paper-2025", 2, PAPER_2025, "pbl_pipeline.fit.implicit:solve_sessions")
-METHODS.register("gauss-newton", 4, GAUSS_NEWTON, solve_per_frame)
-METHODS.register("paper-gauss-newton", 2, PAPER_GAUSS_NEWTON)
-METHODS.register("blazepose", 7, BLAZEPOSE)
-METHODS.register("markers", 1, MARKERS)
+METHODS.register("gauss-newton", 5, GAUSS_NEWTON, solve_per_frame)
+METHODS.register("paper-gauss-newton", 3, PAPER_GAUSS_NEWTON)
+METHODS.register("blazepose", 8, BLAZEPOSE)
+METHODS.register("markers", 2, MARKERS)

@@ -118,7 +118,7 @@ class GaussNewtonParams:
     max_iterations: int = 60
     #: It ends after a step in which no joint moved further (rad; m for the pelvis) ...
     tolerance_rad: float = 1e-3
-    #: ... or two in a row whose gain was below this share of the cost.
+    #: ... or three in a row whose gain was below this share of the cost.
     tolerance_cost: float = 1e-5
     #: Weight of half the squared second difference of each joint over frames at 30 Hz, per rad^2 and m^2.
     smooth_per_rad2: float = 200.0

@@ -171,7 +171,8 @@ def _mean_seen(confidence: np.ndarray) -> np.ndarray:
 
 def has_3d(trial: Keypoints) -> bool:
     """Whether the detector gave 3D points at all."""
-    return bool(np.any(np.isfinite(trial.xyz_cam_m) & (trial.confidence > 0)[..., None]))
+    frames = zip(trial.xyz_cam_m, trial.confidence, strict=True)  # one by one: the first one mostly tells
+    return any(np.isfinite(x[c > 0]).any() for x, c in frames)
 
 
 def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:

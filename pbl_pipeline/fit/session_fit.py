@@ -193,11 +193,11 @@ def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given:
     begin, session, motions = time.perf_counter(), packed.session, _motions(given)
     used = np.asarray(session.problem.weight) > 0
     finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))
-    if not finite or not np.isfinite(solution.loss_trace[-1, 1]):
+    if not finite or not np.isfinite(solution.loss_trace[-1, 1]) or np.any(solution.scale <= 0):
         raise PblError(
             "FIT_DIVERGED",
-            found="joint angles or a cost that are not finite",
-            expected="finite angles",
+            found="joint angles or a cost that are not finite, or a body whose lengths are not positive",
+            expected="finite angles and positive lengths",
             next_step="check the keypoints and the camera matrix",
             key=", ".join(session.names),
         )

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter
-from scipy.stats import quantile
 
 from pbl_pipeline.body import Body, MarkerSet
 from pbl_pipeline.errors import PblError
@@ -84,13 +83,21 @@ def box_side_px(view: Keypoints) -> Float[np.ndarray, " T"]:
     enough = np.flatnonzero(np.count_nonzero(seen, axis=1) >= 2)
     if not len(enough):
         return side
-    points = np.where(seen[enough][..., None], view.xy_px[enough], np.nan).astype(np.float64)
-    # Of all frames in one call: numpy's goes through a Python function for each frame.
-    share = np.reshape(BOX_PERCENT, (1, 2, 1)) / 100
-    low, high = np.moveaxis(quantile(points, share, axis=1, nan_policy="omit"), 1, 0)
+    low, high = _percentiles(np.moveaxis(view.xy_px[enough], -1, 0), seen[enough], BOX_PERCENT)
     step = float(np.median(np.diff(view.time_s))) if len(view.time_s) > 1 else BOX_S
     side[enough] = median_filter(np.max(high - low, axis=1), max(1, round(BOX_S / step)), mode="nearest")
     return np.where(side > 0, side, np.nan)
+
+
+def _percentiles(x: Float[np.ndarray, "D T J"], seen: np.ndarray, percent: Sequence[float]) -> list[np.ndarray]:
+    """Percentiles (T, D) of the points `seen` (T, J) bool in each frame. Numpy's own takes frames one by one."""
+    ordered, last = np.sort(np.where(seen, x, np.inf), axis=-1), np.count_nonzero(seen, axis=-1)[:, None] - 1
+    found = []
+    for share in np.asarray(percent) / 100:
+        below = np.floor(share * last).astype(int)
+        low, high = (np.take_along_axis(ordered, i[None], -1) for i in (below, np.minimum(below + 1, last)))
+        found.append((low + (share * last - below) * (high - low))[..., 0].T)
+    return found
 
 
 def body_metres(

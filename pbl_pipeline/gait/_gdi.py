@@ -228,8 +228,8 @@ def score_gdi(
     left, right, mean, profile, sd, minimal_change = None, None, None, None, None, None
     if enough:
         if (model_of_error := _model_of_error(usable, basis, params)) is not None:
-            passes = _passes(usable, vectors, basis)
-            expected = expected_index(estimate(model_of_error, passes), basis, model_of_error.of(len(passes)).widening)
+            posterior = estimate(model_of_error, _passes(usable, vectors, basis))
+            expected = expected_index(posterior, basis, model_of_error.widening)
             left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
             minimal_change = minimal_change_of(expected.sd_anew)
         else:

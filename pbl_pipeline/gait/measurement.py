@@ -19,7 +19,7 @@ import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -131,15 +131,6 @@ class MeasurementModel:
     pass_cycles: float  # cycles of both sides of one pass, of which the gait measures are means
     #: Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
     measures: Mapping[str, Mapping[str, MeasureError]]
-    jointly: MeasurementModel | None = None  # with `TERMS` of passes that were fitted together, if they were measured
-
-    def of(self, passes: int) -> MeasurementModel:
-        """Return the model for a visit of so many passes, which are fitted together."""
-        return self if passes == 1 or self.jointly is None else self.jointly
-
-
-#: Fields whose values differ between passes fitted alone and passes fitted together.
-TERMS = ("person", "visit", "views", "widening")
 
 
 class Posterior(NamedTuple):
@@ -170,20 +161,12 @@ def model_names() -> tuple[str, ...]:
 @functools.cache
 def load_model(name: str) -> MeasurementModel:
     """Return a model that ships, by its name."""
-    data = shipped_model(f"gait/measurement_models/{name}.json", ("mean", "spread", "cycle"))
-    jointly = data.pop("jointly", None)
+    arrays = ("mean", "spread", "person", "visit", "cycle")
+    data = shipped_model(f"gait/measurement_models/{name}.json", arrays)
     errors = {k: {n: MeasureError(*e) for n, e in view.items()} for k, view in data.pop("measures").items()}
-    terms = _terms({n: data.pop(n) for n in TERMS})
-    model = MeasurementModel(**data, **terms, measures=errors)
-    return (
-        model if jointly is None else dataclasses.replace(model, jointly=dataclasses.replace(model, **_terms(jointly)))
-    )
-
-
-def _terms(data: dict[str, Any]) -> dict[str, Any]:
-    views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data["views"].items()}
+    views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
     views[RIGHT] = views[LEFT].mirrored()
-    return data | {"views": views, "person": np.array(data["person"]), "visit": np.array(data["visit"])}
+    return MeasurementModel(**data, views=views, measures=errors)
 
 
 @functools.cache
@@ -194,7 +177,7 @@ def model_of_fit(params_hash: str) -> str:
 
 def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
     """Estimate the scores of a person from all passes of a visit together. At least one pass has cycles of a side."""
-    model, size = model.of(len(passes)), len(model.mean)
+    size = len(model.mean)
     views = [model.views[p.far_leg] for p in passes]
     scores = np.concatenate([np.concatenate(p.scores) for p in passes])
     gain = np.vstack([v.gain for v in views])
@@ -260,7 +243,7 @@ def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: Normati
     for far_leg in model.views:
         typical = Pass((unseen, unseen), (cycles, cycles), far_leg)
         then = now._replace(covariance=estimate(model, [*passes, typical]).covariance)
-        out[far_leg] = expected_index(then, norm, model.of(len(passes) + 1).widening).sd
+        out[far_leg] = expected_index(then, norm, model.widening).sd
     return out
 
 

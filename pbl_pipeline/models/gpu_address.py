@@ -1,7 +1,7 @@
 """Where the process that owns the GPU for detection listens, and how it is started: by whoever first needs it.
 
-It ends by itself when no one has been connected for a while. Fit and detection want other settings of XLA
-(`jax_setup`), and many processes that decode share one GPU, so it is a process of its own.
+It ends by itself when no one has been connected for a while. Many processes that decode share one GPU, so it is a
+process of its own.
 """
 
 from __future__ import annotations
@@ -72,12 +72,7 @@ def _listens(address: str) -> bool:
 
 
 def _start(address: str, log: Path) -> None:
-    from pbl_pipeline.jax_setup import FIT_FLAGS  # loads JAX
-
     env = dict(os.environ)
-    of_fit = {flag.partition("=")[0] for flag in FIT_FLAGS}
-    flags = [f for f in env.get("XLA_FLAGS", "").split() if f.partition("=")[0] not in of_fit]
-    env["XLA_FLAGS"] = " ".join(flags)
     # The fit may be another process on the same GPU.
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)

@@ -1,9 +1,9 @@
 """The process that owns the GPU for detection: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
 
-Each connection is of one network: a `NetworkSpec`, then pictures, each answered with the network's outputs as float32
-in the order of the pictures. The pictures that wait on all connections of a network go through the GPU together. Each
-network has one batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's
-result does not depend on its neighbours.
+Each connection is of one network: a line of JSON with its `NetworkSpec`, answered by one; then the bytes of pictures,
+each answered with the network's outputs as float32 in the order of the pictures. The pictures that wait on all
+connections of a network go through the GPU together. Each network has one batch size, so that one program is compiled
+for it; a batch that is not full is padded, and a picture's result does not depend on its neighbours.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from __future__ import annotations
 import json
 import os
 import selectors
+import socket
 import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from .network import NetworkSpec
+from .network import NetworkSpec, receive, receive_line, send_line
 from .tflite import LiteModel, read_network
 
 #: Pictures of one call of a network, and the smallest that is tried where the GPU's memory does not suffice.
@@ -109,14 +109,14 @@ class _Served:
         self._program, self._device = program, device
         self._selector = selectors.DefaultSelector()
         self._changed = threading.Condition()
-        self._images, self._owners = self._empty(), list[Connection]()
+        self._images, self._owners = self._empty(), list[socket.socket]()
         self.n_connections = 0
         for work in (self._collect, self._compute):
             threading.Thread(target=work, daemon=True).start()
 
-    def add(self, connection: Connection) -> None:
+    def add(self, connection: socket.socket) -> None:
         self.n_connections += 1
-        self._selector.register(connection.fileno(), selectors.EVENT_READ, connection)
+        self._selector.register(connection, selectors.EVENT_READ, connection)
 
     def close(self) -> None:
         """End all connections."""
@@ -128,23 +128,23 @@ class _Served:
 
     def _collect(self) -> None:
         """Receive pictures into the batch that is computed next."""
-        image = np.empty(self._program.image_shape, np.uint8)
         while True:
             for key, _ in self._selector.select(1.0):
-                try:
-                    key.data.recv_bytes_into(image.reshape(-1))
-                except (EOFError, OSError):
+                with self._changed:
+                    self._changed.wait_for(lambda: len(self._owners) < len(self._images))
+                    images, at = self._images, len(self._owners)
+                if not receive(key.data, images[at]):
                     self._drop(key.data)
                     continue
                 with self._changed:
-                    self._changed.wait_for(lambda: len(self._owners) < len(self._images))
-                    self._images[len(self._owners)] = image
+                    if self._images is not images:  # the batch was taken meanwhile
+                        self._images[0] = images[at]
                     self._owners.append(key.data)
                     self._changed.notify()
 
-    def _drop(self, connection: Connection) -> None:
+    def _drop(self, connection: socket.socket) -> None:
         try:
-            self._selector.unregister(connection.fileno())
+            self._selector.unregister(connection)
             connection.close()
             self.n_connections -= 1
         except (KeyError, OSError, ValueError):  # it was closed before
@@ -167,7 +167,7 @@ class _Served:
                     os._exit(1)
             for owner, outputs in zip(owners, found, strict=False):
                 try:
-                    owner.send_bytes(outputs.tobytes())
+                    owner.sendall(outputs.data)
                 except (OSError, ValueError):
                     continue
 
@@ -176,7 +176,9 @@ class Server:
     """Serves networks at an address until it is closed or no one has been connected for `idle_s`."""
 
     def __init__(self, address: str, any_device: bool = False, idle_s: float = IDLE_S, batch: int = BATCH) -> None:
-        self._listener = Listener(address, "AF_UNIX", backlog=256)
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(address)
+        self._listener.listen(256)
         self._any_device, self._idle_s, self._batch = any_device, idle_s, batch
         self._served: dict[NetworkSpec, _Served] = {}
         self._locks: dict[NetworkSpec, threading.Lock] = {}
@@ -190,7 +192,7 @@ class Server:
         threading.Thread(target=self._watch, daemon=True).start()
         while True:
             try:
-                connection = self._listener.accept()
+                connection, _ = self._listener.accept()
             except OSError:
                 return
             self._openers.submit(self._open, connection)
@@ -201,10 +203,10 @@ class Server:
         for served in self._served.values():
             served.close()
 
-    def _open(self, connection: Connection) -> None:
+    def _open(self, connection: socket.socket) -> None:
         self._opening += 1
         try:
-            given = json.loads(connection.recv_bytes())
+            given = json.loads(receive_line(connection))
             outputs = None if given["outputs"] is None else tuple(given["outputs"])
             spec = NetworkSpec(**(given | {"outputs": outputs}))
             try:
@@ -213,11 +215,12 @@ class Server:
                         self._served[spec] = _Served(Program(spec, self._any_device, self._batch), self._device)
             except Exception as error:  # noqa: BLE001 - whoever asked lets LiteRT compute and says why
                 lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
-                connection.send_bytes(json.dumps({"error": lines[0] if lines else type(error).__name__}).encode())
+                send_line(connection, {"error": lines[0] if lines else type(error).__name__})
+                connection.close()
                 return
             served = self._served[spec]
             program = served._program
-            connection.send_bytes(json.dumps({"device": program.device, "sizes": program.sizes}).encode())
+            send_line(connection, {"device": program.device, "sizes": program.sizes})
             served.add(connection)
         except (EOFError, OSError, ValueError):
             connection.close()
@@ -239,10 +242,9 @@ def main() -> None:
     """Entry of the process. Ends at once where JAX finds no GPU."""
     address = Path(sys.argv[1])
     address.unlink(missing_ok=True)
-    # Programs are kept on disk as those of the fit, by the same rules.
-    from pbl_pipeline.jax_setup import keep_programs
+    from pbl_pipeline.jax_setup import configure
 
-    keep_programs()
+    configure()
     import jax
 
     device = jax.devices()[0]

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import socket
 import threading
 from collections import deque
 from collections.abc import Collection
 from concurrent.futures import Future
-from multiprocessing.connection import Client
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -124,36 +123,59 @@ class _Remote:
     """A connection to the process that owns the GPU, for one network; calls of several threads share it."""
 
     def __init__(self, address: str, spec: NetworkSpec) -> None:
-        self._connection: Any = Client(address, "AF_UNIX")
-        self._connection.send_bytes(json.dumps(dataclasses.asdict(spec)).encode())
-        reply = json.loads(self._connection.recv_bytes())
+        self._connection = socket.socket(socket.AF_UNIX)
+        self._connection.connect(address)
+        send_line(self._connection, dataclasses.asdict(spec))
+        reply = json.loads(receive_line(self._connection))
         if "error" in reply:
             raise RuntimeError(reply["error"])
         self.device, self._sizes = str(reply["device"]), [int(n) for n in reply["sizes"]]
         self._sending = threading.Lock()
-        self._waiting: deque[Future[bytes]] = deque()
+        self._waiting: deque[Future[np.ndarray]] = deque()
         self._broken: BaseException | None = None
         threading.Thread(target=self._listen, name="gpu-network", daemon=True).start()
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
-        future: Future[bytes] = Future()
+        future: Future[np.ndarray] = Future()
         with self._sending:
             if self._broken is not None:
                 raise self._broken
             self._waiting.append(future)
-            self._connection.send_bytes(np.ascontiguousarray(image).reshape(-1))
-        values = np.frombuffer(future.result(), np.float32)
-        parts = np.split(values, np.cumsum(self._sizes)[:-1])
+            self._connection.sendall(np.ascontiguousarray(image).data)
+        parts = np.split(future.result(), np.cumsum(self._sizes)[:-1])
         return dict(zip(self._sizes, parts, strict=True))
 
     def _listen(self) -> None:
         try:
-            while True:
-                reply = self._connection.recv_bytes()
+            while receive(self._connection, reply := np.empty(sum(self._sizes), np.float32)):
                 self._waiting.popleft().set_result(reply)
-        except (OSError, EOFError, IndexError) as error:
-            gone = EOFError("the process that owns the GPU ended") if isinstance(error, EOFError) else error
-            with self._sending:
-                self._broken = gone
-                while self._waiting:
-                    self._waiting.popleft().set_exception(gone)
+        except IndexError:  # an answer to nothing
+            pass
+        with self._sending:
+            self._broken = EOFError("the process that owns the GPU ended")
+            while self._waiting:
+                self._waiting.popleft().set_exception(self._broken)
+
+
+def send_line(connection: socket.socket, value: object) -> None:
+    """Send a value as one line of JSON."""
+    connection.sendall(json.dumps(value).encode() + b"\n")
+
+
+def receive_line(connection: socket.socket) -> bytes:
+    """Return the next line, without what follows it. Raises EOFError where the other side has ended."""
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = connection.recv(1)
+        if not byte:
+            raise EOFError("the process that owns the GPU ended")
+        line += byte
+    return line
+
+
+def receive(connection: socket.socket, into: np.ndarray) -> bool:
+    """Fill an array with the bytes that come; False where the other side ended before."""
+    try:
+        return connection.recv_into(into.data, into.nbytes, socket.MSG_WAITALL) == into.nbytes
+    except OSError:
+        return False

@@ -7,6 +7,8 @@ thirty times faster than XLA's program of the same model.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -159,34 +161,39 @@ def _activated(options: Any, compute: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *inputs: activation(compute(*inputs))
 
 
-def _convolution(options: Any, weights: np.ndarray, groups: int) -> Callable[..., Any]:
+def _convolution(options: Any, depthwise: bool) -> Callable[..., Any]:
+    """Shifted pictures, side by side, times one matrix; depthwise the sum of shifted pictures times their weights.
+
+    NVIDIA's library has its own convolutions, but float32 ones that are fast are found by trial (half a minute a
+    network), and convert the order of axes before and after. These are a third faster, without a trial.
+    """
     stride, dilation = (options.strideH, options.strideW), (options.dilationHFactor, options.dilationWFactor)
 
     def compute(x: Array, w: Array, bias: Array) -> Array:
-        # (out, H, W, in) of TensorFlow Lite, and (1, H, W, channels) of its depthwise convolution, as HWIO.
-        kernel = w.transpose(1, 2, 0, 3) if groups > 1 else w.transpose(1, 2, 3, 0)
-        y = lax.conv_general_dilated(
-            x,
-            kernel,
-            stride,
-            _padding(options),
-            rhs_dilation=dilation,
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-            feature_group_count=groups,
-        )
+        reach = [(n - 1) * d for n, d in zip(w.shape[1:3], dilation, strict=True)]
+        if options.padding == _SAME:
+            x = jnp.pad(x, [(0, 0), *lax.padtype_to_pads(x.shape[1:3], [r + 1 for r in reach], stride, "SAME"), (0, 0)])
+        last = [n - r for n, r in zip(x.shape[1:3], reach, strict=True)]
+        places = itertools.product(*(range(0, r + 1, d) for r, d in zip(reach, dilation, strict=True)))
+        parts = [x[:, i : i + last[0] : stride[0], j : j + last[1] : stride[1]] for i, j in places]
+        # (1, H, W, channels) and (out, H, W, in) of TensorFlow Lite.
+        if depthwise:
+            y = functools.reduce(jnp.add, map(jnp.multiply, parts, w.reshape(len(parts), -1)))
+        else:
+            y = jnp.concatenate(parts, axis=-1) @ w.reshape(w.shape[0], -1).T
         return y + bias
 
     return _activated(options, compute)
 
 
 def _conv(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
-    return _convolution(options, fixed[0], 1)
+    return _convolution(options, depthwise=False)
 
 
 def _depthwise(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
     if options.depthMultiplier != 1:
         raise _unknown(f"DEPTHWISE_CONV_2D with {options.depthMultiplier} outputs a channel")
-    return _convolution(options, fixed[0], fixed[0].shape[-1])
+    return _convolution(options, depthwise=True)
 
 
 def _pad(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:

@@ -24,7 +24,6 @@ from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
     IMPORTANT_CHANGE,
-    TERMS,
     MeasureError,
     MeasurementModel,
     Pass,
@@ -280,8 +279,7 @@ def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) ->
     """A row per session: whose, the true index, the found one with its errors, and that of the plain mean curves."""
     rows = []
     for kind, visit, passes in sessions_of(seen):
-        widening = model.of(len(passes)).widening
-        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, widening)
+        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, model.widening)
         plain, true = (np.mean([getattr(s, n) for s in passes], axis=0) for n in ("scores", "true"))
         first = passes[0]
         rows.append(
@@ -328,6 +326,25 @@ def error_table(frame: pd.DataFrame) -> pd.DataFrame:
                 "minimal change": least.mean(),
             }
         )
+    return pd.DataFrame(rows)
+
+
+def lasting_table(frame: pd.DataFrame) -> pd.DataFrame:
+    """Parts of the index's error by kind of session, as standard deviations: what all walks of a person have in common,
+    bias included, what both visits of a walk have in common beside it, and what is drawn anew at each. More passes of a
+    kind lessen the last alone. Means of products of two errors, as in `fit_model`."""
+    keys = ["person", "condition", "severity"]
+    rows = []
+    kinds: Any = frame.assign(off=frame["found"] - frame["true"]).groupby("kind", sort=False)
+    for kind, own in kinds:
+        visits: Any = own.groupby([*keys, "visit"])["off"].mean().unstack("visit").dropna()
+        of_person = own.groupby(keys)["off"].mean().groupby("person")
+        n, total, squares = of_person.size(), of_person.sum(), of_person.agg(lambda v: (v**2).sum())
+        several = n > 1
+        person = np.average(((total**2 - squares) / (n * (n - 1)))[several], weights=n[several])
+        walk = (visits[0] * visits[1]).mean() - person
+        parts = np.array([person, walk, (own["off"] ** 2).mean() - person - walk])
+        rows.append({"session": kind, **dict(zip(("person", "walk", "anew"), np.sqrt(parts.clip(0.0)), strict=True))})
     return pd.DataFrame(rows)
 
 
@@ -553,13 +570,8 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
             return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return value
 
-    def written(model: MeasurementModel, names: Iterable[str]) -> dict[str, Any]:
-        views = {k: plain(v) for k, v in model.views.items() if k != RIGHT}
-        return {n: plain(getattr(model, n)) for n in names} | {"views": views}
-
-    content = written(model, [f.name for f in dataclasses.fields(model) if f.name != "jointly"])
-    if model.jointly is not None:
-        content["jointly"] = written(model.jointly, TERMS)
+    content = {f.name: plain(getattr(model, f.name)) for f in dataclasses.fields(model)}
+    del content["views"][RIGHT]  # that of the left, mirrored
     path.write_text(json.dumps({"made_by": made_by, **content}, separators=(",", ":")) + "\n", encoding="utf-8")
 
 
@@ -608,7 +620,7 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
         _echo(f"{about}: probability of a change, by session", probability_errors(pairs), 3)
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
-        model = dataclasses.replace(models[ALONE], name=write.stem, jointly=models.get(TOGETHER))
+        model = dataclasses.replace(models[ALONE], name=write.stem)
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
         click.echo(f"\n{write}")
 
@@ -626,6 +638,7 @@ def _echo_left_out(out: pd.DataFrame, widening: float, n_held_out: int) -> None:
         f"of {n_held_out} persons drawn from these: {drawn[1]:.2f} (90 % of draws: {drawn[0]:.2f} to {drawn[2]:.2f})"
     )
     _echo("tuning persons left out in turn: error of the index", error_table(out.assign(sd=out["sd"] * widening)))
+    _echo("tuning persons left out in turn: parts of the error", lasting_table(out))
 
 
 if __name__ == "__main__":

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from pbl_pipeline.gait import MEASURES, change_sd
+from pbl_pipeline.gait import MEASURES, change_sd, measurement
 from research.corpus.measurement import (
     Seen,
     angle_errors,
     change_pairs,
     coverage_by_chance,
+    lasting_table,
     parts_of_errors,
     probability_errors,
     widening_of,
+    write_model,
 )
 
 STANCE = MEASURES.index("stance_percent")
@@ -92,3 +95,30 @@ def test_widening_and_chance_of_persons():
     assert by_person.tolist() == pytest.approx([0.8, 1.0], abs=0.03)
     assert drawn[0] == pytest.approx(by_person[0])
     assert drawn[2] == pytest.approx(by_person[1])
+
+
+def test_the_lasting_parts_of_the_indexs_error_are_found_again():
+    """Bias 1, person 3, walk 2, anew 1.5 of 2,000 persons of three walks; one more person has a single walk."""
+    rng, rows = np.random.default_rng(4), []
+    for person in range(2000):
+        lasting = 1.0 + rng.normal(0, 3.0)
+        for condition in ("", "crouch", "weakness") if person else ("",):
+            of_walk = lasting + rng.normal(0, 2.0)
+            about = {"kind": "left", "person": f"p{person}", "condition": condition, "severity": 0.0, "true": 90.0}
+            rows += [{**about, "visit": v, "found": 90.0 + of_walk + rng.normal(0, 1.5)} for v in (0, 1) for _ in "ab"]
+    table = lasting_table(pd.DataFrame(rows)).set_index("session")
+    assert table.loc["left"].tolist() == pytest.approx([np.sqrt(10.0), 2.0, 1.5], abs=0.15)
+
+
+def test_a_written_model_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shipped = measurement.load_model("blazepose-33")
+    write_model(shipped, tmp_path / "toy.json", "by this test")
+    monkeypatch.setattr(measurement, "_FOLDER", tmp_path)
+    found = measurement.load_model("toy")
+    assert (found.name, found.fits, found.widening) == (shipped.name, shipped.fits, shipped.widening)
+    assert found.measures == shipped.measures
+    for side in ("", "left", "right"):
+        np.testing.assert_array_equal(found.views[side].gain, shipped.views[side].gain)
+        np.testing.assert_array_equal(found.views[side].anew, shipped.views[side].anew)
+    np.testing.assert_array_equal(found.person, shipped.person)
+    measurement.load_model.cache_clear()

@@ -128,7 +128,9 @@ SEEN_BY = {
     "flat-87": ("simcc", "bml_movi_87"),
     "few-17": ("crop3d", "mpi_inf_3dhp_17"),
 }
-BLAZEPOSE, GAUSS_NEWTON = (methods.of_stage("fit")[name].key for name in ("blazepose", "gauss-newton"))
+BLAZEPOSE, GAUSS_NEWTON, MARKERS = (
+    methods.of_stage("fit")[name].key for name in ("blazepose", "gauss-newton", "markers")
+)
 HEAVY = methods.of_stage("keypoints")["blazepose-heavy"].key
 DEFAULT_FITS = {
     (HEAVY, BLAZEPOSE),
@@ -155,7 +157,7 @@ def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, 
     ingest([path], VisitRecord("P001"), Methods(keypoint="few-17", fit="paper-2025"))
     assert plans() == DEFAULT_FITS | {("few-17-v1", "paper-2025-v2")}
     ingest([path], VisitRecord("P001"), Methods(fit="markers"))
-    assert {p for p in plans() if p[1] == "markers-v1"} == {(p[0], "markers-v1") for p in DEFAULT_FITS}
+    assert {p for p in plans() if p[1] == MARKERS} == {(p[0], MARKERS) for p in DEFAULT_FITS}
 
 
 def test_a_new_keypoint_method_for_all_comes_with_its_fit(

@@ -41,6 +41,7 @@ from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual
 from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
+from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import At, Term, Unknowns, square
@@ -134,6 +135,39 @@ def test_a_large_border_by_columns_gives_the_same(k, columns, monkeypatch):
     want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
     np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
     np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), np.diag(np.linalg.inv(full)), rtol=1e-4)
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    cost: jax.Array
+    system: BorderedBandedSystem
+    g: jax.Array
+    h: jax.Array
+
+
+jax.tree_util.register_dataclass(Model)
+
+
+@pytest.mark.parametrize("over", [4.0, 0.5])
+def test_a_curvature_that_is_wrong_neither_creeps_nor_swings(over):
+    """One of two frames has `over` times its own curvature: plain steps leave 3/4 of the way, or as much behind."""
+    factor = jnp.array([[1.0], [over]])
+
+    def evaluate(state):
+        x, y = state
+        none = jnp.zeros((2, 1, 1))
+        system = BorderedBandedSystem(jnp.asarray(factor)[..., None], none, jnp.zeros((2, 1)), none, jnp.eye(1))
+        return Model(1.0 + 0.5 * jnp.sum(x**2) + 0.5 * jnp.sum(y**2), system, -x, -y)
+
+    def move(state, dx, dy):
+        return state[0] + dx, state[1] + dy
+
+    start = jnp.array([[0.1], [0.1]]), jnp.zeros(1)
+    limits = Limits(jnp.asarray(1e-5), jnp.asarray(-1.0), jnp.asarray(50))
+    end = minimise(evaluate, move, before_first(evaluate, start), jnp.ones(2), limits)
+    assert int(end.result) == Result.SMALL_STEP
+    assert int(end.iteration) <= 15
+    assert float(jnp.max(jnp.abs(end.state[0]))) < 1e-4
 
 
 def test_many_systems_at_once():

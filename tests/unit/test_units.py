@@ -17,6 +17,7 @@ from pbl_pipeline.fit.units import (
     FILE,
     PAPER,
     body_metres,
+    box_side_px,
     check_units,
     crop_px,
     pixel_px,
@@ -70,6 +71,17 @@ def test_the_crop_of_keypoints_of_other_programs_is_that_of_their_box(stated):
     xy = k.xy_px.copy()
     xy[:, 0] += 5_000.0
     np.testing.assert_allclose(crop_px(dataclasses.replace(k, xy_px=xy)), crop_px(k), rtol=0.15)
+
+
+def test_the_box_is_between_numpys_percentiles_of_the_points_seen():
+    k = seen()
+    rng = np.random.default_rng(0)
+    k = dataclasses.replace(
+        k, confidence=np.where(rng.random(k.confidence.shape) < 0.5, 0.0, k.confidence), time_s=40 * k.time_s
+    )
+    points = np.where(k.confidence[..., None] > 0, k.xy_px, np.nan)
+    low, high = np.nanpercentile(points, (5, 95), axis=1)
+    np.testing.assert_allclose(box_side_px(k), np.max(high - low, axis=1), rtol=1e-5)  # frames too far apart to smooth
 
 
 def test_points_that_say_nothing_of_the_size_leave_the_pictures():

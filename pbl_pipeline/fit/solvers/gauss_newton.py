@@ -17,7 +17,11 @@ from .result import Result
 
 #: A step of a frame's unknown is cut to this.
 LONGEST_STEP = 0.5
-DAMPING_START, DAMPING_LEAST, DAMPING_MOST = 1e-2, 1e-7, 1e7
+#: Damping of the first step, the least at all and after a step that was refused (less changes no step), and the most.
+DAMPING_START, DAMPING_LEAST, DAMPING_REFUSED, DAMPING_MOST = 1e-2, 1e-7, 1e-3, 1e7
+#: Where no unknown of a frame moves further than `NEAR`, the step is as many Gauss-Newton steps long as a secant says,
+#: within these bounds: weak directions creep, or swing to and fro, by a fixed share of what is left.
+NEAR, SHORTEST, LONGEST = 0.2, 0.4, 2.5
 #: Space for the cost of each iteration: the bound on their number.
 MOST_ITERATIONS = 200
 
@@ -41,7 +45,7 @@ class Quadratic(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """When the iteration ends, as data: after a step in which no unknown of a frame moved further than `step`, or two
+    """When the iteration ends, as data: after a step in which no unknown of a frame moved further than `step`, or three
     in a row whose gain was below the fraction `gain` of the cost, or `iterations` steps.
     """
 
@@ -61,7 +65,12 @@ class Progress:
     cost: Array
     latest: Any
     candidate: Any
-    #: Longest step of an unknown from the state to the candidate.
+    #: The Gauss-Newton step (F, Q) and (K,) from the state, how many times it the candidate lies away, and how steeply
+    #: the cost falls along it.
+    direction: tuple[Array, Array]
+    length: Array
+    slope: Array
+    #: Longest step of a frame's unknown in that direction.
     step: Array
     damping: Array
     #: Candidates tried, the start not counted (-1 before it was evaluated).
@@ -81,6 +90,9 @@ def before_first(evaluate: Callable[[S], Quadratic], start: S) -> Progress:
         cost=jnp.asarray(jnp.inf, jnp.float32),
         latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
         candidate=start,
+        direction=(jnp.zeros(shapes.g.shape, shapes.g.dtype), jnp.zeros(shapes.h.shape, shapes.h.dtype)),
+        length=jnp.asarray(1.0, jnp.float32),
+        slope=jnp.asarray(jnp.inf, jnp.float32),
         step=jnp.asarray(jnp.inf, jnp.float32),
         damping=jnp.asarray(DAMPING_START, jnp.float32),
         iteration=jnp.asarray(-1, jnp.int32),
@@ -114,20 +126,28 @@ def minimise(
         keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
         state, latest, cost = jax.tree.map(keep, (p.candidate, now, now.cost), (p.state, p.latest, p.cost))
         damping = jnp.where(first, p.damping, jnp.where(accepted, p.damping / 10, p.damping * 10))
-        damping = jnp.clip(damping, DAMPING_LEAST, DAMPING_MOST)
+        damping = jnp.clip(damping, jnp.where(accepted, DAMPING_LEAST, DAMPING_REFUSED), DAMPING_MOST)
         gained = p.cost - now.cost > limits.gain * p.cost
         # A step that was refused says nothing of the minimum: the next one is damped more.
         idle = jnp.where(better, jnp.where(gained, 0, p.idle + 1), p.idle)
-        result = jnp.where(idle >= 2, Result.SMALL_GAIN, Result.BOUND)
+        result = jnp.where(idle >= 3, Result.SMALL_GAIN, Result.BOUND)
         result = jnp.where(better & (p.step < limits.step), Result.SMALL_STEP, result)
         dx, dy = solve(_damped(latest.system, damping), latest.g, latest.h)
         dx = jnp.clip(dx, -LONGEST_STEP, LONGEST_STEP)
+        longest = jnp.max(jnp.abs(dx) * counts[:, None])
+        # The length at which the slope along the last direction would have been 0.
+        secant = p.length / jnp.maximum(1 - _slope(latest, *p.direction) / p.slope, 1e-3)
+        near = better & (jnp.maximum(p.step, longest) < NEAR)
+        length = jnp.where(near, jnp.clip(secant, SHORTEST, LONGEST), 1.0)
         return Progress(
             state=state,
             cost=cost,
             latest=latest,
-            candidate=move(state, dx, dy),
-            step=jnp.max(jnp.abs(dx) * counts[:, None]),
+            candidate=move(state, length * dx, length * dy),
+            direction=(dx, dy),
+            length=length,
+            slope=_slope(latest, dx, dy),
+            step=longest,
             damping=damping,
             iteration=p.iteration + 1,
             idle=idle,
@@ -137,6 +157,11 @@ def minimise(
 
     most = jnp.minimum(limits.iterations, MOST_ITERATIONS)
     return jax.lax.while_loop(lambda p: (p.result == Result.BOUND) & (p.iteration < most), step, begin)
+
+
+def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:
+    """How steeply the cost falls along a step."""
+    return jnp.sum(at.g * dx) + jnp.sum(at.h * dy)
 
 
 def _damped(system: BorderedBandedSystem, damping: Array) -> BorderedBandedSystem:
