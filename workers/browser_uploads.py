@@ -4,6 +4,7 @@ of the drop folder is."""
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import os
 import secrets
@@ -23,6 +24,7 @@ from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, check_opens, has_room, tak
 #: Age at which the rest of a broken upload is removed (s).
 _REST_S = 86_400.0
 _PREFIX = "browser-"
+_refused = functools.partial(PblError, "UPLOAD_REFUSED")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,10 +65,10 @@ class Arriving:
         if ending not in (*VIDEO_ENDINGS, *LOG_ENDINGS):
             photo = ending in (".heic", ".heif", ".jpg", ".jpeg", ".png")
             raise _refused(
-                self.name,
                 "a photo" if photo else f"a file that ends in {ending!r}",
                 f"a video ({', '.join(VIDEO_ENDINGS)}), or the sensor log beside it ({', '.join(LOG_ENDINGS)})",
                 "choose the video itself",
+                self.name,
             )
         self._most = LARGEST_LOG if ending in LOG_ENDINGS else LARGEST
         folder = folder_of(archive_dir(), PHONE, to.subject)
@@ -87,7 +89,7 @@ class Arriving:
         self._n += len(piece)
         if self._n > self._most:
             found, most = f"a file of more than {self._most / 1e9:g} GB", f"at most {self._most / 1e9:g} GB"
-            raise _refused(self.name, found, most, "send a shorter recording")
+            raise _refused(found, most, "send a shorter recording", self.name)
         self._sum.update(piece)
         self._file.write(piece)
 
@@ -145,7 +147,7 @@ def register(
                 out.append(_take_in(visit, one.name, [copy, log] if log else [copy], by))
     expected, next_step = "the video of the same name with it", "send both together"
     out += [
-        Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused(stem, "a sensor log alone", expected, next_step))
+        Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused("a sensor log alone", expected, next_step, stem))
         for stem, copy in logs.items()
     ]
     remove_folders(archive_dir(), to.subject)
@@ -163,7 +165,3 @@ def _take_in(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outc
     if result.status == "registered":
         record("recording", by, {}, {}, {"recording": "registered"}, video_id=result.video_id)
     return Outcome(name, result.status, result.video_id)
-
-
-def _refused(name: str, found: str, expected: str, next_step: str) -> PblError:
-    return PblError("UPLOAD_REFUSED", found=found, expected=expected, next_step=next_step, key=name)

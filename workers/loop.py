@@ -10,7 +10,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any
 
 from pbl_pipeline.video import release_frames
 from schemas import tables_version
@@ -24,20 +24,7 @@ from .queue import Claim
 from .run_job import Computed, Outcome
 
 
-class Runs(Protocol):
-    """The part of a worker (`loop.Worker`) that batches use."""
-
-    stop: threading.Event
-    heartbeat: Any
-    batch: int
-
-    report: Callable[[Claim, Outcome | None], None]
-
-    def one(self, job: Claim, computed: Computed | None = None) -> Outcome: ...
-    def follow(self, outcomes: Sequence[Outcome]) -> None: ...
-
-
-def run_fits(first: list[Claim], worker: Runs, where: str | None = None) -> None:
+def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> None:
     """Do the jobs of `first` and, as long as there are more of that table, the next batches. `where`:
     as for `queue.claim`.
 

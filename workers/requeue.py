@@ -76,16 +76,14 @@ class Reprocess:
 
 
 #: Where a method is selected: table -> (prefix of its columns, selection, method table).
-_SELECTIONS = {
-    "Tracking": ("tracking", "TrackingSelection", "TrackingMethod"),
-    "Keypoints": ("keypoint", "KeypointSelection", "KeypointMethod"),
-    "SessionFit": ("fit", "FitPlan", "FitMethod"),
-    "GaitEvents": ("gait", "GaitPlan", "GaitEventMethod"),
-    "GDI": ("gdi", "GdiPlan", "GdiModel"),
-    "Kinetics": ("kinetics", "KineticsPlan", "KineticsMethod"),
+_SELECTIONS: dict[str, tuple[str, Any, Any]] = {
+    "Tracking": ("tracking", tracking.TrackingSelection, tracking.TrackingMethod),
+    "Keypoints": ("keypoint", keypoints.KeypointSelection, keypoints.KeypointMethod),
+    "SessionFit": ("fit", fit.FitPlan, fit.FitMethod),
+    "GaitEvents": ("gait", gait.GaitPlan, gait.GaitEventMethod),
+    "GDI": ("gdi", gdi.GdiPlan, gdi.GdiModel),
+    "Kinetics": ("kinetics", kinetics.KineticsPlan, kinetics.KineticsMethod),
 }
-#: Modules by prefix of their columns.
-_MODULES = {"tracking": tracking, "keypoint": keypoints, "fit": fit, "gait": gait, "gdi": gdi, "kinetics": kinetics}
 
 
 def plan_new_method(table: str, method: str, since: datetime.date | None = None) -> Reprocess:
@@ -104,9 +102,7 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
             expected="one of " + ", ".join(_SELECTIONS),
             next_step="name the table whose method changed; what follows from it is computed by itself",
         )
-    prefix, selection_name, method_name = _SELECTIONS[name]
-    module = _MODULES[prefix]
-    selection, methods = getattr(module, selection_name), getattr(module, method_name)
+    prefix, selection, methods = _SELECTIONS[name]
     column = f"{prefix}_method"
     chosen = resolve_method(methods, method)
     recorded = video.Video & (True if since is None else f"video_created >= '{since:%Y-%m-%d}'")
@@ -171,10 +167,10 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
     """Do what was planned, in small transactions, and queue it behind new work; yields how many are done so far."""
     one = table_named(plan.table)
     if plan.add:
-        prefix, selection_name, _ = _SELECTIONS[plan.table]
+        _, selection, _ = _SELECTIONS[plan.table]
         for i in range(0, len(plan.add), 50 * CHUNK):
             part = plan.add[i : i + 50 * CHUNK]
-            getattr(_MODULES[prefix], selection_name).insert(part, skip_duplicates=True)
+            selection.insert(part, skip_duplicates=True)
             if plan.fit_method is not None:
                 plan_fits(part, plan.fit_method)
             yield min(i + 50 * CHUNK, len(plan.add))

@@ -22,6 +22,12 @@ _LARGEST = 1 << 17
 
 #: Names of the marker sets that ship with the project.
 MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for p in _DATA.glob("markers_*.csv")))
+_format_error = functools.partial(
+    PblError,
+    "FILE_FORMAT",
+    expected="CSV with name, body, x, y, z in metres",
+    next_step="compare with pbl_pipeline/body/data/markers_blazepose_33.csv",
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,12 +92,12 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     try:
         text = read_text(path, _LARGEST)
     except (OSError, ValueError) as error:
-        raise _format_error(path, str(error)) from error
+        raise _format_error(str(error), key=path) from error
     numbered = [(i, t) for i, t in enumerate(text.splitlines(), 1) if t.strip() and not t.lstrip().startswith("#")]
     table = csv.DictReader((t for _, t in numbered), skipinitialspace=True)
     absent = [c for c in _COLUMNS if c not in (table.fieldnames or ())]
     if absent:
-        raise _format_error(path, f"no column {', '.join(absent)}")
+        raise _format_error(f"no column {', '.join(absent)}", key=path)
     names: list[str] = []
     bodies: list[str] = []
     positions: list[list[float]] = []
@@ -100,27 +106,27 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
         where = f"line {number}"
         marker, body = (row["name"] or "").strip(), (row["body"] or "").strip()
         if not marker or marker in names:
-            raise _format_error(path, f"{where}: {'no name' if not marker else f'marker {marker} a second time'}")
+            raise _format_error(f"{where}: {'no name' if not marker else f'marker {marker} a second time'}", key=path)
         if not is_plain(marker):
-            raise _format_error(path, f"{where}: a name with control characters")
+            raise _format_error(f"{where}: a name with control characters", key=path)
         if body not in known:
-            raise _format_error(path, f"{where}: body {body!r}", f"one of {', '.join(known)}")
+            raise _format_error(f"{where}: body {body!r}", expected=f"one of {', '.join(known)}", key=path)
         try:
             position = [float(row[c]) for c in "xyz"]
             weight = float(row.get("weight_3d") or 1)
         except (TypeError, ValueError) as error:
-            raise _format_error(path, f"{where}: {error}") from error
+            raise _format_error(f"{where}: {error}", key=path) from error
         # Two metres from a body's origin is no place on a person: most often a table in millimetres.
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > 2:
-            raise _format_error(path, f"{where}: position {position}")
+            raise _format_error(f"{where}: position {position}", key=path)
         if not 0 <= weight <= 1:
-            raise _format_error(path, f"{where}: weight_3d {weight}", "a number from 0 to 1")
+            raise _format_error(f"{where}: weight_3d {weight}", expected="a number from 0 to 1", key=path)
         names.append(marker)
         bodies.append(body)
         positions.append(position)
         weights.append(weight)
     if not names:
-        raise _format_error(path, "no markers")
+        raise _format_error("no markers", key=path)
     index = np.array([known.index(b) for b in bodies], np.int32)
     position_m = np.array(positions, np.float64)
     index.setflags(write=False)
@@ -128,13 +134,3 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     for array in (position_m, weight_3d):
         array.setflags(write=False)
     return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m, weight_3d)
-
-
-def _format_error(path: Path, found: str, expected: str = "CSV with name, body, x, y, z in metres") -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected=expected,
-        next_step="compare with pbl_pipeline/body/data/markers_blazepose_33.csv",
-        key=path,
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import click
@@ -14,6 +15,12 @@ from .gait import METHOD_HELP, is_c3d
 _EPILOG = """\b
 Example: pbl events walk.fit.npz --out walk.events.csv
 Example: pbl events walk.c3d --out walk.events.csv"""
+_format_error = functools.partial(
+    PblError,
+    "FILE_FORMAT",
+    expected="a fit.npz (qpos), a keypoints.npz (xyz_cam_m or xyz_world_m), or a C3D",
+    next_step="make one with `pbl detect` or `pbl fit`",
+)
 
 
 @click.command(epilog=_EPILOG)
@@ -58,14 +65,4 @@ def _feet(path: Path):
     if "xyz_world_m" in fields:
         seen = WorldMarkers.load(path)
         return feet_from_markers(seen.time_s, seen.names, seen.marker_set, seen.xyz_world_m, seen.confidence)
-    raise _format_error(path, f"fields {', '.join(sorted(fields)) or 'none'}")
-
-
-def _format_error(path: Path, found: str) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected="a fit.npz (qpos), a keypoints.npz (xyz_cam_m or xyz_world_m), or a C3D",
-        next_step="make one with `pbl detect` or `pbl fit`",
-        key=str(path),
-    )
+    raise _format_error(f"fields {', '.join(sorted(fields)) or 'none'}", key=path)

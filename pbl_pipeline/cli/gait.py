@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import click
@@ -14,6 +15,7 @@ METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-200
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
 Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
+_usage = functools.partial(PblError, "USAGE", next_step="see `pbl gait --help`")
 
 
 @click.command(epilog=_EPILOG)
@@ -99,7 +101,3 @@ def gait(
 def is_c3d(path: Path) -> bool:
     """Whether a file is a laboratory's recording, by its name; it may be gzipped."""
     return path.name.lower().removesuffix(".gz").endswith(".c3d")
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl gait --help`")

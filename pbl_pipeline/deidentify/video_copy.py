@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import functools
 import json
 import os
 import secrets
@@ -32,6 +33,20 @@ CELL_RADII = 0.4
 #: The blur is computed on a picture in which a radius has this many pixels.
 _RADIUS_PX = 10.0
 _SHIFT = 4  # OpenCV's circles carry this many fractional bits
+_unwritable = functools.partial(
+    PblError,
+    "FILE_UNWRITABLE",
+    next_step="pass another --out, or --overwrite to replace an earlier result (never the recording)",
+)
+_usage = functools.partial(PblError, "USAGE", next_step="see `pbl deidentify --help`")
+#: HEAD_NOT_FOUND about a recording whose pictures are to be shown without heads.
+nothing_covered = functools.partial(
+    PblError,
+    "HEAD_NOT_FOUND",
+    found="no head, so nothing of the recording is covered, and PBL_DEIDENTIFY forbids to show it",
+    expected="a person whose head is in the picture",
+    next_step="look at the recording; PBL_DEIDENTIFY=skeleton shows no picture at all",
+)
 
 
 def cover(image: np.ndarray, circles: Sequence[np.ndarray], how: str) -> None:
@@ -156,11 +171,11 @@ def check_call(video: Path, out: Path, how: str, keep: Collection[str], overwrit
     if out.suffix.lower() != ".mp4":
         raise _usage(f"--out {out.name}", "a name that ends in .mp4")
     if out.exists() and video.exists() and os.path.samefile(out, video):
-        raise _unwritable(out, "the recording itself", "another file than the recording")
+        raise _unwritable("the recording itself", "another file than the recording", key=out)
     for path in (out, sidecar_of(out)):
         check_out_file(path)
         if path.exists() and not overwrite:
-            raise _unwritable(path, "a file of that name", "a new name")
+            raise _unwritable("a file of that name", "a new name", key=path)
 
 
 def deidentify(
@@ -233,19 +248,8 @@ def to_show(video: str | Path, folder: Path, info: VideoInfo | None = None) -> P
         return Path(video)
     done = deidentify(video, folder / f"{secrets.token_hex(8)}.mp4", how, info=info)
     if done.status == "NO_HEAD" and how != "skeleton":
-        raise nothing_covered(video)
+        raise nothing_covered(key=video)
     return done.path
-
-
-def nothing_covered(about: object) -> PblError:
-    """HEAD_NOT_FOUND about a recording whose pictures are to be shown without heads."""
-    return PblError(
-        "HEAD_NOT_FOUND",
-        found="no head, so nothing of the recording is covered, and PBL_DEIDENTIFY forbids to show it",
-        expected="a person whose head is in the picture",
-        next_step="look at the recording; PBL_DEIDENTIFY=skeleton shows no picture at all",
-        key=str(about),
-    )
 
 
 def covered_picture(image: np.ndarray, heads: Heads, index: int, how: str) -> np.ndarray:
@@ -330,17 +334,3 @@ def _content(
         "parameters": dataclasses.asdict(params),
         "code_version": code_version(),
     }
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl deidentify --help`")
-
-
-def _unwritable(path: Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "FILE_UNWRITABLE",
-        found=found,
-        expected=expected,
-        next_step="pass another --out, or --overwrite to replace an earlier result (never the recording)",
-        key=str(path),
-    )

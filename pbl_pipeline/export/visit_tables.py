@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +14,13 @@ from pbl_pipeline.fit.angles_file import angles_table
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
 from pbl_pipeline.kinetics import CURVES, CycleKinetics, Kinetics
+from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.words import KINETICS, unit_of
 
 from .columns import Column, Labels, Table, joined
 from .trial import ExportTrial
 
-_MEANINGS = json.loads(resources.files("pbl_pipeline.export").joinpath("meanings.json").read_text(encoding="utf-8"))
+_MEANINGS = json.loads(shipped_text("export/meanings.json"))
 #: The direction in which a joint value grows, by the joint's name without its side.
 JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
 _SIDES = {"r": "right", "l": "left"}

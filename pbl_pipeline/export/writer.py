@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -32,6 +33,8 @@ from .keypoints_csv import write_keypoints_csv
 from .osim import write_osim, write_trc
 from .trial import ExportTrial, wanted_markers, with_body_points
 from .visit_tables import session_tables
+
+_input = functools.partial(PblError, "EXPORT_INPUT")
 
 
 def origin_of(trial: ExportTrial, body: Body) -> dict[str, str]:
@@ -364,7 +367,3 @@ def _check_names(trial: ExportTrial, formats: Sequence[str]) -> None:
             f"names of ASCII letters without spaces, / \\ * + in {', '.join(formats)}",
             "rename the markers in the table and fit again; csv, parquet and dlc take any name",
         )
-
-
-def _input(found: str, expected: str, next_step: str, key: str | None = None) -> PblError:
-    return PblError("EXPORT_INPUT", found=found, expected=expected, next_step=next_step, key=key)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Sequence
 
@@ -16,6 +17,9 @@ from .types import GaitCycle
 
 #: Fewer people, or a larger fraction of the cycles from one person, give a warning.
 ADVISED_PEOPLE, MAX_SHARE = 20, 0.2
+_invalid = functools.partial(
+    PblError, "NORM_INVALID", next_step="add cycles or choose others (docs/measures.md, section Normative sets)"
+)
 
 
 def norm_from_cycles(
@@ -101,12 +105,3 @@ def _bands(cycles: Sequence[GaitCycle], percent: np.ndarray) -> dict[str, dict[s
         curves = np.array([_vector(c, (name,), percent) for c in cycles])
         bands[name] = {"percent": percent, "mean_deg": curves.mean(axis=0), "sd_deg": curves.std(axis=0, ddof=1)}
     return bands
-
-
-def _invalid(found: str, expected: str) -> PblError:
-    return PblError(
-        "NORM_INVALID",
-        found=found,
-        expected=expected,
-        next_step="add cycles or choose others (docs/measures.md, section Normative sets)",
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import io
 import itertools
 import math
@@ -53,6 +54,11 @@ _FOOT_MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 _LEG_MARKERS = ("LPSI", "RPSI", "SACR", "LKNE", "RKNE", "LANK", "RANK")
 _LABELS = {"Foot Strike": FOOT_DOWN, "Foot Off": FOOT_UP}
 _SIDES = {"left": LEFT, "right": RIGHT}
+_format_error = functools.partial(
+    PblError,
+    "FILE_FORMAT",
+    next_step="export the recording with the angles of the laboratory's model, see docs/files.md",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +89,7 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
     column = {name: i for i, name in enumerate(labels)}
     missing = [p for p in angle_points if p not in column]
     if missing:
-        raise _format_error(path, f"no points {', '.join(dict.fromkeys(missing))}", "the angles of Plug-in Gait")
+        raise _format_error(f"no points {', '.join(dict.fromkeys(missing))}", "the angles of Plug-in Gait", key=path)
     angles = {
         letter: {name: points[:, column[letter + p], k] for name, (p, k) in PLUG_IN_GAIT_POINTS.items()}
         for letter in "LR"
@@ -151,9 +157,9 @@ def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], n
         rate = float(reader.point_rate)
     # The package raises whatever it stumbles over.
     except Exception as error:
-        raise _format_error(path, f"{type(error).__name__}: {error}", "a C3D file") from error
+        raise _format_error(f"{type(error).__name__}: {error}", "a C3D file", key=path) from error
     if not len(rows) or not 0 < rate < math.inf:
-        raise _format_error(path, "no frames", "points over time")
+        raise _format_error("no frames", "points over time", key=path)
     xyz = np.where(rows[..., 3:4] < 0, np.nan, rows[..., :3])
     return xyz, list(column), (reader.first_frame - 1 + np.arange(len(xyz))) / rate, reader
 
@@ -173,7 +179,7 @@ def _metres(reader: Any, path: Path) -> float:
     text = str(np.ravel(unit.string_array)[0]).strip().lower() if unit is not None else "mm"
     factors = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
     if text not in factors:
-        raise _format_error(path, f"points in {text!r}", "mm, cm or m")
+        raise _format_error(f"points in {text!r}", "mm, cm or m", key=path)
     return factors[text]
 
 
@@ -215,13 +221,3 @@ def _given(events: tuple[GaitEvent, ...], method: str, source: str) -> GaitEvent
     span = ((events[0].time_s, events[-1].time_s),) if events else ()
     reason = "" if events else "no event in the file"
     return GaitEvents(PASS if events else EMPTY, events, reason, method, "", source, span, len(events))
-
-
-def _format_error(path: Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected=expected,
-        next_step="export the recording with the angles of the laboratory's model, see docs/files.md",
-        key=str(path),
-    )

@@ -19,12 +19,12 @@ import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.bounded import parse_json
+from pbl_pipeline.shipped import shipped_model
 
 from .cycle_measures import Z90
 from .events import LEFT, RIGHT
@@ -161,13 +161,12 @@ def model_names() -> tuple[str, ...]:
 @functools.cache
 def load_model(name: str) -> MeasurementModel:
     """Return a model that ships, by its name."""
-    data: dict[str, Any] = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8"))
-    del data["made_by"]
+    arrays = ("mean", "spread", "person", "visit", "cycle")
+    data = shipped_model(f"gait/measurement_models/{name}.json", arrays)
     errors = {k: {n: MeasureError(*e) for n, e in view.items()} for k, view in data.pop("measures").items()}
     views = {k: View(**{n: np.array(v) for n, v in view.items()}) for k, view in data.pop("views").items()}
     views[RIGHT] = views[LEFT].mirrored()
-    arrays: dict[str, Any] = {n: np.array(data.pop(n)) for n in ("mean", "spread", "person", "visit", "cycle")}
-    return MeasurementModel(**data, **arrays, views=views, measures=errors)
+    return MeasurementModel(**data, views=views, measures=errors)
 
 
 @functools.cache

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,23 +31,28 @@ class Curves(NamedTuple):
     error_model: str = ""
 
 
+def curve_table(curves: Sequence[Mapping[str, np.ndarray]], names: Sequence[str]) -> np.ndarray:
+    """Return the curves of C cycles, (C, K, P) float32 of the K `names`; those that a cycle lacks are NaN."""
+    unknown = np.full(len(REPORT_PERCENT), np.nan, np.float32)
+    rows = [[of_cycle.get(name, unknown) for name in names] for of_cycle in curves]
+    return np.asarray(rows, np.float32).reshape(len(curves), len(names), len(unknown))
+
+
+def known_curves(names: Sequence[str], rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the known curves by name of one cycle of a `curve_table`. rows: (K, P)."""
+    return {name: curve for name, curve in zip(names, rows, strict=True) if np.isfinite(curve).all()}
+
+
 def save_curves(cycles: Sequence[GaitCycle], path: Path) -> None:
     """Write the curves of all cycles and their standard deviations to one .npz (float32); unknown curves are NaN."""
-    percent = np.asarray(REPORT_PERCENT, np.float32)
     names = sorted({name for c in cycles for name in c.curves})
-    unknown = np.full(len(percent), np.nan, np.float32)
-
-    def table(of: Callable[[GaitCycle], Mapping[str, np.ndarray]]) -> np.ndarray:
-        rows = [[of(c).get(name, unknown) for name in names] for c in cycles]
-        return np.asarray(rows, np.float32).reshape(len(cycles), len(names), len(percent))
-
     np.savez_compressed(
         path,
         cycle_no=np.asarray([c.number for c in cycles], np.int16),
         names=np.asarray(names, dtype=str),
-        percent=percent,
-        curve=table(lambda c: c.curves),
-        curve_sd=table(lambda c: c.curves_sd),
+        percent=np.asarray(REPORT_PERCENT, np.float32),
+        curve=curve_table([c.curves for c in cycles], names),
+        curve_sd=curve_table([c.curves_sd for c in cycles], names),
         error_model=np.asarray([c.error_model for c in cycles], dtype=str),
     )
 
@@ -68,14 +73,9 @@ def load_curves(path: Path) -> dict[int, Curves]:
     sd = data.get("curve_sd", np.full_like(curves, np.nan))  # absent in files of version 0.1 and before
     shape = (data["cycle_no"].size, len(names), None)
     check_numbers(path, {"curve": curves, "curve_sd": sd}, {"curve": shape, "curve_sd": shape})
-
     errors = texts_of(path, data, "error_model") if "error_model" in data else [""] * shape[0]  # since version 0.2
-
-    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: curve for name, curve in zip(names, rows, strict=True) if np.isfinite(curve).all()}
-
     rows = zip(data["cycle_no"].ravel(), curves, sd, errors, strict=True)
-    return {int(n): Curves(known(a), known(b), error) for n, a, b, error in rows}
+    return {int(n): Curves(known_curves(names, a), known_curves(names, b), error) for n, a, b, error in rows}
 
 
 #: Checks of the index among the checks of a trial or session; the others are of its measures.

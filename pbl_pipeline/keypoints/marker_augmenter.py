@@ -11,6 +11,7 @@ The walking direction should not matter but does, so the predictions for several
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -51,6 +52,7 @@ _LEG_OF_HEIGHT = 0.462
 _ADULT_M, _PERSON_M = (1.35, 2.15), (0.5, 2.6)
 #: Legs that imply another height than the stated one by more than this fraction are told.
 _MISMATCH = 0.08
+_unsuitable = functools.partial(PblError, "AUGMENTER_INPUT")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -219,7 +221,3 @@ def _resampled(to_s: np.ndarray, from_s: np.ndarray, values: np.ndarray) -> np.n
     """(N, P, 3) at the times `to_s`, linear between `from_s`; its ends hold beyond."""
     flat = values.reshape(len(values), -1)
     return np.stack([np.interp(to_s, from_s, v) for v in flat.T], axis=1).reshape(len(to_s), *values.shape[1:])
-
-
-def _unsuitable(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("AUGMENTER_INPUT", found=found, expected=expected, next_step=next_step)

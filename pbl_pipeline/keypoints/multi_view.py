@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,11 @@ from .types import Keypoints
 
 #: Cameras started by one trigger differ by less; a frame of 60 Hz is 17 ms.
 SAME_TIME_S = 1e-3
+_view_error = functools.partial(
+    PblError,
+    "FIT_INPUT",
+    next_step="synchronise and cut the recordings to the same frames, and detect each with the same method",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +99,11 @@ def check_same_times(times_s: Sequence[np.ndarray], key: object = None) -> None:
     for number, other in enumerate(times_s[1:], 2):
         if len(other) != len(first):
             found = f"{len(other)} frames in view {number}, {len(first)} in the first"
-            raise _view_error(found, "the same frames in all", key)
+            raise _view_error(found, "the same frames in all", key=key)
         apart = float(np.max(np.abs(np.asarray(other) - first), initial=0.0))
         if not apart <= SAME_TIME_S:
             found = f"time stamps of view {number} up to {1000 * apart:.3g} ms from the first's"
-            raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together", key)
+            raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together", key=key)
 
 
 def cameras_of_files(stems: Sequence[str], calibration: str | Path) -> tuple[str, list[str]]:
@@ -125,16 +131,6 @@ def cameras_of_files(stems: Sequence[str], calibration: str | Path) -> tuple[str
 
 def _plain(name: str) -> str:
     return re.sub(r"[_\-\s]", "", name).casefold()
-
-
-def _view_error(found: str, expected: str, key: object = None) -> PblError:
-    return PblError(
-        "FIT_INPUT",
-        found=found,
-        expected=expected,
-        next_step="synchronise and cut the recordings to the same frames, and detect each with the same method",
-        key=key,
-    )
 
 
 def _calibration_error(path: str | Path, cameras: list[str], views: list[str], n_views: int) -> PblError:

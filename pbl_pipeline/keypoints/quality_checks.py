@@ -24,12 +24,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from importlib import resources
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
+from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.tracking import step_s
 
 from .in_view import SEEN_SHARE, ends, visibility
@@ -38,7 +38,7 @@ from .types import Keypoints
 #: The bound of all curves: a fraction of the length of the trunk (middle of the shoulders to middle of the hips) in the
 #: picture, as it would be seen from the side. The "percentage of correct points" of pose estimation at 0.2.
 BOUND_TRUNK = 0.2
-_DATA = "data/confidence_curves.json"
+_DATA = "keypoints/data/confidence_curves.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,9 +65,8 @@ class ConfidenceCurve:
 @functools.cache
 def confidence_curves() -> dict[str, ConfidenceCurve]:
     """All curves by name."""
-    text = resources.files("pbl_pipeline.keypoints").joinpath(_DATA).read_text(encoding="utf-8")
     curves = {}
-    for name, c in json.loads(text)["curves"].items():
+    for name, c in json.loads(shipped_text(_DATA))["curves"].items():
         stated, probability = np.asarray(c["stated"], float), np.asarray(c["probability"], float)
         if np.any(np.diff(stated) <= 0) or np.any(np.diff(probability) < 0) or not 0 <= probability[0] <= 1:
             raise ValueError(f"{_DATA}: {name} is not a monotone curve")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ _OPTIONAL = (
     *("picture_time_s", "picture_luma", "picture_detail", "crop_px"),
 )
 _NO_SOURCE = "not stated in the keypoints file"
+_format_error = functools.partial(PblError, "FILE_FORMAT", next_step="see docs/files.md, section keypoints.npz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,10 +226,6 @@ def _box(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
 
 def _there(value: object) -> str:
     return "missing" if value is None else "there"
-
-
-def _format_error(found: str, expected: str) -> PblError:
-    return PblError("FILE_FORMAT", found=found, expected=expected, next_step="see docs/files.md, section keypoints.npz")
 
 
 def log_shift_s(log: PhoneLog, keypoints: Keypoints | None, path: str) -> float:

@@ -9,13 +9,14 @@ holds `Frame#`, `Time` and each marker's name over its three columns, line 5 the
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pbl_pipeline.bounded import MAX_SECONDS, MAX_TEXT, count_rows, read_bytes, span_s
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
 
@@ -23,6 +24,14 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _HEADER_LINES = 5
 #: Spread of the markers of a frame that no room has and no body: the unit is another one than the file says.
 _WIDEST_M, _NARROWEST_M = 50.0, 0.01
+_format_error = functools.partial(
+    PblError, "FILE_FORMAT", next_step="see docs/files.md, section markers of a laboratory"
+)
+_damaged = functools.partial(
+    PblError,
+    "FILE_FORMAT",
+    next_step="export it again, tab-separated; docs/files.md, section markers of a laboratory, says what is read",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,36 +51,31 @@ def read_trc(path: str | Path) -> Trc:
     says, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
     other than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
     """
-    try:
-        # Only names matter: a path in the first line may be in any encoding.
-        lines = read_bytes(path, MAX_TEXT).decode("utf-8-sig", errors="replace").splitlines()
-        count_rows(len(lines))
-    except ValueError as error:
-        raise _damaged(path, str(error), "some minutes of some hundred markers") from error
-    except OSError as error:
-        raise PblError(
-            "FILE_MISSING",
-            found=error.strerror or str(error),
-            expected="a TRC file",
-            next_step="check the path, and that you may read the file",
-            key=str(path),
-        ) from error
+    with os_errors_as("FILE_MISSING", "a TRC file", "check the path, and that you may read the file", path):
+        try:
+            # Only names matter: a path in the first line may be in any encoding.
+            lines = read_bytes(path, MAX_TEXT).decode("utf-8-sig", errors="replace").splitlines()
+            count_rows(len(lines))
+        except ValueError as error:
+            raise _damaged(str(error), "some minutes of some hundred markers", key=path) from error
     if len(lines) < _HEADER_LINES or not lines[0].startswith("PathFileType"):
-        raise _damaged(path, "no header of a TRC file", "five lines, the first beginning with PathFileType")
+        raise _damaged("no header of a TRC file", "five lines, the first beginning with PathFileType", key=path)
     header = dict(zip(_cells(lines[1]), _cells(lines[2]), strict=False))
     scale = _METRES.get(header.get("Units", "").lower())
     if scale is None:
-        raise _damaged(path, f"Units {header.get('Units', '')!r}", "mm, cm or m")
+        raise _damaged(f"Units {header.get('Units', '')!r}", "mm, cm or m", key=path)
     names = tuple(n for n in _cells(lines[3])[2:] if n)
     if not names or _count(path, header, "NumMarkers") != len(names):
-        raise _damaged(path, f"{len(names)} names, NumMarkers {header.get('NumMarkers')}", "as many names as markers")
+        raise _damaged(
+            f"{len(names)} names, NumMarkers {header.get('NumMarkers')}", "as many names as markers", key=path
+        )
     rows = [(i, line) for i, line in enumerate(lines[_HEADER_LINES:], _HEADER_LINES + 1) if line.strip()]
     if not rows or _count(path, header, "NumFrames") != len(rows):
-        raise _damaged(path, f"{len(rows)} rows, NumFrames {header.get('NumFrames')}", "a row for each frame")
+        raise _damaged(f"{len(rows)} rows, NumFrames {header.get('NumFrames')}", "a row for each frame", key=path)
     table = np.array([_numbers(path, i, line, 2 + 3 * len(names)) for i, line in rows])
     time_s, xyz = table[:, 1], scale * table[:, 2:].reshape(len(rows), len(names), 3)
     if not np.isfinite(time_s).all() or np.any(np.diff(time_s) <= 0):
-        raise _damaged(path, "times that are missing, repeat or run backwards", "strictly increasing seconds")
+        raise _damaged("times that are missing, repeat or run backwards", "strictly increasing seconds", key=path)
     xyz[np.all(xyz == 0, axis=2)] = np.nan
     _check_unit(path, xyz, header["Units"])
     return Trc(time_s, names, xyz)
@@ -85,19 +89,21 @@ def _count(path: str | Path, header: dict[str, str], name: str) -> int:
     try:
         return int(float(header[name]))
     except (KeyError, ValueError, OverflowError) as error:
-        raise _damaged(path, f"{name} {header.get(name, '')!r}", "a whole number") from error
+        raise _damaged(f"{name} {header.get(name, '')!r}", "a whole number", key=path) from error
 
 
 def _numbers(path: str | Path, number: int, line: str, n_cells: int) -> np.ndarray:
     cells = _cells(line)
     if len(cells) < n_cells or any(cells[n_cells:]):
-        raise _damaged(path, f"line {number}: {len(cells)} cells", f"{n_cells} cells between tabs")
+        raise _damaged(f"line {number}: {len(cells)} cells", f"{n_cells} cells between tabs", key=path)
     try:
         values = np.array([float(cell) if cell else np.nan for cell in cells[:n_cells]])
     except ValueError as error:
-        raise _damaged(path, f"line {number}: {error}", "numbers, or empty cells where a marker is missing") from error
+        raise _damaged(
+            f"line {number}: {error}", "numbers, or empty cells where a marker is missing", key=path
+        ) from error
     if np.isinf(values).any():
-        raise _damaged(path, f"line {number}: an infinite number", "finite numbers, or empty cells")
+        raise _damaged(f"line {number}: an infinite number", "finite numbers, or empty cells", key=path)
     return values
 
 
@@ -108,18 +114,8 @@ def _check_unit(path: str | Path, xyz_m: np.ndarray, unit: str) -> None:
     size = float(np.median(np.max(np.nanmax(whole, axis=1) - np.nanmin(whole, axis=1), axis=1)))
     if not _NARROWEST_M < size < _WIDEST_M:
         raise _damaged(
-            path, f"markers that lie {size:.3g} m apart if Units {unit} is right", "the unit the numbers are in"
+            f"markers that lie {size:.3g} m apart if Units {unit} is right", "the unit the numbers are in", key=path
         )
-
-
-def _damaged(path: str | Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected=expected,
-        next_step="export it again, tab-separated; docs/files.md, section markers of a laboratory, says what is read",
-        key=str(path),
-    )
 
 
 _FIELDS = ("time_s", "names", "marker_set", "xyz_world_m", "confidence")
@@ -191,7 +187,7 @@ class WorldMarkers:
         data = load_npz(path, _FIELDS)
         missing = [k for k in _FIELDS if k not in data]
         if missing:
-            raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", path)
+            raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", key=path)
         n, j = data["time_s"].size, data["names"].size
         check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
         names, marker_set = texts_of(path, data, "names"), text_of(path, data, "marker_set")
@@ -252,14 +248,4 @@ def _about(path: str | Path, *values) -> WorldMarkers:
     try:
         return WorldMarkers(*values)
     except PblError as error:
-        raise _format_error(error.found, error.expected, path) from error
-
-
-def _format_error(found: str, expected: str, path: str | Path | None = None) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected=expected,
-        next_step="see docs/files.md, section markers of a laboratory",
-        key=None if path is None else str(path),
-    )
+        raise _format_error(error.found, error.expected, key=path) from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
+from pbl_pipeline.gait.metrics_file import curve_table, known_curves
 from pbl_pipeline.paramset import structured
-from pbl_pipeline.qc import Check
 
 from .joints import MOMENTS
-from .types import CURVES, CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
+from .types import CURVES, CycleKinetics, Kinetics, Series, TrialKinetics
 
 _SERIES = tuple(f.name for f in dataclasses.fields(Series))
 _OF_CYCLES = ("cycle_no", "names", "percent", "curve", "curve_sd")
@@ -26,30 +26,24 @@ def content_of(kinetics: Kinetics) -> dict[str, Any]:
     """Return the content of kinetics.json."""
     own = ("status", "code", "reason", "mass_kg", "residual_bw", "method", "params_hash")
     return {
-        **{name: getattr(kinetics, name) for name in own},
+        **_own(kinetics, *own),
         "measures": {name: m.to_dict() for name, m in kinetics.measures.items()},
         "reasons": dict(kinetics.reasons),
         "qc": [c.to_dict() for c in kinetics.qc],
         "trials": [
-            {
-                "name": t.name,
-                "status": t.status,
-                "code": t.code,
-                "reason": t.reason,
-                "cycles": [
-                    {
-                        "number": c.number,
-                        "side": c.side,
-                        "used": c.used,
-                        "measures": {name: round(v, 5) for name, v in c.measures.items()},
-                        "missing": c.missing,
-                    }
-                    for c in t.cycles
-                ],
-            }
+            {**_own(t, "name", "status", "code", "reason"), "cycles": [_cycle(c) for c in t.cycles]}
             for t in kinetics.trials
         ],
     }
+
+
+def _cycle(cycle: CycleKinetics) -> dict[str, Any]:
+    measures = {name: round(v, 5) for name, v in cycle.measures.items()}
+    return {**_own(cycle, "number", "side", "used"), "measures": measures, "missing": cycle.missing}
+
+
+def _own(found: Any, *names: str) -> dict[str, Any]:
+    return {name: getattr(found, name) for name in names}
 
 
 def save_content(kinetics: Kinetics, path: Path) -> None:
@@ -57,54 +51,23 @@ def save_content(kinetics: Kinetics, path: Path) -> None:
     path.write_text(json.dumps(content_of(kinetics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | None, Sequence[Mapping]]]) -> Kinetics:
+def kinetics_of(content: Mapping[str, Any], arrays: Mapping[str, tuple[Series | None, Mapping]]) -> Kinetics:
     """Return the kinetics of a kinetics.json. `arrays`: by trial, what `load_arrays` returned.
 
     Raises KeyError, TypeError, ValueError, AttributeError where the content is not that of a kinetics.json.
     """
-    measures = {}
-    for name, told in content["measures"].items():
-        measures[str(name)] = structured({k: v for k, v in told.items() if k != "interval"}, KineticMeasure)
     trials = []
-    for t in content["trials"]:
-        series, curves = arrays.get(t["name"], (None, ()))
-        of_cycle = {int(c["number"]): c for c in curves}
-        cycles = tuple(
-            CycleKinetics(
-                number=int(c["number"]),
-                side=str(c["side"]),
-                used=bool(c["used"]),
-                curves=of_cycle.get(int(c["number"]), {}).get("curves", {}),
-                curves_sd=of_cycle.get(int(c["number"]), {}).get("curves_sd", {}),
-                measures={str(k): float(v) for k, v in c["measures"].items()},
-                missing=str(c["missing"]),
-            )
-            for c in t["cycles"]
-        )
-        trials.append(TrialKinetics(str(t["name"]), str(t["status"]), str(t["code"]), str(t["reason"]), cycles, series))
-    numbers = {k: None if content[k] is None else float(content[k]) for k in ("mass_kg", "residual_bw")}
-    return Kinetics(
-        status=str(content["status"]),
-        code=str(content["code"]),
-        reason=str(content["reason"]),
-        measures=measures,
-        reasons={str(k): str(v) for k, v in content["reasons"].items()},
-        **numbers,
-        method=str(content["method"]),
-        params_hash=str(content["params_hash"]),
-        trials=tuple(trials),
-        qc=tuple(structured(c, Check) for c in content["qc"]),
-    )
+    for told in content["trials"]:
+        series, curves = arrays.get(told["name"], (None, {}))
+        cycles = [{**c, **curves.get(c["number"], {})} for c in told["cycles"]]
+        trials.append(dataclasses.replace(structured({**told, "cycles": cycles}, TrialKinetics), series=series))
+    measures = {name: {k: v for k, v in told.items() if k != "interval"} for name, told in content["measures"].items()}
+    found = structured({**content, "measures": measures, "trials": ()}, Kinetics)
+    return dataclasses.replace(found, trials=tuple(trials))
 
 
 def save_arrays(trial: TrialKinetics, path: Path) -> None:
     """Write a trial's forces and moments over time, and its cycles' curves, to one .npz (float32, time_s float64)."""
-    unknown = np.full(len(REPORT_PERCENT), np.nan)
-    tables = {
-        name: [[of(c).get(n, unknown) for n in CURVES] for c in trial.cycles]
-        for name, of in (("curve", lambda c: c.curves), ("curve_sd", lambda c: c.curves_sd))
-    }
-    shape = (len(trial.cycles), len(CURVES), len(REPORT_PERCENT))
     over_time = {}
     if trial.series is not None:
         over_time = {n: np.asarray(getattr(trial.series, n), float if n == "time_s" else np.float32) for n in _SERIES}
@@ -114,13 +77,14 @@ def save_arrays(trial: TrialKinetics, path: Path) -> None:
         cycle_no=np.asarray([c.number for c in trial.cycles], np.int16),
         names=np.asarray(CURVES, dtype=str),
         percent=np.asarray(REPORT_PERCENT, np.float32),
-        **{name: np.asarray(rows, np.float32).reshape(shape) for name, rows in tables.items()},
+        curve=curve_table([c.curves for c in trial.cycles], CURVES),
+        curve_sd=curve_table([c.curves_sd for c in trial.cycles], CURVES),
         **over_time,
     )
 
 
-def load_arrays(path: Path) -> tuple[Series | None, list[dict[str, Any]]]:
-    """Return forces and moments over time, and of each cycle `number`, `curves` and `curves_sd`.
+def load_arrays(path: Path) -> tuple[Series | None, dict[int, dict[str, Any]]]:
+    """Return forces and moments over time, and by number of the cycle its `curves` and `curves_sd`.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """
@@ -145,9 +109,5 @@ def load_arrays(path: Path) -> tuple[Series | None, list[dict[str, Any]]]:
         }
         check_numbers(path, data, shapes)
         series = Series(**{name: np.asarray(data[name], float) for name in _SERIES})
-
-    def known(rows: np.ndarray) -> dict[str, np.ndarray]:
-        return {name: row for name, row in zip(names, rows, strict=True) if np.isfinite(row).all()}
-
     rows = zip(data["cycle_no"].ravel(), data["curve"], data["curve_sd"], strict=True)
-    return series, [{"number": int(i), "curves": known(a), "curves_sd": known(b)} for i, a, b in rows]
+    return series, {int(i): {"curves": known_curves(names, a), "curves_sd": known_curves(names, b)} for i, a, b in rows}

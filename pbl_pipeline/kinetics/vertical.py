@@ -16,15 +16,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve, toeplitz
 
-from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.runs import runs
+from pbl_pipeline.shipped import shipped_model
 
 from .dynamics import GRAVITY, GRID_HZ
 
@@ -128,12 +127,9 @@ class _Part:
 @functools.cache
 def load_vertical_model(name: str) -> VerticalModel:
     """Return a model that ships."""
-    file = resources.files("pbl_pipeline.kinetics").joinpath("vertical_models", f"{name}.json")
-    data: dict[str, Any] = parse_json(file.read_text(encoding="utf-8"))
-    del data["made_by"]
-    arrays: dict[str, Any] = {k: np.array(data.pop(k)) for k in ("phase", "mean", "slope", "person")}
+    data = shipped_model(f"kinetics/vertical_models/{name}.json", ("phase", "mean", "slope", "person"))
     noise = {k: Noise(*v) for k, v in data.pop("noise").items()}
-    return VerticalModel(**data, **arrays, noise=noise)
+    return VerticalModel(**data, noise=noise)
 
 
 def support_phase(stands: np.ndarray) -> Float[np.ndarray, " N"]:

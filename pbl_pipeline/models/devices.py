@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Sequence
 
@@ -10,6 +11,14 @@ from pbl_pipeline.errors import PblError
 #: What may be asked for. "auto": CUDA where it works, else the CPU, and the model says which.
 DEVICES = ("auto", "cpu", "cuda")
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
+unavailable = functools.partial(
+    PblError,
+    "DEVICE_UNAVAILABLE",
+    expected="onnxruntime with a CUDA execution provider that starts, because cuda was asked for",
+    next_step="replace onnxruntime by onnxruntime-gpu and install the CUDA and cuDNN that it names, or ask for "
+    "cpu or auto (--device, PBL_ONNX_DEVICE)",
+    key="cuda",
+)
 
 
 def asked_device(device: str | None = None) -> str:
@@ -50,14 +59,3 @@ def providers_for(device: str | None = None) -> list[str]:
 def device_of(providers: Sequence[str]) -> str:
     """The device that a session with these providers computes on."""
     return next((d for d, p in _PROVIDERS.items() if providers and providers[0] == p), "cpu")
-
-
-def unavailable(found: str) -> PblError:
-    return PblError(
-        "DEVICE_UNAVAILABLE",
-        found=found,
-        expected="onnxruntime with a CUDA execution provider that starts, because cuda was asked for",
-        next_step="replace onnxruntime by onnxruntime-gpu and install the CUDA and cuDNN that it names, or ask for "
-        "cpu or auto (--device, PBL_ONNX_DEVICE)",
-        key="cuda",
-    )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.resources import cores
 
 from .devices import asked_device, device_of, providers_for, unavailable
@@ -52,7 +52,7 @@ class OnnxModel:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
                 raise unavailable(_first_line(error)) from error
             raise model_invalid(
-                self._path, _first_line(error), "a graph that the installed onnxruntime loads"
+                _first_line(error), "a graph that the installed onnxruntime loads", key=self._path
             ) from error
         self.device = device_of(self._session.get_providers())
         self.note = ""
@@ -67,7 +67,7 @@ class OnnxModel:
             got = self(black)
         except Exception as error:
             raise model_invalid(
-                self._path, f"it does not run: {_first_line(error)}", "a graph that computes"
+                f"it does not run: {_first_line(error)}", "a graph that computes", key=self._path
             ) from error
         self._check_shapes(got)
 
@@ -142,7 +142,7 @@ class OnnxModel:
                 raise self._wrong(f"{self.spec.outputs[role]} of shape {array.shape}", expected)
 
     def _wrong(self, found: str, expected: str) -> PblError:
-        return model_invalid(self._path, found, f"{expected}, as its model.json says")
+        return model_invalid(found, f"{expected}, as its model.json says", key=self._path)
 
 
 def check_frozen(spec: ModelSpec, sha256: str, spec_sha256: str) -> None:
@@ -165,16 +165,8 @@ def check_frozen(spec: ModelSpec, sha256: str, spec_sha256: str) -> None:
 def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
     """The bytes of `model.onnx`. Raises `PblError` MODEL_MISSING, MODEL_CHECKSUM."""
     path = Path(folder) / GRAPH_FILE
-    try:
+    with os_errors_as("MODEL_MISSING", f"{GRAPH_FILE} beside model.json", "copy the whole folder again", path):
         data = path.read_bytes()
-    except OSError as error:
-        raise PblError(
-            "MODEL_MISSING",
-            found=error.strerror or str(error),
-            expected=f"{GRAPH_FILE} beside model.json",
-            next_step="copy the whole folder again",
-            key=str(path),
-        ) from error
     found = hashlib.sha256(data).hexdigest()
     if found != spec.sha256:
         raise PblError(

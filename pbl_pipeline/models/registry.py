@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import http.client
 import os
@@ -22,7 +23,7 @@ from typing import IO
 
 from pbl_pipeline import progress, settings
 from pbl_pipeline.bounded import DAMAGED, opened_zip
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.temporary import new_folder
 
 from .onnx_model import OnnxModel, check_graph_file
@@ -33,6 +34,9 @@ _CHUNK = 1 << 20
 #: Only these leave an archive; the graph is at most what one ONNX file may be.
 _MEMBERS = (GRAPH_FILE, SPEC_FILE, "LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
 _LARGEST = 2 << 30
+_missing = functools.partial(
+    PblError, "MODEL_MISSING", expected=f"a folder or archive with {GRAPH_FILE} and {SPEC_FILE}"
+)
 
 
 @contextlib.contextmanager
@@ -62,7 +66,9 @@ def unpacked(source: str | Path, sha256: str | None) -> Iterator[Path]:
 
 def _download(address: str, into: Path) -> Path:
     if settings.offline():
-        raise _missing(address, "PBL_OFFLINE forbids fetching", "copy the archive here and add it as a file")
+        raise _missing(
+            "PBL_OFFLINE forbids fetching", next_step="copy the archive here and add it as a file", key=address
+        )
     path = into / "archive"
     try:
         request = urllib.request.Request(address, headers={"User-Agent": "pbl-pipeline"})  # noqa: S310 - http(s) only
@@ -71,7 +77,9 @@ def _download(address: str, into: Path) -> Path:
             with progress.bar("fetching the model", total=round(total / 1e6), unit="MB") as update:
                 _copy(answer, file, address, update)
     except (OSError, urllib.error.URLError, http.client.HTTPException, ValueError) as error:
-        raise _missing(address, str(getattr(error, "reason", error)), "check the address and the connection") from error
+        raise _missing(
+            str(getattr(error, "reason", error)), next_step="check the address and the connection", key=address
+        ) from error
     return path
 
 
@@ -81,7 +89,7 @@ def _copy(answer: IO[bytes], file: IO[bytes], address: str, update) -> None:
         file.write(chunk)
         come += len(chunk)
         if come > _LARGEST:
-            raise _missing(address, "more than 2 GB", "check the address: a model's archive is smaller")
+            raise _missing("more than 2 GB", next_step="check the address: a model's archive is smaller", key=address)
         update(round(come / 1e6) - drawn)
         drawn = round(come / 1e6)
 
@@ -91,7 +99,7 @@ def _check(archive: Path, sha256: str | None, source: str) -> None:
         with archive.open("rb") as file:
             found = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise _missing(source, error.strerror or str(error), "check the path") from error
+        raise _missing(error.strerror or str(error), next_step="check the path", key=source) from error
     if sha256 and found != sha256.strip().lower():
         raise PblError(
             "MODEL_CHECKSUM",
@@ -117,7 +125,7 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
                 opened = tar.extractfile
             specs = [n for n, _ in members if PurePosixPath(n).name == SPEC_FILE]
             if len(specs) != 1:
-                raise model_invalid(source, f"{len(specs)} files {SPEC_FILE} in the archive", "one")
+                raise model_invalid(f"{len(specs)} files {SPEC_FILE} in the archive", "one", key=source)
             home = PurePosixPath(specs[0]).parent
             for name, size in members:
                 path = PurePosixPath(name)
@@ -132,18 +140,8 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
     except (*DAMAGED, tarfile.TarError, ValueError, OSError) as error:
         what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise model_invalid(
-            source, f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive"
+            f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive", key=source
         ) from error
-
-
-def _missing(source: str, found: str, next_step: str) -> PblError:
-    return PblError(
-        "MODEL_MISSING",
-        found=found,
-        expected=f"a folder or archive with {GRAPH_FILE} and {SPEC_FILE}",
-        next_step=next_step,
-        key=source,
-    )
 
 
 #: Files that are kept beside graph and spec, where they are there.
@@ -211,7 +209,12 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
                 "old one stay, and a method that names it then fails until it is added again",
                 key=str(source),
             )
-        try:
+        with os_errors_as(
+            "FILE_UNWRITABLE",
+            f"a folder of models that you may write to ({there.parent})",
+            "set PBL_MODELS to a folder of your own",
+            there,
+        ):
             there.parent.mkdir(parents=True, exist_ok=True)
             with _scratch(there.parent) as new:
                 for name in (GRAPH_FILE, SPEC_FILE, *_TEXTS):
@@ -221,30 +224,16 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
                     if there.exists():  # put aside in one step: nobody meets half of it
                         os.replace(there, old / "model")
                     os.replace(new, there)
-        except OSError as error:
-            raise PblError(
-                "FILE_UNWRITABLE",
-                found=error.strerror or str(error),
-                expected=f"a folder of models that you may write to ({there.parent})",
-                next_step="set PBL_MODELS to a folder of your own",
-                key=str(there),
-            ) from error
     return load_spec(there), model
 
 
 def remove(name: str) -> Path:
     """Delete a registered model's folder and return where it was. Raises `PblError` MODEL_MISSING, FILE_UNWRITABLE."""
     folder = find(name)
-    try:
+    with os_errors_as(
+        "FILE_UNWRITABLE", "a folder of models that you may change", "ask the owner of the folder", folder
+    ):
         shutil.rmtree(folder)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="a folder of models that you may change",
-            next_step="ask the owner of the folder",
-            key=str(folder),
-        ) from error
     return folder
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.bounded import read_json
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.paramset import canonical_json
 
 SPEC_FILE, GRAPH_FILE = "model.json", "model.onnx"
@@ -36,6 +37,10 @@ _INPUT = ("name", "width", "height", "layout", "colour", "mean", "std")
 _WORDS = ("name", "licence", "source", "comment")
 #: Ways in which names tell the sides apart: (left, right) at the beginning or the end of a name.
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("l", "r"), ("L", "R"))
+#: MODEL_INVALID about a file of a model.
+model_invalid = functools.partial(
+    PblError, "MODEL_INVALID", next_step="correct the model's folder as docs/models.md describes it, and add it again"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,20 +88,18 @@ def load_spec(folder: str | Path) -> ModelSpec:
     wrong kind. MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
     """
     path = Path(folder) / SPEC_FILE
-    try:
-        content = read_json(path)
-    except OSError as error:
-        raise PblError(
-            "MODEL_MISSING",
-            found=error.strerror or str(error),
-            expected=f"a folder with {GRAPH_FILE} and {SPEC_FILE}",
-            next_step="see docs/models.md for what a model's folder holds",
-            key=str(path),
-        ) from error
-    except ValueError as error:
-        raise model_invalid(path, f"no JSON text ({error})", "a JSON object") from error
+    with os_errors_as(
+        "MODEL_MISSING",
+        f"a folder with {GRAPH_FILE} and {SPEC_FILE}",
+        "see docs/models.md for what a model's folder holds",
+        path,
+    ):
+        try:
+            content = read_json(path)
+        except ValueError as error:
+            raise model_invalid(f"no JSON text ({error})", "a JSON object", key=path) from error
     if not isinstance(content, dict):
-        raise model_invalid(path, "no named fields", "a JSON object")
+        raise model_invalid("no named fields", "a JSON object", key=path)
     return parse_spec(content, path)
 
 
@@ -107,27 +110,29 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
     _fields(path, "", content, required, (*(_OPTIONAL_POINTS if points else ()), *_OPTIONAL))
     name = _text(path, content, "name")
     if not _NAME.fullmatch(name):
-        raise model_invalid(path, f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40")
+        raise model_invalid(f"name {name!r}", "small letters, digits, '.', '_' and '-', at most 40", key=path)
     kind = _text(path, content, "kind")
     if kind not in KINDS:
-        raise model_invalid(path, f"kind {kind!r}", f"one of {', '.join(KINDS)}")
+        raise model_invalid(f"kind {kind!r}", f"one of {', '.join(KINDS)}", key=path)
     sha256 = _text(path, content, "sha256").lower()
     if not _SHA256.fullmatch(sha256):
-        raise model_invalid(path, f"sha256 {sha256[:80]!r}", f"the 64 hex digits of the SHA-256 of {GRAPH_FILE}")
+        raise model_invalid(f"sha256 {sha256[:80]!r}", f"the 64 hex digits of the SHA-256 of {GRAPH_FILE}", key=path)
     outputs = content["outputs"]
     if not isinstance(outputs, dict) or set(outputs) != set(KINDS[kind]) or not _all_text(outputs.values()):
-        raise model_invalid(path, f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}")
+        raise model_invalid(f"outputs {outputs!r}", f"the graph's names of {', '.join(KINDS[kind])}", key=path)
     names = content.get("joint_names", [])
     if not isinstance(names, list) or bool(names) != points or not _all_text(names) or len(set(names)) != len(names):
-        raise model_invalid(path, "joint_names: not a list of names, all different", "a name for each point, in order")
+        raise model_invalid(
+            "joint_names: not a list of names, all different", "a name for each point, in order", key=path
+        )
     markers = _text(path, content, "marker_set") if points else ""
     if len(markers) > 32:
-        raise model_invalid(path, f"marker_set of {len(markers)} characters", "at most 32")
+        raise model_invalid(f"marker_set of {len(markers)} characters", "at most 32", key=path)
     if points:
         _check_marker_set(markers, names)
     origin = content.get("pixel_origin", "centre")
     if origin not in ("centre", "edge"):
-        raise model_invalid(path, f"pixel_origin {origin!r}", "'centre' or 'edge'")
+        raise model_invalid(f"pixel_origin {origin!r}", "'centre' or 'edge'", key=path)
     hashed = {k: v for k, v in content.items() if k not in _WORDS}
     return ModelSpec(
         name=name,
@@ -164,35 +169,28 @@ def mirror_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     return pairs
 
 
-def model_invalid(path: str | Path, found: str, expected: str) -> PblError:
-    """MODEL_INVALID about a file of a model."""
-    return PblError(
-        "MODEL_INVALID",
-        found=found,
-        expected=expected,
-        next_step="correct the model's folder as docs/models.md describes it, and add it again",
-        key=str(path),
-    )
-
-
 def _mirror(path: str | Path, names: list[str], stated: Any) -> tuple[int, ...]:
     if stated is None:
         pairs = mirror_pairs(names)
     elif isinstance(stated, list) and all(isinstance(p, list) and len(p) == 2 and _all_text(p) for p in stated):
         pairs = [(a, b) for a, b in stated]
     else:
-        raise model_invalid(path, "mirror_pairs: not a list of pairs of names", "[[left, right], ...]")
+        raise model_invalid("mirror_pairs: not a list of pairs of names", "[[left, right], ...]", key=path)
     flat = [n for pair in pairs for n in pair]
     wrong = sorted({n for n in flat if n not in names or flat.count(n) > 1})
     if wrong:
-        raise model_invalid(path, f"mirror_pairs with {', '.join(wrong)}", "names of joint_names, each once at most")
+        raise model_invalid(
+            f"mirror_pairs with {', '.join(wrong)}", "names of joint_names, each once at most", key=path
+        )
     out = list(range(len(names)))
     for left, right in pairs:
         i, j = names.index(left), names.index(right)
         out[i], out[j] = j, i
     lone = [n for i, n in enumerate(names) if out[i] == i and re.search("left|right", n.lower())]
     if lone:
-        raise model_invalid(path, f"no other side of {', '.join(lone)}", "a pair for each, by name or in mirror_pairs")
+        raise model_invalid(
+            f"no other side of {', '.join(lone)}", "a pair for each, by name or in mirror_pairs", key=path
+        )
     return tuple(out)
 
 
@@ -206,20 +204,22 @@ def _check_marker_set(markers: str, names: Sequence[str]) -> None:
 
 def _input(path: str | Path, value: Any) -> ModelInput:
     if not isinstance(value, dict):
-        raise model_invalid(path, "input: no named fields", f"an object with {', '.join(_INPUT)}")
+        raise model_invalid("input: no named fields", f"an object with {', '.join(_INPUT)}", key=path)
     _fields(path, "input.", value, _INPUT, ())
     layout, colour = _text(path, value, "layout"), _text(path, value, "colour")
     if layout not in ("NCHW", "NHWC") or colour not in ("RGB", "BGR"):
-        raise model_invalid(path, f"input layout {layout!r}, colour {colour!r}", "NCHW or NHWC, RGB or BGR")
+        raise model_invalid(f"input layout {layout!r}, colour {colour!r}", "NCHW or NHWC, RGB or BGR", key=path)
     for side in ("width", "height"):
         size = value[side]
         if not isinstance(size, int) or isinstance(size, bool) or not 16 <= size <= 4096:
-            raise model_invalid(path, f"input {side} {size!r}", "a whole number of pixels, 16 to 4096")
+            raise model_invalid(f"input {side} {size!r}", "a whole number of pixels, 16 to 4096", key=path)
     for field in ("mean", "std"):
         numbers = value[field]
         three = isinstance(numbers, list) and len(numbers) == 3 and all(_is_number(n) for n in numbers)
         if not three or (field == "std" and min(numbers) <= 0):
-            raise model_invalid(path, f"input {field} {numbers!r}", "three numbers on the scale 0..255, std positive")
+            raise model_invalid(
+                f"input {field} {numbers!r}", "three numbers on the scale 0..255, std positive", key=path
+            )
     mean, std = tuple(map(float, value["mean"])), tuple(map(float, value["std"]))
     name = _text(path, value, "name")
     return ModelInput(name, value["width"], value["height"], layout, colour, mean, std)  # type: ignore[arg-type]
@@ -233,13 +233,13 @@ def _fields(
     if missing or unknown:
         found = [f"no {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
         known = f"the fields {', '.join(required)}" + (f"; optional {', '.join(optional)}" if optional else "")
-        raise model_invalid(path, "; ".join(found), known)
+        raise model_invalid("; ".join(found), known, key=path)
 
 
 def _text(path: str | Path, content: Mapping[str, Any], field: str) -> str:
     value = content[field]
     if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST:
-        raise model_invalid(path, f"{field} {str(value)[:80]!r}", f"a text of 1 to {_LONGEST} characters")
+        raise model_invalid(f"{field} {str(value)[:80]!r}", f"a text of 1 to {_LONGEST} characters", key=path)
     return value.strip()
 
 
@@ -254,5 +254,5 @@ def _is_number(value: Any) -> bool:
 def _number(path: str | Path, content: Mapping[str, Any], field: str, default: float, low: float, high: float) -> float:
     value = content.get(field, default)
     if not _is_number(value) or not low <= value <= high:
-        raise model_invalid(path, f"{field} {value!r}", f"a number from {low:g} to {high:g}")
+        raise model_invalid(f"{field} {value!r}", f"a number from {low:g} to {high:g}", key=path)
     return float(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,6 +27,9 @@ from pbl_pipeline.render.drawing import (
 from pbl_pipeline.video import read_frames, scaled_matrix, write_h264
 
 _BLOCK = 64  # frames whose capsules are computed and kept at a time
+_changed = functools.partial(
+    PblError, "VIDEO_CHANGED", next_step="use the recording that the fit was made from, or run the chain on this one"
+)
 
 
 class _Painter:
@@ -154,7 +158,7 @@ def render_overlay(
     try:
         write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf)
         if count != len(fit.time_s):
-            raise _changed(video_path, f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted")
+            raise _changed(f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
         part.replace(out_path)
     finally:
         part.unlink(missing_ok=True)
@@ -203,7 +207,7 @@ def overlay_frames(
             pictures[frame.index] = np.ascontiguousarray(image)
     missing = [i for i in wanted if i not in pictures]
     if missing:
-        raise _changed(video_path, f"no frame {missing[0]}", f"{len(fit.time_s)} frames, as when it was fitted")
+        raise _changed(f"no frame {missing[0]}", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
     return [pictures[int(i)] for i in indices]
 
 
@@ -252,16 +256,6 @@ def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
 def _check_frame(image: np.ndarray, index: int, fit: TrialFit, video_path: str | Path) -> None:
     size = (image.shape[1], image.shape[0])
     if size != tuple(fit.image_size_px):
-        raise _changed(video_path, f"a frame of {size} px", f"{tuple(fit.image_size_px)} px, as when it was fitted")
+        raise _changed(f"a frame of {size} px", f"{tuple(fit.image_size_px)} px, as when it was fitted", key=video_path)
     if index >= len(fit.time_s):
-        raise _changed(video_path, f"a frame {index}", f"{len(fit.time_s)} frames, as when it was fitted")
-
-
-def _changed(video_path: str | Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "VIDEO_CHANGED",
-        found=found,
-        expected=expected,
-        next_step="use the recording that the fit was made from, or run the chain on this one",
-        key=video_path,
-    )
+        raise _changed(f"a frame {index}", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)

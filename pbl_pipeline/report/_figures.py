@@ -12,8 +12,10 @@ from markupsafe import Markup
 
 from pbl_pipeline import charts
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, far_leg_of, leg_angles
+from pbl_pipeline.gait import GaitCycle, GaitEvents, NormalBands, leg_angles
+from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.render import SIDE_COLOUR, stance_spans
+from pbl_pipeline.report.curves import Ranges, cycle_curves
 from pbl_pipeline.report.words import plural
 from pbl_pipeline.runs import runs
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
@@ -28,38 +30,24 @@ class Picture:
     image: np.ndarray
 
 
-_SIDES = ("left", "right")
 _JPEG_QUALITY = 84
 
 
 def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
     """One chart per angle over the cycles that count: the joints first, then the pelvis. Empty without curves."""
-    usable = [c for c in cycles if c.used and c.curves]
-    if not usable:
-        return []
-    foot_off, faint = {s: _foot_off([c for c in usable if c.side == s]) for s in _SIDES}, far_leg_of(usable)
-    names = ANGLES | FOOT_ANGLES | PELVIS_ANGLES
-    drawn = []
-    for key, (title, positive) in names.items():
-        by_side = {s: [c.curves[key] for c in usable if c.side == s and key in c.curves] for s in _SIDES}
-        if not any(by_side.values()):
-            continue
-        band = (bands.percent, *bands.curves[key]) if key in bands.curves else None
-        percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
-        ranges = [
-            f"{side} {number(float(np.min(mean)), 0)} to {number(float(np.max(mean)), 0)}\N{DEGREE SIGN}"
-            for side, curves in by_side.items()
-            if curves and np.isfinite(mean := charts.mean_curve(curves)).all()
-        ]
-        label = f"{title} in degrees over the gait cycle in percent. Mean curves: {', '.join(ranges)}."
-        drawn.append(
-            {
-                "name": title,
-                "note": ", ".join(x for x in (positive, "" if band is not None else "no norm") if x),
-                "svg": charts.cycle_chart(label, percent, by_side, foot_off, band, faint),
-            }
-        )
-    return drawn
+    return [
+        {
+            "name": curve.title,
+            "note": ", ".join(x for x in (curve.positive, "" if curve.norm is not None else "no norm") if x),
+            "svg": curve.picture,
+        }
+        for curve in cycle_curves(cycles, bands, ANGLES | FOOT_ANGLES | PELVIS_ANGLES, _cycle_label)
+    ]
+
+
+def _cycle_label(title: str, ranges: Ranges) -> str:
+    told = (f"{s} {number(low, 0)} to {number(high, 0)}\N{DEGREE SIGN}" for s, (low, high) in ranges.items())
+    return f"{title} in degrees over the gait cycle in percent. Mean curves: {', '.join(told)}."
 
 
 def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
@@ -67,10 +55,10 @@ def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
     if not np.isfinite(fit.qpos).any():
         return []
     sides = leg_angles(fit)
-    spans = {s: stance_spans(events.events, s) for s in _SIDES} if events is not None else {}
+    spans = {s: stance_spans(events.events, s) for s in SIDES} if events is not None else {}
     drawn = []
     for name, (title, positive) in ANGLES.items():
-        curves = {side: sides[side][name] for side in _SIDES if name in sides[side]}
+        curves = {side: sides[side][name] for side in SIDES if name in sides[side]}
         label = f"{title} in degrees over the {fit.time_s[-1]:.1f} seconds of the recording."
         drawn.append({"name": title, "note": positive, "svg": charts.time_chart(label, fit.time_s, curves, spans)})
     return drawn
@@ -82,13 +70,13 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
         return None
     counts = ", ".join(
         f"{side} foot down {len(events.times(side, 'foot_down'))} and up {len(events.times(side, 'foot_up'))} times"
-        for side in _SIDES
+        for side in SIDES
     )
     return charts.contact_chart(
         f"Foot contacts over the recording: {counts}.",
         float(fit.time_s[-1]),
         known_spans(fit),
-        {s: stance_spans(events.events, s) for s in _SIDES},
+        {s: stance_spans(events.events, s) for s in SIDES},
         [(e.time_s, e.side, e.event) for e in events.events],
     )
 
@@ -141,11 +129,6 @@ def legend(*items: str) -> list[tuple[Markup, str]]:
         (Markup('<svg viewBox="0 0 30 12" aria-hidden="true">{}</svg>').format(samples[i][0]), samples[i][1])
         for i in items
     ]
-
-
-def _foot_off(cycles: Sequence[GaitCycle]) -> float:
-    values = [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in cycles]
-    return float(np.mean(values)) if values else float("nan")
 
 
 def _line(colour: str, width: float, dash: str = "none", opacity: float = 1.0) -> Markup:

@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from pbl_pipeline import charts
-from pbl_pipeline.kinetics import KineticMeasure, Kinetics
+from pbl_pipeline.gait.events import SIDES
+from pbl_pipeline.kinetics import GRAVITY, KineticMeasure, Kinetics
 from pbl_pipeline.kinetics.types import WIDTH_SD
 from pbl_pipeline.qc import PASS
 from pbl_pipeline.report.words import plural, sentence
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 
-_SIDES = ("left", "right")
 #: Smallest range of a chart by unit.
 _LEAST = {"BW": 0.2, "Nm/kg": 0.5, "W/kg": 1.0}
 #: The section is folded where the 90 % interval of the loading peak reaches further than this from it (body weights).
@@ -37,7 +37,7 @@ def forces_section(visit: Visit) -> dict | None:
     peak = kinetics.measures.get("vertical_peak_loading_bw")
     sure = peak is not None and peak.sd is not None and WIDTH_SD * peak.sd <= _UNSURE_BW
     weight = kinetics.mass_kg
-    in_newtons = "" if weight is None else f" 1 BW is {number(9.80665 * weight, 0)} N."
+    in_newtons = "" if weight is None else f" 1 BW is {number(GRAVITY * weight, 0)} N."
     residual = kinetics.residual_bw
     left_over = "" if residual is None else f" Carried by no foot: {number(100 * residual, 1)} % of the weight."
     doubts = [c for c in kinetics.qc if c.outcome != PASS]
@@ -96,7 +96,7 @@ def force_charts(kinetics: Kinetics, label: Callable[[str, str, int], str]) -> l
     cycles = [c for t in kinetics.trials for c in t.cycles if c.used and c.curves]
     drawn = []
     for name, (title, unit) in KINETICS_CURVES.items():
-        by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in _SIDES}
+        by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in SIDES}
         known = [curve for curves in by_side.values() for curve in curves]
         if not known or any(text in name for text in hidden):
             continue

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from pathlib import Path, PurePath
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
@@ -42,6 +40,7 @@ from pbl_pipeline.report.words import (
     sentence,
     size,
 )
+from pbl_pipeline.shipped import shipped_page, shipped_text
 from pbl_pipeline.visit import Recording, Visit
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, number, significant
 
@@ -417,10 +416,8 @@ def write_report(
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    folder = resources.files("pbl_pipeline.report").joinpath("templates")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    template = environment.from_string(folder.joinpath("report.html").read_text(encoding="utf-8"))
-    css = Markup(folder.joinpath("report.css").read_text(encoding="utf-8"))  # noqa: S704  our own file
+    template = shipped_page("report/templates/report.html")
+    css = Markup(shipped_text("report/templates/report.css"))  # noqa: S704  our own file
     page = {"tiles": [], "measures": [], "cycle_charts": [], "index": None, "forces": None} | page_of(
         visit, pictures or {}, title, norm
     )

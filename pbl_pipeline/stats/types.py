@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,7 @@ from pbl_pipeline.errors import PblError
 
 #: Beyond this, and as a spread below its inverse, squares are no longer numbers of a computer.
 _LARGEST = 1e100
-
-
-def refuse(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("STATS_INPUT", found=found, expected=expected, next_step=next_step)
+refuse = functools.partial(PblError, "STATS_INPUT")
 
 
 def numbers(values: Any, name: str, ndim: int = 1, missing: bool = False) -> np.ndarray:

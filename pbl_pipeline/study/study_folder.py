@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -15,11 +16,19 @@ import pandas as pd
 
 from pbl_pipeline.bounded import MAX_ROWS, MIB, read_bytes, read_json
 from pbl_pipeline.csv_cells import frame_to_csv, unquoted_frame
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.paramset import structured
 
 from .types import FRAMES, StudyData, StudyDescription
+
+_missing = functools.partial(
+    os_errors_as,
+    "FILE_MISSING",
+    "the folder of a study: study.json, visits.csv, ... (docs/study.md)",
+    "check the path, and that all files of the folder were copied",
+)
+_format = functools.partial(PblError, "FILE_FORMAT")
 
 
 def deidentified(study: StudyData, prefix: str = "P") -> tuple[StudyData, pd.DataFrame]:
@@ -106,17 +115,17 @@ def read_study(folder: str | Path) -> StudyData:
         data = _read(path, _MAX_BYTES.get(name, 32 * MIB))
         if sums is not None and sums.get(path.name) != _sha256(data):
             raise _format(
-                path,
                 "another content than study.json names",
                 "the file as it was written",
                 "copy the folder again; if the change is meant, remove the key files from study.json",
+                path,
             )
         frames[name] = _frame(path, name, data)
     try:
         fields = {f.name for f in dataclasses.fields(StudyDescription)}
         description = structured({k: v for k, v in about.items() if k in fields}, StudyDescription)
     except (TypeError, ValueError) as error:
-        raise _format(folder / _ABOUT, str(error), "the fields of docs/study.md", "export the study again") from error
+        raise _format(str(error), "the fields of docs/study.md", "export the study again", folder / _ABOUT) from error
     try:
         study = StudyData(**frames, description=description)
     except PblError as error:
@@ -163,23 +172,21 @@ def _csv(name: str, frame: Any) -> bytes:
 
 def _about(path: Path) -> dict[str, Any]:
     try:
-        about = read_json(path)
-    except OSError as error:
-        raise _missing(path, error) from error
+        with _missing(path):
+            about = read_json(path)
     except ValueError as error:
-        raise _format(path, str(error), "a JSON object", "copy the folder again") from error
+        raise _format(str(error), "a JSON object", "copy the folder again", path) from error
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("files", {}), dict):
-        raise _format(path, "another format", f"a study of the format {FORMAT}", "export the study again")
+        raise _format("another format", f"a study of the format {FORMAT}", "export the study again", path)
     return about
 
 
 def _read(path: Path, at_most: int) -> bytes:
     try:
-        return read_bytes(path, at_most)
-    except OSError as error:
-        raise _missing(path, error) from error
+        with _missing(path):
+            return read_bytes(path, at_most)
     except ValueError as error:
-        raise _format(path, str(error), "a CSV file of a study", "split the study") from error
+        raise _format(str(error), "a CSV file of a study", "split the study", path) from error
 
 
 def _frame(path: Path, name: str, data: bytes) -> pd.DataFrame:
@@ -194,22 +201,8 @@ def _frame(path: Path, name: str, data: bytes) -> pd.DataFrame:
         )
         return unquoted_frame(read)
     except (ValueError, OverflowError) as error:  # pandas' ParserError and UnicodeDecodeError are ValueErrors
-        raise _format(path, f"{error}"[:200], "a CSV file as docs/study.md describes it", "copy it again") from error
+        raise _format(f"{error}"[:200], "a CSV file as docs/study.md describes it", "copy it again", path) from error
 
 
 def _sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def _missing(path: Path, error: OSError) -> PblError:
-    return PblError(
-        "FILE_MISSING",
-        found=error.strerror or str(error),
-        expected="the folder of a study: study.json, visits.csv, ... (docs/study.md)",
-        next_step="check the path, and that all files of the folder were copied",
-        key=path,
-    )
-
-
-def _format(path: Path, found: str, expected: str, next_step: str) -> PblError:
-    return PblError("FILE_FORMAT", found=found, expected=expected, next_step=next_step, key=path)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 from collections.abc import Mapping
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,13 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain
+from pbl_pipeline.shipped import shipped_text
 
 SIDES = ("left", "right", "both")
 #: Points of a curve, in percent of the gait cycle.
 CURVE_PERCENT = np.linspace(0.0, 100.0, 101)
 CURVE_POINTS = tuple(f"p{i}" for i in range(101))
+invalid = functools.partial(PblError, "STUDY_INVALID")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,9 +35,8 @@ class Column:
 
 
 def _frames() -> dict[str, tuple[Column, ...]]:
-    text = resources.files("pbl_pipeline.study").joinpath("frame_columns.csv").read_text(encoding="utf-8")
     found: dict[str, list[Column]] = {}
-    for row in csv.DictReader(text.splitlines()):
+    for row in csv.DictReader(shipped_text("study/frame_columns.csv").splitlines()):
         column = Column(row["name"], row["kind"], row["unit"], row["meaning"], row["optional"] == "yes")
         found.setdefault(row["frame"], []).append(column)
     found["curves"] += [
@@ -115,15 +116,15 @@ class StudyData:
         for name, key in KEYS.items():
             frame: Any = getattr(self, name)
             if (twice := frame.duplicated(list(key))).any():
-                raise invalid(name, f"{_row(frame, twice, key)} twice", "one row of each", "remove or correct one")
+                raise invalid(f"{_row(frame, twice, key)} twice", "one row of each", "remove or correct one", name)
             if "visit" in key:
                 lost = ~pd.MultiIndex.from_frame(frame[["subject", "visit"]]).isin(known)
                 if lost.any():
                     raise invalid(
-                        name, f"{_row(frame, lost, key)}, a visit that is not in visits", "visits of visits", "add it"
+                        f"{_row(frame, lost, key)}, a visit that is not in visits", "visits of visits", "add it", name
                     )
             if "side" in key and (odd := ~frame["side"].isin(SIDES)).any():
-                raise invalid(name, f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side")
+                raise invalid(f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side", name)
         _check_units(self.measures, "measures", "measure")
         _check_units(self.curves, "curves", "variable")
         _check_index(self.measures)
@@ -147,10 +148,10 @@ def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
         frame = pd.DataFrame({c.name: [] for c in columns})
     frame = frame.assign(**{c.name: "" for c in columns if c.optional and c.name not in frame})
     if absent := [c.name for c in columns if c.name not in frame]:
-        raise invalid(name, f"no column {', '.join(absent[:5])}", "the columns of docs/study.md", "add them")
+        raise invalid(f"no column {', '.join(absent[:5])}", "the columns of docs/study.md", "add them", name)
     more = [c for c in frame.columns if c not in {k.name for k in columns}]
     if more and name != "visits":
-        raise invalid(name, f"unknown column {more[0]!r}", "the columns of docs/study.md", "remove it")
+        raise invalid(f"unknown column {more[0]!r}", "the columns of docs/study.md", "remove it", name)
     known = pd.DataFrame({c.name: _values(name, c, frame[c.name]) for c in columns}, index=frame.index)
     return known.join(frame[more])
 
@@ -165,13 +166,13 @@ def _values(name: str, column: Column, values: Any) -> Any:
         if column.kind == "flag":
             return values.map(_flag).astype(bool)
     except (TypeError, ValueError) as error:
-        raise invalid(name, f"{column.name}: {error}", f"a column of kind {column.kind}", "correct it") from None
+        raise invalid(f"{column.name}: {error}", f"a column of kind {column.kind}", "correct it", name) from None
     texts = values.astype(object).where(values.notna(), "").astype(str).str.strip()
     odd = [t for t in texts.unique() if len(t) > _LONGEST or not is_plain(t) or (not t and column.kind == "label")]
     if odd:
         found = f"{column.name}: {ascii(odd[0])[:80]}" if odd[0] else f"{column.name}: empty"
         raise invalid(
-            name, found, f"one line of {'1' if column.kind == 'label' else '0'} to {_LONGEST} characters", "correct it"
+            found, f"one line of {'1' if column.kind == 'label' else '0'} to {_LONGEST} characters", "correct it", name
         )
     return texts
 
@@ -187,57 +188,57 @@ def _flag(value: Any) -> bool:
 
 def _check_visits(visits: Any) -> None:
     if not len(visits):
-        raise invalid("visits", "no visit", "one at least", "put visits into the study")
+        raise invalid("no visit", "one at least", "put visits into the study", "visits")
     by_person = visits.groupby("subject", sort=False)
     if len(odd := by_person["group"].nunique().loc[lambda n: n > 1]):
-        raise invalid("visits", f"subject {odd.index[0]} in {odd.iloc[0]} groups", "one group per person", "correct it")
+        raise invalid(f"subject {odd.index[0]} in {odd.iloc[0]} groups", "one group per person", "correct it", "visits")
     excluded = visits[~visits["included"]]
     if (bare := excluded["reason"] == "").any():
         raise invalid(
-            "visits", f"{_row(excluded, bare, KEYS['visits'])} does not count, without a reason", "a reason", "write it"
+            f"{_row(excluded, bare, KEYS['visits'])} does not count, without a reason", "a reason", "write it", "visits"
         )
     counted = visits[visits["included"]]
     if (twice := counted.duplicated(["subject", "role"])).any():
         raise invalid(
-            "visits",
             f"{_row(counted, twice, ('subject', 'role'))} twice among the visits that count",
             "each role once per person",
             "exclude one of them with the reason, or give it another role",
+            "visits",
         )
     first = counted[counted["role"].isin(FIRST_ROLES)].groupby("subject")["days"].max()
     others = counted[~counted["role"].isin(FIRST_ROLES)]
     if (late := others["days"] < others["subject"].map(first).astype(float)).any():
         raise invalid(
-            "visits",
             f"{_row(others, late, ('subject', 'visit', 'role'))} before the visit {' or '.join(FIRST_ROLES)}",
             "days that fit the roles",
             "correct role or date",
+            "visits",
         )
 
 
 def _check_units(frame: Any, name: str, what: str) -> None:
     units = frame.groupby(what, sort=False)["unit"].nunique()
     if len(odd := units[units > 1]):
-        raise invalid(name, f"{what} {odd.index[0]} in {odd.iloc[0]} units", "one unit", "convert the values")
+        raise invalid(f"{what} {odd.index[0]} in {odd.iloc[0]} units", "one unit", "convert the values", name)
 
 
 def _check_index(measures: Any) -> None:
     if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
-        raise invalid("measures", "gdi of both sides", "that index in visits only", "remove it here")
+        raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
 
 
 def _check_scores(scores: Any, instruments: Any) -> None:
     table = instruments.set_index("instrument")
     if (odd := ~scores["instrument"].isin(table.index)).any():
         raise invalid(
-            "scores", f"instrument {scores.loc[odd, 'instrument'].iloc[0]!r}", "a row of instruments", "add its row"
+            f"instrument {scores.loc[odd, 'instrument'].iloc[0]!r}", "a row of instruments", "add its row", "scores"
         )
     if (table["low"] >= table["high"]).any() or (table["mic"] <= 0).any():
         raise invalid(
-            "instruments",
             "a range whose low is not below its high, or a minimal important change that is not positive",
             "low < high, mic > 0",
             "correct the row",
+            "instruments",
         )
     for text in table["classes"]:
         classes_of(text)
@@ -247,10 +248,10 @@ def _check_scores(scores: Any, instruments: Any) -> None:
     if (outside := (scores["value"] < low) | (scores["value"] > high)).any():
         row = scores[outside].iloc[0]
         raise invalid(
-            "scores",
             f"{row['instrument']} {row['value']:g} of {row['subject']}, {row['visit']}",
             f"{low[outside].iloc[0]:g} to {high[outside].iloc[0]:g}",
             "correct the score at its source",
+            "scores",
         )
 
 
@@ -263,10 +264,10 @@ def classes_of(text: str) -> list[tuple[float, str]]:
             found.append((float(number), word.strip() or number))
         except ValueError:
             raise invalid(
-                "instruments", f"classes {text!r}", "such as: 0 high risk; 21 low risk", "correct it"
+                f"classes {text!r}", "such as: 0 high risk; 21 low risk", "correct it", "instruments"
             ) from None
     if [v for v, _ in found] != sorted({v for v, _ in found}):
-        raise invalid("instruments", f"classes {text!r}", "lowest values that increase", "put them in order")
+        raise invalid(f"classes {text!r}", "lowest values that increase", "put them in order", "instruments")
     return found
 
 
@@ -288,7 +289,7 @@ def minimal_change_at(before: float, change: float | None, classes: str) -> floa
         except ValueError:
             least = np.nan
         if not least > 0:
-            raise invalid("instruments", f"minimal change {text!r}", "such as: 0 3; 12 2; 15 1", "correct it")
+            raise invalid(f"minimal change {text!r}", "such as: 0 3; 12 2; 15 1", "correct it", "instruments")
         if before >= lowest:
             change = least
     return change
@@ -297,7 +298,3 @@ def minimal_change_at(before: float, change: float | None, classes: str) -> floa
 def _row(frame: Any, where: Any, key: tuple[str, ...]) -> str:
     row = frame[np.asarray(where)].iloc[0]
     return ", ".join(f"{k} {row[k]}" for k in key)
-
-
-def invalid(frame: str, found: str, expected: str, next_step: str) -> PblError:
-    return PblError("STUDY_INVALID", found=found, expected=expected, next_step=next_step, key=frame)

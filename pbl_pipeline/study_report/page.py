@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import pandas as pd
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.files import check_out_folder
+from pbl_pipeline.shipped import shipped_page
 from pbl_pipeline.stats import CurveTest, Estimate
 from pbl_pipeline.study import StudyData, content_hash
 
@@ -110,9 +109,7 @@ def _render(
     results: StudyResults,
     formats: str,
 ) -> str:
-    text = resources.files("pbl_pipeline.study_report").joinpath("templates/report.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    return environment.from_string(text).render(
+    return shipped_page("study_report/templates/report.html").render(
         head=head,
         tables=tables,
         sections=sections,

@@ -15,7 +15,6 @@ from scipy import stats as distributions
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.stats import (
     CurveTest,
-    Estimate,
     adjust,
     compare_groups,
     correlation,
@@ -101,8 +100,9 @@ def reason(error: PblError) -> str:
     return f"at least {least[1]} persons needed" if least else f"{error.found}; expected {error.expected}"
 
 
-def _interval(found: Estimate | None) -> dict[str, float]:
-    return {k: np.nan if found is None else getattr(found, k) for k in ("value", "low", "high")}
+def _fields(found: object | None, *names: str) -> dict[str, Any]:
+    """Fields of what was found as columns of a row; none where nothing was: a frame has NaN there."""
+    return {} if found is None else {name: getattr(found, name) for name in names}
 
 
 def flow_table(study: StudyData, to_compare: Plan) -> pd.DataFrame:
@@ -174,8 +174,8 @@ def repeatability(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd
 
     def add(name: str, of: str, kind: str, group: str, ratings: Callable[[], Any], interval: str) -> None:
         found, why = _tried(lambda: icc(ratings(), kind, interval=interval))
-        more = {k: np.nan if found is None else getattr(found, k) for k in ("sem", "mdc90", "mdc95", "n", "k")}
-        rows.append({"name": name, "of": of, "group": group, "kind": kind, **_interval(found), **more, **why})
+        values = _fields(found, *_INTERVAL, "sem", "mdc90", "mdc95", "n", "k")
+        rows.append({"name": name, "of": of, "group": group, "kind": kind, **values, **why})
 
     for name in to_compare.measures:
         cycles = cycle_values(study, to_compare, name)
@@ -209,19 +209,8 @@ def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.Data
             for persons, part in parts.items():
                 kind = "spearman" if ordinal[score] else "pearson"
                 found, why = _tried(correlation, part[name], part[score], kind)
-                p = np.nan if found is None else found.p
-                rows.append(
-                    {
-                        "name": name,
-                        "score": score,
-                        "persons": persons,
-                        "kind": kind,
-                        **_interval(found),
-                        "p": p,
-                        "n": len(part),
-                        **why,
-                    }
-                )
+                about = {"name": name, "score": score, "persons": persons, "kind": kind, "n": len(part)}
+                rows.append({**about, **_fields(found, *_INTERVAL, "p"), **why})
     return _corrected(pd.DataFrame(rows, columns=COLUMNS["validity"]), "persons")
 
 
@@ -235,22 +224,12 @@ def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd
         shared = {"name": name, "n": len(both)}
         moved, why_moved = _tried(srm, pre, post)
         mean = summary(post - pre) if moved is not None else {}
-        middle = {"value": mean.get("mean", np.nan), **{k: mean.get(k, np.nan) for k in ("low", "high")}}
-        rows.append({**shared, "statistic": "mean", **middle, "p": np.nan, **why_moved})
-        rows.append(
-            {**shared, "statistic": "srm", **_interval(moved), "p": np.nan if moved is None else moved.p, **why_moved}
-        )
+        middle = {"value": mean["mean"], "low": mean["low"], "high": mean["high"]} if mean else {}
+        rows.append({**shared, "statistic": "mean", **middle, **why_moved})
+        rows.append({**shared, "statistic": "srm", **_fields(moved, *_INTERVAL, "p"), **why_moved})
         tested, why = _tried(wilcoxon, pre, post, n_resamples=resamples)
-        effect = None if tested is None else tested.effect
-        rows.append(
-            {
-                **shared,
-                "statistic": "effect_size",
-                **_interval(effect),
-                "p": np.nan if tested is None else tested.p,
-                **why,
-            }
-        )
+        effect = _fields(tested and tested.effect, *_INTERVAL) | _fields(tested, "p")
+        rows.append({**shared, "statistic": "effect_size", **effect, **why})
     return _corrected(pd.DataFrame(rows, columns=COLUMNS["change"]), "statistic")
 
 
@@ -274,24 +253,12 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
                     continue
                 test, why = _tried(compare_groups, x, y)
                 size, _ = _tried(hedges_g, x, y)
-                rows.append(
-                    {
-                        "name": name,
-                        "by": by,
-                        "a": a,
-                        "b": b,
-                        "test": "" if test is None else test.name,
-                        "statistic": np.nan if test is None else test.statistic,
-                        "p": np.nan if test is None else test.p,
-                        **{
-                            f"g_{k}" if k != "value" else "g": v
-                            for k, v in _interval(size if test is not None else None).items()
-                        },
-                        "n_a": len(x),
-                        "n_b": len(y),
-                        **why,
-                    }
-                )
+                row = {"name": name, "by": by, "a": a, "b": b, "test": "", "n_a": len(x), "n_b": len(y), **why}
+                if test is not None:
+                    row |= {"test": test.name, "statistic": test.statistic, "p": test.p}
+                if test is not None and size is not None:
+                    row |= {"g": size.value, "g_low": size.low, "g_high": size.high}
+                rows.append(row)
     return _corrected(pd.DataFrame(rows, columns=COLUMNS["groups"]), "by")
 
 

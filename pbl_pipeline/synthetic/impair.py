@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 from pbl_pipeline.errors import PblError
 
 SIDES = ("right", "left", "both")
+_unknown = functools.partial(PblError, "USAGE", next_step="correct it; docs/synth.md lists all")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,7 +150,3 @@ IMPAIRMENTS: dict[str, Callable[[Style, float, str], None]] = {
 #: Impairments that may be on one side, and those of them that are on the right side by default.
 SIDED = ("crouch", "stiff_knee", "drop_foot", "weakness")
 ONE_SIDE = ("stiff_knee", "drop_foot", "weakness")
-
-
-def _unknown(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="correct it; docs/synth.md lists all")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
-from importlib import resources
 
 import numpy as np
 from jaxtyping import Float
@@ -13,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import joint_of, load_body
 from pbl_pipeline.gait.normative import harmonic_sum
+from pbl_pipeline.shipped import shipped_text
 
-_TABLES = json.loads(resources.files("pbl_pipeline.synthetic").joinpath("data/curves.json").read_text(encoding="utf-8"))
+_TABLES = json.loads(shipped_text("synthetic/data/curves.json"))
 
 #: Degrees over one gait cycle of one side, its foot contact at phase 0: the mean, then (cosine, sine) of harmonic 1, 2
 #: and so on. The project's own numbers: harmonics through values written down every 5 % of the cycle to follow the

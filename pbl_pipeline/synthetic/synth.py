@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable
@@ -61,6 +62,7 @@ _IN_NAME: dict[str, Callable[[Any], str]] = {
     "sensor": lambda sensor: f"sensor-{hashlib.sha256(repr(sensor).encode()).hexdigest()[:6]}",
     "root_relative": lambda _: "absolute",
 }
+_usage = functools.partial(PblError, "USAGE", next_step="correct it; docs/synth.md lists all")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -346,7 +348,7 @@ def _check_in_view(outside: np.ndarray, spec: SynthSpec) -> None:
     raise _usage(
         f"{100 * outside.mean():.0f} % of the points outside of the picture",
         f"at most {100 * OUTSIDE_SHARE:.0f} %: the person stays in front of the {spec.camera} camera",
-        "take fewer --seconds, --camera panned or handheld, --view follow, or --ground treadmill",
+        next_step="take fewer --seconds, --camera panned or handheld, --view follow, or --ground treadmill",
     )
 
 
@@ -366,10 +368,6 @@ def _events(plan: Plan, until_s: float) -> tuple[GaitEvent, ...]:
             if 0 <= at <= until_s:
                 out.append(GaitEvent(at, side, kind, 1.0))
     return tuple(sorted(out, key=lambda e: e.time_s))
-
-
-def _usage(found: str, expected: str, next_step: str = "correct it; docs/synth.md lists all") -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step=next_step)
 
 
 def speed_of_group(group: str, seed: int = 0) -> float:

@@ -2,7 +2,7 @@
 
 from .appearance import appearance_of, appearance_similarity
 from .associate import AssociationParams
-from .blazepose import BlazePoseDetector, body_box, circle_roi
+from .blazepose import BlazePoseDetector, BlazePoseWindows, body_box, circle_roi
 from .detection_schedule import WatchParams
 from .identity_swaps import UncrossParams
 from .methods import METHODS, SUBJECT_METHODS, detector_params
@@ -20,6 +20,6 @@ from .subject_choice import (
 )
 from .tiling import tiles
 from .track import track_people
-from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking
+from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking, WindowDetector
 from .walker_score import SubjectParams, step_s, time_in_view_s
 from .yolox import YoloxDetector

@@ -7,6 +7,7 @@ forbid to join two tracks, and may join them only where nobody else in the video
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import cv2
@@ -14,8 +15,9 @@ import numpy as np
 
 from pbl_pipeline.video import Frame
 
+from .associate import measure
 from .tiling import size_of
-from .types import Scene
+from .types import Detection, Scene
 
 #: Patches along the body axis in radii of the region of interest, from the middle of the hips: (from, to, half width),
 #: up positive.
@@ -51,6 +53,11 @@ def appearance_of(scene: Scene, state: np.ndarray, turn_rad: float) -> np.ndarra
             return np.full(_SIZE, np.nan)
         parts += [_light(lab[:, 0]), _colour(lab[:, 1:])]
     return np.concatenate(parts)
+
+
+def with_appearance(detection: Detection, scene: Scene) -> Detection:
+    """The detection with `appearance_of` the person whom it found in `scene`."""
+    return dataclasses.replace(detection, appearance=appearance_of(scene, measure(detection), detection.roi_px[3]))
 
 
 def _patch(scene: Scene, to_picture: np.ndarray) -> np.ndarray:

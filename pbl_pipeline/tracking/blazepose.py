@@ -54,11 +54,8 @@ class BlazePoseDetector:
 
     name = "blazepose"
 
-    def __init__(
-        self, model_path: str | Path, min_score: float = 0.5, min_iou: float = 0.3, cut_windows: bool = False
-    ) -> None:
-        self.window_px = LAYOUT.input_size if cut_windows else 0
-        self._model = SsdModel(model_path, MODEL_SHA256, LAYOUT, min_score, min_iou)
+    def __init__(self, model_path: str | Path, min_score: float = 0.5) -> None:
+        self._model = SsdModel(model_path, MODEL_SHA256, LAYOUT, min_score)
         self.model_sha256 = self._model.sha256
 
     def detect(self, image: np.ndarray) -> list[Detection]:
@@ -71,6 +68,13 @@ class BlazePoseDetector:
         return detections
 
 
+class BlazePoseWindows(BlazePoseDetector):
+    """`WindowDetector`: as `BlazePoseDetector`, of windows at the size of the network's input."""
+
+    window_px = LAYOUT.input_size
+
+
 def blazepose(params: TrackingParams) -> BlazePoseDetector:
     """The detector of the method. Raises the `PblError`s of `assets.fetch`."""
-    return BlazePoseDetector(assets.fetch("blazepose_detector"), params.min_score, cut_windows=params.cut_windows)
+    kind = BlazePoseWindows if params.cut_windows else BlazePoseDetector
+    return kind(assets.fetch("blazepose_detector"), params.min_score)

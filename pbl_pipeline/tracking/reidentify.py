@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .appearance import appearance_of, appearance_similarity, mean_appearance
+from .appearance import appearance_similarity, mean_appearance, with_appearance
 from .associate import AssociationParams, Trail, measure, pair_cost
 from .detection_schedule import window_around
 from .identity_swaps import line_near
@@ -49,8 +49,7 @@ def backtrack(
         excess = [pair_cost(back, -time_s, d, params) - g for d, g in zip(free, gates, strict=True)]
         if excess and min(excess) <= 0:
             seen = free[int(np.argmin(excess))]
-            seen = dataclasses.replace(seen, appearance=appearance_of(scene, measure(seen), seen.roi_px[3]))
-            back.add(index, -time_s, seen, params.memory_s)
+            back.add(index, -time_s, with_appearance(seen, scene), params.memory_s)
             misses = 0
             continue
         misses += 1

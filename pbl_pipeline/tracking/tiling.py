@@ -11,7 +11,7 @@ import numpy as np
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.video import Frame
 
-from .types import Detection, PersonDetector, Scene
+from .types import Detection, PersonDetector, Scene, WindowDetector
 
 #: A box that ends within this fraction of the window's width from its edge is taken as cut by it.
 CUT_SHARE = 0.02
@@ -74,14 +74,14 @@ def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window
     """Return the detections in a window, of which `inside` lies in the picture, in pixels of the picture."""
     x, y, right, bottom = inside
     scale = 1.0
-    if isinstance(scene, Frame):
+    if isinstance(scene, Frame) and isinstance(detector, WindowDetector):
         n, side = detector.window_px, max(window[2] - window[0], window[3] - window[1])
         scale = side / n
         # Of the first pixel's centre.
         x, y = ((window[i] + window[i + 2] - side + scale - 1) / 2 for i in (0, 1))
         shown = scene.cut(np.array([[scale, 0.0, x], [0.0, scale, y]]), (n, n))
     else:
-        shown = scene[y:bottom, x:right]
+        shown = (scene.image if isinstance(scene, Frame) else scene)[y:bottom, x:right]
     return [
         dataclasses.replace(
             d,

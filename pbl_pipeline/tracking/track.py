@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
-from .appearance import appearance_of
+from .appearance import with_appearance
 from .associate import Associator, Trail, measure
 from .blazepose import body_box
 from .detection_schedule import Watch, window_around
@@ -26,7 +25,7 @@ from .methods import METHODS
 from .params import TrackingParams
 from .reidentify import backtrack, join_trails
 from .tiling import detect_in
-from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking
+from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking, WindowDetector
 
 #: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
 #: expected than so many body heights, it is a poor view of that one.
@@ -97,9 +96,9 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
         elsewhere = watch.elsewhere(now, associator.live)
         if not (due or elsewhere):
             continue
-        scene = frame if getattr(detector, "window_px", 0) else frame.image  # one of a laboratory may have none
+        scene = frame if isinstance(detector, WindowDetector) else frame.image
         found = detect_in(detector, scene, watch.around(now, due), elsewhere)
-        found = [_with_appearance(d, scene) for d in found]
+        found = [with_appearance(d, scene) for d in found]
         for new in associator.step(frame.index, now, found, due):
             sure = _confirmed(new, detector, scene, now, associator.live, params)
             if sure is not None:
@@ -144,17 +143,13 @@ def _confirmed(
     best = again[int(np.argmax(overlap))]
     if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
         return None
-    return _with_appearance(best, scene)
+    return with_appearance(best, scene)
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
     """Whether two region of interest lie so close, and are so alike in size, that both are of one person."""
     apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
     return bool(apart < SAME_BODY)
-
-
-def _with_appearance(detection: Detection, scene: Scene) -> Detection:
-    return dataclasses.replace(detection, appearance=appearance_of(scene, measure(detection), detection.roi_px[3]))
 
 
 def _is_real(trail: Trail, params: TrackingParams) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,17 +30,20 @@ Scene = Frame | np.ndarray
 
 
 class PersonDetector(Protocol):
-    """Finds people in one upright BGR frame. Implementations hold a loaded model and are not shared by threads.
-
-    window_px: side of the square that it is shown of a window of the frame; 0, or a detector without it: the window's
-    own pixels.
-    """
+    """Finds people in one upright BGR frame. Implementations hold a loaded model and are not shared by threads."""
 
     name: str
     model_sha256: str
-    window_px: int
 
     def detect(self, image: np.ndarray) -> list[Detection]: ...
+
+
+@runtime_checkable
+class WindowDetector(PersonDetector, Protocol):
+    """A `PersonDetector` that is shown each window of the frame as a square of `window_px` pixels a side, cut from the
+    decoder's planes; others are shown the window's own pixels of the converted picture."""
+
+    window_px: int
 
 
 @dataclasses.dataclass(frozen=True)

@@ -59,9 +59,6 @@ class YoloxDetector:
     another shape.
     """
 
-    #: Its input is not square.
-    window_px = 0
-
     def __init__(self, model: OnnxModel, min_score: float = 0.3, min_iou: float = 0.5) -> None:
         self._model, self._min_score, self._min_iou = model, min_score, min_iou
         self.name, self.model_sha256 = model.spec.name, model.spec.sha256
@@ -95,7 +92,7 @@ class YoloxDetector:
         ]
 
     def _invalid(self, found: str, expected: str) -> PblError:
-        return model_invalid(self._model.folder, found, expected)
+        return model_invalid(found, expected, key=self._model.folder)
 
 
 def yolox(params: TrackingParams) -> YoloxDetector:

@@ -7,7 +7,6 @@ import functools
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import pandas as pd
 from scipy import stats
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.shipped import shipped_text
 
 from .compare import JointError, KinematicErrors, median_niqr, niqr, normality_p
 from .reference import (
@@ -97,9 +97,7 @@ _POPULATIONS = ("control", "neurological", "LLPU", "pediatric")
 _ACTIVITIES = ("FSST", "standing", "TUG", "tandem", "walking")
 _DATASETS = ("MMMC handheld", "MMMC static", "BML-MoVi static")
 #: Titles, notes and decimals of the tables, and other names of the paper's populations and activities, small letters.
-_TEXTS = json.loads(
-    resources.files("pbl_pipeline.validation").joinpath("data/table_texts.json").read_text(encoding="utf-8")
-)
+_TEXTS = json.loads(shipped_text("validation/data/table_texts.json"))
 _OPENCAP = [split_side(j)[0] for j in JOINTS_OPENCAP]
 _PAPER_JOINTS = [split_side(j)[0] for j in JOINTS_PAPER]
 

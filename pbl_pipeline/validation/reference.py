@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from pbl_pipeline.gait import BodyPoses, camera_side, mostly
 FRONT, BACK, IPSILATERAL, CONTRALATERAL, MIXED = "front", "back", "ipsilateral", "contralateral", "mixed"
 #: View of a joint of the middle if the camera stands on one side.
 LATERAL = "lateral"
+_refused = functools.partial(PblError, "REFERENCE_INPUT", next_step="see docs/validation.md, section The reference")
 
 
 def view_of_fit(fit: TrialFit, poses: BodyPoses) -> dict[str, str]:
@@ -168,17 +170,19 @@ class Reference:
         object.__setattr__(self, "time_s", time)
         object.__setattr__(self, "angles_deg", angles)
         if self.convention not in CONVENTIONS:
-            raise _refused(self.name, f"convention {self.convention!r}", " or ".join(CONVENTIONS))
+            raise _refused(f"convention {self.convention!r}", " or ".join(CONVENTIONS), key=self.name)
         if time.ndim != 1 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
-            raise _refused(self.name, "time stamps out of order or not finite", "(T,) increasing seconds")
+            raise _refused("time stamps out of order or not finite", "(T,) increasing seconds", key=self.name)
         for joint, values in angles.items():
             if values.shape != time.shape:
-                raise _refused(self.name, f"{joint} of shape {values.shape}", f"({time.size},), one value a time stamp")
+                raise _refused(
+                    f"{joint} of shape {values.shape}", f"({time.size},), one value a time stamp", key=self.name
+                )
         if self.pelvis_m is not None:
             pelvis = np.asarray(self.pelvis_m, float)
             object.__setattr__(self, "pelvis_m", pelvis)
             if pelvis.shape != (time.size, 3):
-                raise _refused(self.name, f"pelvis_m of shape {pelvis.shape}", f"({time.size}, 3)")
+                raise _refused(f"pelvis_m of shape {pelvis.shape}", f"({time.size}, 3)", key=self.name)
 
     def save(self, path: str | Path) -> None:
         """Write as .npz: `time_s`, `names` (A,), `angles_deg` (T, A), `pelvis_m`, `name`, `source`, `convention`."""
@@ -218,13 +222,3 @@ class Reference:
         pelvis = data["pelvis_m"] if np.any(np.isfinite(data["pelvis_m"])) else None
         name, source, convention = (text_of(path, data, k) for k in ("name", "source", "convention"))
         return cls(name, source, convention, data["time_s"], angles, pelvis)
-
-
-def _refused(name: str, found: str, expected: str) -> PblError:
-    return PblError(
-        "REFERENCE_INPUT",
-        found=found,
-        expected=expected,
-        next_step="see docs/validation.md, section The reference",
-        key=name,
-    )

@@ -7,12 +7,10 @@ import functools
 import json
 import math
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import click
-import jinja2
 import numpy as np
 import pandas as pd
 
@@ -20,6 +18,7 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.latex import tex_escape
+from pbl_pipeline.shipped import shipped_page, shipped_text
 from pbl_pipeline.stats import bland_altman, correlation
 
 
@@ -30,8 +29,7 @@ def paper_figures() -> dict[str, Any]:
     The texts are as printed, most "median (nIQR)". Beside the tables that we fill from error rows it holds the paper's
     figures on reliability, curves and run time.
     """
-    folder = resources.files("pbl_pipeline.validation").joinpath("data")
-    return json.loads(folder.joinpath("paper_figures.json").read_text(encoding="utf-8"))
+    return json.loads(shipped_text("validation/data/paper_figures.json"))
 
 
 def paper_cells(table: str) -> dict[str, dict[str, str]]:
@@ -244,10 +242,7 @@ def latex(table: Table) -> str:
 
 def html(tables: Mapping[str, Table]) -> str:
     """One page with all tables that asks for nothing from elsewhere. Every text is escaped."""
-    folder = resources.files("pbl_pipeline.validation").joinpath("templates")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    template = environment.from_string(folder.joinpath("tables.html").read_text(encoding="utf-8"))
-    return template.render(
+    return shipped_page("validation/templates/tables.html").render(
         tables=list(tables.values()),
         source=paper_figures()["source"],
         version=code_version(),

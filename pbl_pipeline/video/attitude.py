@@ -13,6 +13,7 @@ the picture's right is +y and its down is +x. With the device to world rotation 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from pathlib import Path
 
@@ -30,6 +31,9 @@ _SHORTEST_NORM = 1e-3
 _MOST_ROLL_DEG = 60.0
 #: Closer to the vertical than this, a viewing direction has no roll to judge.
 _VERTICAL_DEG = 30.0
+log_error = functools.partial(
+    PblError, "PHONE_LOG", next_step="see docs/phone_capture.md; without --attitude the camera is taken as still"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,26 +61,28 @@ def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tup
     try:
         time, quat = np.asarray(time_s, np.float64), np.asarray(quat_wxyz, np.float64)
     except (TypeError, ValueError) as error:
-        raise log_error(f"values that are not numbers ({error})", "numbers", key) from error
+        raise log_error(f"values that are not numbers ({error})", "numbers", key=key) from error
     if time.ndim != 1 or quat.shape != (len(time), 4):
-        raise log_error(f"times of shape {time.shape}, quaternions of shape {quat.shape}", "(P,) and (P, 4)", key)
+        raise log_error(f"times of shape {time.shape}, quaternions of shape {quat.shape}", "(P,) and (P, 4)", key=key)
     if len(time) < 2:
-        raise log_error(f"{len(time)} samples", "at least two", key)
+        raise log_error(f"{len(time)} samples", "at least two", key=key)
     for name, array in (("times", time), ("quaternions", quat)):
         bad = int(np.sum(~np.isfinite(array.reshape(len(time), -1)).all(axis=1)))
         if bad:
-            raise log_error(f"{bad} of {len(time)} {name} not finite", "finite numbers; leave such samples out", key)
+            raise log_error(
+                f"{bad} of {len(time)} {name} not finite", "finite numbers; leave such samples out", key=key
+            )
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):
         i = int(back[0])
         found = (
             f"{len(back)} stamps that repeat or run backwards, the first at {time[i + 1]:.6g} s after {time[i]:.6g} s"
         )
-        raise log_error(found, "strictly increasing times; sort them and leave out repeats", key)
+        raise log_error(found, "strictly increasing times; sort them and leave out repeats", key=key)
     norm = np.linalg.norm(quat, axis=1, keepdims=True)
     if not np.all((norm > _SHORTEST_NORM) & np.isfinite(norm)):
         found = f"{int(np.sum(~(norm > _SHORTEST_NORM)))} quaternions of length near zero"
-        raise log_error(found, "quaternions of length 1; leave such samples out", key)
+        raise log_error(found, "quaternions of length 1; leave such samples out", key=key)
     quat = quat / norm
     # q and -q are one rotation, but what lies half way between them is none.
     turned = np.cumsum(np.sum(quat[1:] * quat[:-1], axis=1) < 0) % 2 == 1
@@ -129,14 +135,4 @@ def check_roll(path: Path, quat_wxyz: np.ndarray, frame: str) -> None:
         next_step="check `frame` (device: the phone's own axes) and `rotation_deg` (0 portrait, 90 top to the right, "
         "270 top to the left), and that the quaternions turn the phone's vectors into the world and not back",
         key=str(path),
-    )
-
-
-def log_error(found: str, expected: str, key: object) -> PblError:
-    return PblError(
-        "PHONE_LOG",
-        found=found,
-        expected=expected,
-        next_step="see docs/phone_capture.md; without --attitude the camera is taken as still",
-        key=None if key is None else str(key),
     )

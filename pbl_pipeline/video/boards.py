@@ -17,6 +17,7 @@ KINDS = (CHECKERBOARD, CHARUCO)
 DEFAULT_DICTIONARY = "DICT_5X5_100"
 #: Corners of a ChArUco board that must be seen in one picture: fewer say little.
 _FEWEST_CORNERS = 8
+_usage = functools.partial(PblError, "USAGE", next_step="measure the printed board and pass its figures")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +120,3 @@ def _detector(board: Board) -> Any:
 def dictionaries() -> list[str]:
     """Names of the marker families that OpenCV knows."""
     return sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_") and n == n.upper())
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="measure the printed board and pass its figures")

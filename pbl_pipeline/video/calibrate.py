@@ -8,6 +8,7 @@ the lens is fitted again (delete-a-group jackknife); the larger of the two devia
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 from collections.abc import Sequence
@@ -40,6 +41,7 @@ MOST_RMS_PX, MOST_REL_SD = 1.0, 0.01
 _OUTLIER = 3.0
 _GROUPS = 8
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+_poor = functools.partial(PblError, "CALIBRATION_POOR")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -312,10 +314,6 @@ def _no_board(path: str | Path, board: Board, tried: int, other: Board | None) -
         next_step=hint,
         key=path,
     )
-
-
-def _poor(found: str, expected: str, next_step: str, key: object) -> PblError:
-    return PblError("CALIBRATION_POOR", found=found, expected=expected, next_step=next_step, key=key)
 
 
 #: Longer side of the picture (px) and by how much residuals are drawn larger.

@@ -6,6 +6,7 @@ Pixel coordinates have (0, 0) at the centre of the top-left pixel, as in OpenCV.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +23,11 @@ from .types import Camera, VideoInfo
 
 #: How far R R^T may be from 1: float32 poses pass, a scaled or mistyped matrix does not.
 _ORTHONORMAL_TOL = 1e-4
+_invalid_pose = functools.partial(
+    PblError,
+    "CAMERA_INVALID",
+    next_step="write the calibration again; docs/files.md, section several cameras, says what is read",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +44,15 @@ class CameraPose:
         try:
             R, p = np.array(self.R_nc, np.float64), np.array(self.p_nc, np.float64)
         except (TypeError, ValueError) as error:
-            raise _invalid_pose(None, f"values that are not numbers ({error})", "R_nc (3, 3) and p_nc (3,)") from error
+            raise _invalid_pose(
+                f"values that are not numbers ({error})", "R_nc (3, 3) and p_nc (3,)", key=None
+            ) from error
         if R.shape != (3, 3) or p.shape != (3,):
-            raise _invalid_pose(None, f"R_nc of shape {R.shape}, p_nc of shape {p.shape}", "shapes (3, 3) and (3,)")
+            raise _invalid_pose(f"R_nc of shape {R.shape}, p_nc of shape {p.shape}", "shapes (3, 3) and (3,)", key=None)
         if not np.isfinite(R).all() or not np.isfinite(p).all():
-            raise _invalid_pose(None, "a camera pose that is not finite", "finite numbers")
+            raise _invalid_pose("a camera pose that is not finite", "finite numbers", key=None)
         if np.abs(R @ R.T - np.eye(3)).max() > _ORTHONORMAL_TOL or np.linalg.det(R) < 0:
-            raise _invalid_pose(None, f"R_nc {R.tolist()}", "a rotation: orthonormal, determinant +1")
+            raise _invalid_pose(f"R_nc {R.tolist()}", "a rotation: orthonormal, determinant +1", key=None)
         R.setflags(write=False)
         p.setflags(write=False)
         object.__setattr__(self, "R_nc", R)
@@ -66,12 +74,12 @@ def load_camera_poses(path: str | Path) -> dict[str, CameraPose]:
     try:
         content = read_toml(path)
     except OSError as error:
-        raise _invalid_pose(path, f"the file cannot be read ({error.strerror})", "a TOML calibration") from error
+        raise _invalid_pose(f"the file cannot be read ({error.strerror})", "a TOML calibration", key=path) from error
     except ValueError as error:
-        raise _invalid_pose(path, f"the text cannot be parsed ({error})", "a TOML calibration") from error
+        raise _invalid_pose(f"the text cannot be parsed ({error})", "a TOML calibration", key=path) from error
     cameras = {name: table for name, table in content.items() if isinstance(table, dict) and "matrix" in table}
     if not cameras:
-        raise _invalid_pose(path, "no table with a camera matrix", "a table for each camera")
+        raise _invalid_pose("no table with a camera matrix", "a table for each camera", key=path)
     return {name: _pose(path, name, table) for name, table in cameras.items()}
 
 
@@ -83,20 +91,12 @@ def _pose(path: Path, name: str, table: Mapping[str, Any]) -> CameraPose:
         except (KeyError, TypeError, ValueError, OverflowError):
             vector = np.full(3, np.nan)
         if vector.shape != (3,) or not np.isfinite(vector).all():
-            raise _invalid_pose(path, f"[{name}] {field} = {table.get(field)!r}"[:200], f"{field}: 3 finite numbers")
+            raise _invalid_pose(
+                f"[{name}] {field} = {table.get(field)!r}"[:200], f"{field}: 3 finite numbers", key=path
+            )
         vectors.append(vector)
     R_cn = Rotation.from_rotvec(vectors[0]).as_matrix()
     return CameraPose(R_cn.T, -R_cn.T @ vectors[1])
-
-
-def _invalid_pose(path: Path | None, found: str, expected: str) -> PblError:
-    return PblError(
-        "CAMERA_INVALID",
-        found=found,
-        expected=expected,
-        next_step="write the calibration again; docs/files.md, section several cameras, says what is read",
-        key=None if path is None else str(path),
-    )
 
 
 #: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (38 models,
@@ -161,12 +161,12 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     distortion = _array(path, fields, "distortion", (4, 5))
     width, height = _array(path, fields, "size", (2,)).tolist()
     if fields.get("fisheye"):
-        raise _invalid(path, "a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion")
+        raise _invalid("a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion", key=path)
     if min(width, height) <= 0 or not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
         raise _invalid(
-            path,
             f"principal point ({matrix[0, 2]:g}, {matrix[1, 2]:g}) of a {width:g}x{height:g} px picture",
             "a principal point inside the picture",
+            key=path,
         )
     distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
     check_lens(matrix, distortion, (width, height), path)
@@ -174,7 +174,7 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     if fields.get("focal_sd") is not None:
         rel_sd = float(_array(path, fields, "focal_sd", (1,))[0]) * 2 / (matrix[0, 0] + matrix[1, 1])
         if rel_sd < 0:
-            raise _invalid(path, f"focal_sd_px = {fields['focal_sd']!r}", "a standard deviation in px, 0 or more")
+            raise _invalid(f"focal_sd_px = {fields['focal_sd']!r}", "a standard deviation in px, 0 or more", key=path)
         spread = f", focal length within {100 * rel_sd:.2g} % (sd)"
     matrix, scaled = _scale(path, matrix, (width, height), image_size_px)
     return Camera(matrix, distortion, f"file: {label}{scaled}{spread}", rel_sd)
@@ -185,11 +185,11 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
     try:
         content = read_toml(path) if path.suffix.lower() == ".toml" else read_json(path)
     except OSError as error:
-        raise _invalid(path, f"the file cannot be read ({error.strerror})", "a calibration file") from error
+        raise _invalid(f"the file cannot be read ({error.strerror})", "a calibration file", key=path) from error
     except ValueError as error:
-        raise _invalid(path, f"the text cannot be parsed ({error})", "a TOML or JSON calibration") from error
+        raise _invalid(f"the text cannot be parsed ({error})", "a TOML or JSON calibration", key=path) from error
     if not isinstance(content, dict):
-        raise _invalid(path, "no named fields", "a table of fields")
+        raise _invalid("no named fields", "a table of fields", key=path)
     if path.suffix.lower() != ".toml":
         names = {"camera_matrix": "matrix", "distortion": "distortion", "image_size_px": "size", "fisheye": "fisheye"}
         names["focal_sd_px"] = "focal_sd"
@@ -197,9 +197,9 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
     cameras = {key: value for key, value in content.items() if isinstance(value, dict) and "matrix" in value}
     if name is None and len(cameras) != 1:
         found = f"{len(cameras)} cameras" + (f" ({', '.join(cameras)})" if cameras else "")
-        raise _invalid(path, found, "one camera, or the name of one of them")
+        raise _invalid(found, "one camera, or the name of one of them", key=path)
     if name is not None and name not in cameras:
-        raise _invalid(path, f"cameras {', '.join(cameras) or '(none)'}", f"a camera named {name}")
+        raise _invalid(f"cameras {', '.join(cameras) or '(none)'}", f"a camera named {name}", key=path)
     key = name or next(iter(cameras))
     camera = cameras[key]
     fields = {"distortion": camera["distortions"]} if "distortions" in camera else {}
@@ -209,13 +209,13 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
 def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int, ...]) -> np.ndarray:
     expected = f"{name}: {' or '.join(map(str, lengths))} finite numbers"
     if name not in fields:
-        raise _invalid(path, f"no field {name}", expected)
+        raise _invalid(f"no field {name}", expected, key=path)
     try:
         value = np.asarray(fields[name], dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError) as error:
-        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected) from error
+        raise _invalid(f"{name} = {_shown(fields[name])}", expected, key=path) from error
     if len(value) not in lengths or not np.isfinite(value).all():
-        raise _invalid(path, f"{name} = {_shown(fields[name])}", expected)
+        raise _invalid(f"{name} = {_shown(fields[name])}", expected, key=path)
     return value
 
 
@@ -227,10 +227,10 @@ def _scale(
     if abs(new_height - factor * height) > 1.0:  # one pixel of rounding
         turned = abs(new_width - new_height / width * height) <= 1.0
         raise _invalid(
-            path,
             f"calibrated for {width:g}x{height:g} px, the recording is {new_width}x{new_height} px"
             + (" (the picture is turned)" if turned else ""),
             "a calibration of the upright picture, of the same shape",
+            key=path,
         )
     if factor == 1.0:
         return matrix, ""
@@ -263,29 +263,29 @@ def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float,
     m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
     plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1
     if not np.isfinite(m).all() or not plain or min(m[0, 0], m[1, 1]) <= 0:
-        raise _invalid(key, f"matrix {m.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive")
+        raise _invalid(f"matrix {m.tolist()}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], fx and fy positive", key=key)
     low, high = (f * max(size_px) for f in _FOCAL_RANGE)
     if not (low <= m[0, 0] <= high and low <= m[1, 1] <= high):
         found = f"focal lengths {m[0, 0]:g} and {m[1, 1]:g} px of a {size_px[0]:g}x{size_px[1]:g} px picture"
-        raise _invalid(key, found, f"{low:g} to {high:g} px")
+        raise _invalid(found, f"{low:g} to {high:g} px", key=key)
     _check_centre(m, size_px, key)
     if not np.isfinite(d).all():
-        raise _invalid(key, f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion")
+        raise _invalid(f"distortion {d.tolist()}", "k1, k2, p1, p2, k3, finite; zeros for no distortion", key=key)
     radial = f"{d[0]:g}, {d[1]:g}, {d[4]:g}"
     corner, r, distorted = _to_corner(m, d, size_px)
     if not distorted[-1] >= corner:  # also where it overflows
         raise _invalid(
-            key,
             f"radial distortion {radial} folds back before the corner of the picture",
             "coefficients k1 k2 p1 p2 k3 that hold over the whole picture",
+            key=key,
         )
     straight = max(float(np.interp(corner, distorted, r)), 1e-9)
     if corner > _MOST_STRETCH * straight or 3 * np.hypot(d[2], d[3]) * straight > _MOST_STRETCH - 1:
         raise _invalid(
-            key,
             f"distortion {radial} (radial), {d[2]:g}, {d[3]:g} (tangential) that moves the corner of the picture "
             f"more than {_MOST_STRETCH:g} times as far out",
             "coefficients k1 k2 p1 p2 k3 as a calibration finds them",
+            key=key,
         )
 
 
@@ -296,10 +296,10 @@ def _check_centre(m: np.ndarray, size_px: tuple[float, float], key: object) -> N
     if outside or (min(abs(across - 1), abs(down - 1)) > _OTHER_SIZE and abs(across / down - 1) <= _ALIKE):
         width, height = size_px
         raise _invalid(
-            key,
             f"principal point ({m[0, 2]:g}, {m[1, 2]:g}) in a picture of {width:g}x{height:g} px",
             f"a point near the middle ({width / 2:g}, {height / 2:g}); this matrix looks like that of a picture of "
             f"{across * width:.0f}x{down * height:.0f} px: multiply its first two rows by the ratio of the sizes",
+            key=key,
         )
 
 
@@ -331,8 +331,7 @@ def _shown(value: object) -> str:
     return repr(value)[:200]
 
 
-def _invalid(path: object, found: str, expected: str) -> PblError:
-    return PblError("CAMERA_INVALID", found=found, expected=expected, next_step=_NEXT, key=path)
+_invalid = functools.partial(PblError, "CAMERA_INVALID", next_step=_NEXT)
 
 
 def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:

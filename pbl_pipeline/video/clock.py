@@ -283,7 +283,7 @@ def attitude_of(log: PhoneLog, path: Path, video: VideoInfo | None = None) -> At
     quat = log.quat_wxyz
     if log.frame == DEVICE:
         if video is not None and "front" in (video.lens or "").lower():
-            raise log_error(f"a video of the {video.lens}", "the camera on the phone's back", path)
+            raise log_error(f"a video of the {video.lens}", "the camera on the phone's back", key=path)
         turned = log.rotation_deg
         if turned is None:
             turned = held_deg(video, quat) if video is not None else 0.0

@@ -41,6 +41,13 @@ from .types import Camera, FirstPicture, VideoInfo
 PRESET_REL_SD = 0.04
 #: Lenses shorter than this (mm, the glass itself) are front or ultra-wide cameras; the presets are of the main ones.
 _SHORTEST_MAIN_MM = 3.0
+_nameless = functools.partial(
+    PblError,
+    "CAMERA_INVALID",
+    expected="a phone that is named: by the camera file of `pbl calibrate`, or by an original recording (--like)",
+    next_step="calibrate again with an original of the phone, pass --like RECORDING, or pass --camera with each "
+    "video; converted copies lose the name",
+)
 
 
 def preset_camera(video: VideoInfo) -> Camera | None:
@@ -198,7 +205,7 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
         info = probe(like)
         lens = phone_lens(info)
         if lens is None:
-            raise _nameless(like, "a recording that does not name the phone's model")
+            raise _nameless("a recording that does not name the phone's model", key=like)
         size, rotation = (info.width_px, info.height_px), info.rotation_deg
     else:
         lens, size, rotation = _read(path)
@@ -282,14 +289,14 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
     content = _content(path)
     if not content:
         load_camera(path, (1, 1))  # says what is wrong with it, unless it is a TOML
-        raise _nameless(path, "a camera file that names no phone")
+        raise _nameless("a camera file that names no phone", key=path)
     phone, video = content.get("phone"), content.get("video")
     if not isinstance(phone, Mapping) or not isinstance(video, Mapping) or not phone.get("model"):
-        raise _nameless(path, "a camera file that does not name the phone's model")
+        raise _nameless("a camera file that does not name the phone's model", key=path)
     rate, rotation, focal = phone.get("rate"), video.get("rotation_deg"), phone.get("focal_35mm")
     size = content.get("image_size_px")
     if rate not in RATES or rotation not in (0, 90, 180, 270) or not _whole(size):
-        raise _nameless(path, "a camera file without the phone's rate of frames, rotation flag or size")
+        raise _nameless("a camera file without the phone's rate of frames, rotation flag or size", key=path)
     names = [str(phone.get(n) or "") for n in ("make", "model", "lens")]
     width, height = int(size[0]), int(size[1])  # type: ignore[index]
     stored = _stored(width, height, rotation)
@@ -308,17 +315,6 @@ def _content(path: Path) -> dict[str, Any]:
 
 def _stored(width: int, height: int, rotation_deg: int) -> tuple[int, int]:
     return (height, width) if rotation_deg in (90, 270) else (width, height)
-
-
-def _nameless(path: str | Path, found: str) -> PblError:
-    return PblError(
-        "CAMERA_INVALID",
-        found=found,
-        expected="a phone that is named: by the camera file of `pbl calibrate`, or by an original recording (--like)",
-        next_step="calibrate again with an original of the phone, pass --like RECORDING, or pass --camera with each "
-        "video; converted copies lose the name",
-        key=path,
-    )
 
 
 #: 35 mm film: width and diagonal of its frame (mm).

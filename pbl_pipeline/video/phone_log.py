@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import os_errors_as
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
@@ -82,18 +82,15 @@ def read_own_form(path: Path) -> PhoneLog:
 
 def read_text(path: Path) -> str:
     """Text of a file. Raises `PblError` FILE_MISSING, PHONE_LOG (no text, or too long)."""
-    try:
-        return bounded.read_text(path)
-    except OSError as error:
-        raise PblError(
-            "FILE_MISSING",
-            found=error.strerror or str(error),
-            expected="a sensor log, CSV or JSON",
-            next_step="check the path, and that you may read the file",
-            key=str(path),
-        ) from error
-    except ValueError as error:
-        raise log_error(f"no text to read ({error})", "CSV or JSON with " + ", ".join(_COLUMNS), path) from error
+    with os_errors_as(
+        "FILE_MISSING", "a sensor log, CSV or JSON", "check the path, and that you may read the file", path
+    ):
+        try:
+            return bounded.read_text(path)
+        except ValueError as error:
+            raise log_error(
+                f"no text to read ({error})", "CSV or JSON with " + ", ".join(_COLUMNS), key=path
+            ) from error
 
 
 def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str], list[dict[str, str | None]]]:
@@ -106,7 +103,7 @@ def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str
         kept = [(i, n) for i, n in enumerate(names) if n in wanted]
         table = [{n: row[i] if i < len(row) else None for i, n in kept} for row in rows if row]
     except (csv.Error, ValueError) as error:
-        raise log_error(f"no CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), path) from error
+        raise log_error(f"no CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), key=path) from error
     return names, table
 
 
@@ -115,7 +112,7 @@ def numbers(path: Path, table: Sequence[Mapping[str, Any]], name: str) -> np.nda
     try:
         return np.array([float(row[name]) for row in table], np.float64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise log_error(f"column {name}: {error}", "a number in each row", path) from error
+        raise log_error(f"column {name}: {error}", "a number in each row", key=path) from error
 
 
 # -------------------------------------------------------------------------------------------------- the project's own
@@ -128,7 +125,7 @@ def _read_csv(path: Path, text: str) -> PhoneLog:
     for name in _SETTINGS:
         values = {str(row.get(name) or "").strip() for row in table} - {""}
         if len(values) > 1:
-            raise log_error(f"column {name} holds {', '.join(sorted(values))}", "one value in the whole file", path)
+            raise log_error(f"column {name} holds {', '.join(sorted(values))}", "one value in the whole file", key=path)
         if values:
             settings[name] = values.pop()
     sensors = {}
@@ -145,12 +142,12 @@ def _read_json(path: Path, text: str) -> PhoneLog:
     try:
         content = bounded.parse_json(text)
     except ValueError as error:
-        raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), path) from error
+        raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), key=path) from error
     if not isinstance(content, dict):
-        raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), path)
+        raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), key=path)
     orientation = content.get("orientation", content)
     if not isinstance(orientation, dict):
-        raise log_error("an orientation that is no object", "an object with " + ", ".join(_COLUMNS), path)
+        raise log_error("an orientation that is no object", "an object with " + ", ".join(_COLUMNS), key=path)
     _check_names(path, list(orientation))
     columns = _lists(path, orientation, _COLUMNS)
     sensors = {}
@@ -170,10 +167,10 @@ def _lists(path: Path, content: Mapping[str, Any], names: Sequence[str], where: 
         try:
             columns.append(np.asarray(content[name], np.float64))
         except (KeyError, TypeError, ValueError) as error:
-            raise log_error(f"{where} field {name}: {error}".strip(), "a list of numbers", path) from error
+            raise log_error(f"{where} field {name}: {error}".strip(), "a list of numbers", key=path) from error
     if len({c.shape for c in columns}) > 1 or columns[0].ndim != 1:
         shapes = ", ".join(f"{n} {c.shape}" for n, c in zip(names, columns, strict=True))
-        raise log_error(f"{where} {shapes}".strip(), "lists of the same length", path)
+        raise log_error(f"{where} {shapes}".strip(), "lists of the same length", key=path)
     return columns
 
 
@@ -195,13 +192,13 @@ def _log(
 def _check_names(path: Path, names: list[str]) -> None:
     missing = [n for n in _COLUMNS if n not in names]
     if missing:
-        raise log_error(f"no {', '.join(missing)}", "the fields " + ", ".join(_COLUMNS), path)
+        raise log_error(f"no {', '.join(missing)}", "the fields " + ", ".join(_COLUMNS), key=path)
 
 
 def _frame(path: Path, settings: Mapping[str, object]) -> tuple[str, float | None]:
     frame, turned = settings.get("frame", CAMERA), settings.get("rotation_deg")
     if frame not in (CAMERA, DEVICE):
-        raise log_error(f"frame {frame!r}", f"{CAMERA} or {DEVICE}", path)
+        raise log_error(f"frame {frame!r}", f"{CAMERA} or {DEVICE}", key=path)
     if turned is None:
         return str(frame), None
     try:
@@ -209,11 +206,11 @@ def _frame(path: Path, settings: Mapping[str, object]) -> tuple[str, float | Non
     except (TypeError, ValueError):
         rotation_deg = math.nan
     if rotation_deg not in (0.0, 90.0, 180.0, 270.0):
-        raise log_error(f"rotation_deg {turned!r}", "0, 90, 180 or 270", path)
+        raise log_error(f"rotation_deg {turned!r}", "0, 90, 180 or 270", key=path)
     if rotation_deg and frame == CAMERA:
         found = f"rotation_deg {rotation_deg:g} with frame {CAMERA}"
         raise log_error(
-            found, f"rotation_deg only with frame {DEVICE}: the camera's frame is the upright picture's", path
+            found, f"rotation_deg only with frame {DEVICE}: the camera's frame is the upright picture's", key=path
         )
     return str(frame), rotation_deg
 
@@ -225,17 +222,17 @@ def _utc(path: Path, value: object) -> float | None:
     try:
         when = datetime.datetime.fromisoformat(str(value))
     except ValueError as error:
-        raise log_error(f"start_utc {value!r}", "a time such as 2026-03-01T09:15:30.250Z", path) from error
+        raise log_error(f"start_utc {value!r}", "a time such as 2026-03-01T09:15:30.250Z", key=path) from error
     if when.year not in _YEARS:
-        raise log_error(f"start_utc {value!r}", f"a year from {_YEARS.start} to {_YEARS.stop - 1}", path)
+        raise log_error(f"start_utc {value!r}", f"a year from {_YEARS.start} to {_YEARS.stop - 1}", key=path)
     if when.tzinfo is None:
-        raise log_error(f"start_utc {value!r} without a time zone", "a time such as 2026-03-01T09:15:30.250Z", path)
+        raise log_error(f"start_utc {value!r} without a time zone", "a time such as 2026-03-01T09:15:30.250Z", key=path)
     return when.timestamp()
 
 
 def _sensor(path: Path, name: str, time: np.ndarray, xyz: np.ndarray) -> Sensor:
     if not np.isfinite(time).all() or not np.isfinite(xyz).all():
-        raise log_error(f"{name}: values that are not finite", "finite numbers; leave such samples out", path)
+        raise log_error(f"{name}: values that are not finite", "finite numbers; leave such samples out", key=path)
     if np.any(np.diff(time) < 0):
-        raise log_error(f"{name}: stamps that run backwards", "increasing times", path)
+        raise log_error(f"{name}: stamps that run backwards", "increasing times", key=path)
     return Sensor(time, xyz)

@@ -62,7 +62,7 @@ def read_sensor_logger(path: Path) -> PhoneLog:
     tables, form = _tables(path)
     rows = tables(_ORIENTATION)
     if not rows:
-        raise log_error("no orientation", "Orientation.csv, or rows of the sensor Orientation in the JSON", path)
+        raise log_error("no orientation", "Orientation.csv, or rows of the sensor Orientation in the JSON", key=path)
     first_ns, time, rows, notes = _time(path, rows)
     quat = np.stack([numbers(path, rows, name) for name in QUATERNION], axis=1)
     time, quat = check_attitude(time, quat, path)
@@ -93,7 +93,7 @@ def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
         try:
             content = bounded.parse_json(text)
         except ValueError as error:
-            raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", path) from error
+            raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", key=path) from error
         rows = [r for r in content if isinstance(r, dict)]
         return lambda name: [r for r in rows if r.get("sensor") == name], "JSON"
     return lambda name: _csv(path, text) if name == _ORIENTATION else [], "CSV"
@@ -119,7 +119,7 @@ def _unzipped(path: Path, name: str) -> str | None:
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
             read_text(path)  # says so
-        raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", path) from error
+        raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", key=path) from error
 
 
 def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
@@ -127,11 +127,13 @@ def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
     try:
         ns = np.array([int(str(row["time"]).split(".")[0]) for row in rows], np.int64)
     except (KeyError, ValueError, OverflowError) as error:
-        raise log_error(f"column time: {error}", "nanoseconds since 1970 in each row", path) from error
+        raise log_error(f"column time: {error}", "nanoseconds since 1970 in each row", key=path) from error
     kept = np.concatenate([[True], np.diff(ns) != 0])
     n = int((~kept).sum())
     if n > _MOST_REPEATS * len(ns):
-        raise log_error(f"{n} of {len(ns)} stamps repeat the one before", "a stamp of its own for each sample", path)
+        raise log_error(
+            f"{n} of {len(ns)} stamps repeat the one before", "a stamp of its own for each sample", key=path
+        )
     notes = [f"{n} repeated rows were left out"] if n else []
     rows = [row for row, keep in zip(rows, kept, strict=True) if keep]
     return int(ns[0]), (ns[kept] - ns[0]) / 1e9, rows, notes
@@ -147,7 +149,7 @@ def _check_pitch(path: Path, rows: _Rows, quat_wxyz: np.ndarray) -> None:
         raise log_error(
             f"quaternions whose pitch differs from the column pitch (sines by {off:.2f})",
             "quaternions that turn the phone's axes into a world with z up",
-            path,
+            key=path,
         )
 
 
@@ -167,10 +169,10 @@ def read_phone_log(path: str | Path) -> PhoneLog:
     path = Path(path)
     log = read_sensor_logger(path) if is_sensor_logger(path) else read_own_form(path)
     if not is_plain(log.device):
-        raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", path)
+        raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", key=path)
     if np.abs(log.time_s).max() > _LATEST_S or bounded.span_s(log.time_s) > bounded.MAX_SECONDS:
         found = f"times from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s"
-        raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", path)
+        raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", key=path)
     _check_gravity(path, log)
     return log
 
@@ -192,5 +194,5 @@ def _check_gravity(path: Path, log: PhoneLog) -> None:
         raise log_error(
             f"an orientation whose vertical lies {off:.0f} deg from the accelerometer's",
             f"at most {_MOST_TILT_DEG:.0f} deg: quaternions that turn the phone's axes into a world with z up",
-            path,
+            key=path,
         )

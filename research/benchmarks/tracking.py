@@ -31,6 +31,7 @@ from pbl_pipeline.keypoints.crops import smooth_rois
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
     METHODS,
+    BlazePoseWindows,
     Detection,
     PersonTrack,
     Tracking,
@@ -40,7 +41,6 @@ from pbl_pipeline.tracking import (
     track_people,
 )
 from pbl_pipeline.tracking import track as tracks
-from pbl_pipeline.tracking.blazepose import blazepose
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 from research.benchmarks.longer_video import repeated
 from research.paths import SHARED
@@ -63,17 +63,16 @@ WAYS = {
 }
 
 
-class Counted:
-    """The embedded detector, counting its calls."""
+class Counted(BlazePoseWindows):
+    """The detector of `USUAL`, counting its calls."""
 
     def __init__(self) -> None:
-        self._detector = blazepose(USUAL)
-        self.name, self.model_sha256, self.calls = self._detector.name, self._detector.model_sha256, 0
-        self.window_px = self._detector.window_px
+        super().__init__(assets.fetch("blazepose_detector"), USUAL.min_score)
+        self.calls = 0
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         self.calls += 1
-        return self._detector.detect(image)
+        return super().detect(image)
 
 
 def clips(frames: int) -> Iterator[tuple[str, Path, int]]:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pbl_pipeline import shipped as shipped_files
 from pbl_pipeline.gait import MEASURES, change_sd, measurement
 from research.corpus.measurement import (
     Seen,
@@ -113,7 +114,7 @@ def test_the_lasting_parts_of_the_indexs_error_are_found_again():
 def test_a_written_model_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     shipped = measurement.load_model("blazepose-33")
     write_model(shipped, tmp_path / "toy.json", "by this test")
-    monkeypatch.setattr(measurement, "_FOLDER", tmp_path)
+    monkeypatch.setattr(shipped_files, "shipped_text", lambda path: (tmp_path / Path(path).name).read_text())
     found = measurement.load_model("toy")
     assert (found.name, found.fits, found.widening) == (shipped.name, shipped.fits, shipped.widening)
     assert found.measures == shipped.measures

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ _EPILOG = """\b
 Example: pbl export walk1.fit.npz walk2.fit.npz --to osim --to trc --to mot --out for_opensim
 Example: pbl export --subject P017 --session 2026-03-01 --to c3d --to parquet --out P017
 Example: pbl export --slice paper --to parquet --out paper_visits"""
+_usage = functools.partial(PblError, "USAGE", next_step="see `pbl export --help`")
 
 
 @click.command(epilog=_EPILOG)
@@ -162,7 +164,3 @@ def _write_many(
     click.echo(f"{len(visits) - refused} of {len(visits)} visits in {out}")
     if refused:
         raise click.exceptions.Exit(1)
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl export --help`")

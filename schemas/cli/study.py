@@ -182,16 +182,10 @@ def _write_key(path: Path, text: str) -> None:
     """The key to the codes, for its owner alone. Raises FILE_UNWRITABLE."""
     import os
 
-    from pbl_pipeline.errors import PblError
+    from pbl_pipeline.errors import os_errors_as
 
-    try:
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
-            out.write(text)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="a file for the key to the codes",
-            next_step="pass another --key",
-            key=path,
-        ) from error
+    with (
+        os_errors_as("FILE_UNWRITABLE", "a file for the key to the codes", "pass another --key", path),
+        os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out,
+    ):
+        out.write(text)

@@ -91,15 +91,15 @@ class LaboratoryMarkers(Recording):
             raise usage(
                 f"bytes that are registered as a video, video_id {number}",
                 "markers that are new, or registered as markers",
-                path,
-                f"delete video_id {number} from video.Video where it was registered by mistake",
+                next_step=f"delete video_id {number} from video.Video where it was registered by mistake",
+                key=path,
             )
         if self._other_set(recorded[0]):
             raise usage(
                 f"marker set {self.about['recording_marker_set']} for markers that are registered, video_id {number}",
                 f"{recorded[0]['recording_marker_set']} as it was registered",
-                path,
-                f"delete video_id {number} from video.Video, then register it with the other set",
+                next_step=f"delete video_id {number} from video.Video, then register it with the other set",
+                key=path,
             )
 
     def _other_set(self, row: Mapping[str, Any]) -> bool:
@@ -120,8 +120,8 @@ class LaboratoryMarkers(Recording):
                     f"marker set {self.about['recording_marker_set']} in a session with another, or another table of "
                     "that name",
                     f"{row['recording_marker_set']}, as video_id {row['video_id']} of the session",
-                    self.files[0].path,
-                    "register it with that set, or in a separate session",
+                    next_step="register it with that set, or in a separate session",
+                    key=self.files[0].path,
                 )
 
     def insert(self, numbers: Sequence[int]) -> list[str]:

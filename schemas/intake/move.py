@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import glob
 import os
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,7 @@ from .videos import check_same_number
 
 #: Plans of a visit that follow a video into its new one.
 _PLANS = (fit.FitPlan, gait.GaitPlan, gdi.GdiPlan, kinetics.KineticsPlan)
+_kept = functools.partial(PblError, "FILE_UNWRITABLE", expected="the recording in its new folder")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +129,7 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
         return
     with worker.alone(LOCK, video.Video.connection) as obtained:
         if not obtained:
-            raise _kept(kept[0], "uploads are being taken over now", "repeat this in a minute")
+            raise _kept("uploads are being taken over now", next_step="repeat this in a minute", key=kept[0])
         names: dict[Path, Path] = {}
         try:
             folder = private_folder(folder_of(archive, "", plan.after[0]) / plain_name(plan.after[1]))
@@ -138,7 +140,9 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
             sync_folders(folder, archive)
         except OSError as error:
             _unlink(names.values())
-            raise _kept(kept[0], error.strerror or str(error), "see that the archive can be written") from error
+            raise _kept(
+                error.strerror or str(error), next_step="see that the archive can be written", key=kept[0]
+            ) from error
         try:
             yield {number: names.get(path, path) for number, path in plan.files.items()}
         except BaseException:
@@ -152,9 +156,3 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
 def _unlink(paths: Any) -> None:
     for path in paths:
         path.unlink(missing_ok=True)
-
-
-def _kept(path: Path, found: str, next_step: str) -> PblError:
-    return PblError(
-        "FILE_UNWRITABLE", key=path, found=found, expected="the recording in its new folder", next_step=next_step
-    )

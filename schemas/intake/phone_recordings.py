@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import hashlib
 import json
 import secrets
@@ -27,6 +28,13 @@ MOST_RECORDINGS = 100
 #: What a phone may state of a recording: the longest text of each (characters), and its whole numbers.
 TEXTS = {"activity": 32, "pace": 32, "aid": 64, "step": 64, "note": 500, "camera": 128, "sensor": 64}
 NUMBERS = ("frames", "dropped")
+_refused = functools.partial(
+    PblError,
+    "PHONE_LINK",
+    expected="a link of the visit's page, opened within its time by one phone",
+    next_step='press "Film with a phone" on the page of the visit and scan the new code; recordings on this phone '
+    "are kept",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,16 +160,6 @@ def _valid(query: Any) -> dict[str, Any]:
     if rows[0]["link_ended"] is not None or rows[0]["link_expires"] <= utc_now():
         raise _refused("a link that has ended")
     return rows[0]
-
-
-def _refused(found: str) -> PblError:
-    return PblError(
-        "PHONE_LINK",
-        found=found,
-        expected="a link of the visit's page, opened within its time by one phone",
-        next_step='press "Film with a phone" on the page of the visit and scan the new code; recordings on this phone '
-        "are kept",
-    )
 
 
 # ---------------------------------------------------------------------------------------------------------- recordings

@@ -53,11 +53,11 @@ def read_protocol(path: Path) -> list[Step]:
         passes = number_of(row, "passes", row.cells.get("passes", "1"))
         if view not in VIEWS or not 1 <= passes <= 99 or passes % 1:
             raise refused(
-                row.where, f"view {view!r}, passes {passes:g}", f"view {', '.join(VIEWS)}; passes 1 to 99", "correct it"
+                f"view {view!r}, passes {passes:g}", f"view {', '.join(VIEWS)}; passes 1 to 99", "correct it", row.where
             )
         steps.append(Step(number, activity, pace, view, int(passes)))
     if not steps:
-        raise refused(str(path), "no rows", f"a row for each step: {', '.join(COLUMNS)}", "add the steps")
+        raise refused("no rows", f"a row for each step: {', '.join(COLUMNS)}", "add the steps", path)
     return steps
 
 
@@ -68,7 +68,7 @@ def add_protocol(name: str, steps: Sequence[Step]) -> bool:
         if _steps(name) == list(steps):
             return False
         expected = "a new name: visits were filmed by the old one"
-        raise usage(f"protocol {name} with other steps", expected, name, f"call it {name}-2")
+        raise usage(f"protocol {name} with other steps", expected, next_step=f"call it {name}-2", key=name)
 
     def insert() -> None:
         Protocol.insert1({"protocol": name, "protocol_created": utc_now()})

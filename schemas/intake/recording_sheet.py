@@ -98,14 +98,14 @@ def _rows(path: Path) -> list[Row]:
         unknown = [c for c, name in names.items() if name not in COLUMNS]
         if unknown or set(NEEDED) - set(names.values()) or len(set(names.values())) < len(names):
             raise refused(
-                sheet.name,
                 f"unknown column {', '.join(map(repr, unknown[:5]))}" if unknown else f"the columns {list(names)}",
                 f"{', '.join(NEEDED)}, and any of {', '.join(COLUMNS[len(NEEDED) :])}",
                 "rename or remove columns; clinical scores and roles of visits go into a sheet of `pbl study import`",
+                sheet.name,
             )
         rows += [replace(row, cells={names[c]: text for c, text in row.cells.items()}) for row in sheet.rows]
     if not rows:
-        raise refused(str(path), "no rows", "a row for each video", "write them below the header")
+        raise refused("no rows", "a row for each video", "write them below the header", path)
     return rows
 
 
@@ -141,10 +141,10 @@ def _blank(row: Row, folder: Path) -> VisitRecord:
 def _value(row: Row, column: str, text: str) -> Any:
     """Return the value of a cell. Raises `PblError` SHEET_FORMAT."""
     if column == "camera_motion" and text not in CAMERA_MOTIONS:
-        raise refused(row.where, f"camera_motion {text!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it")
+        raise refused(f"camera_motion {text!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it", row.where)
     if column == "person":
         if not (text.isdecimal() and 1 <= int(text) < 1000):
-            raise refused(row.where, f"person {text!r}", "the number of a person, from 1", "correct it")
+            raise refused(f"person {text!r}", "the number of a person, from 1", "correct it", row.where)
         return int(text)
     if column in ("height_m", "mass_kg"):
         return number_of(row, column, text)

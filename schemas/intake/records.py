@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,9 @@ from ..rows import counted, delete_below, inside, number, utc_now
 from ..session import UNLABELLED
 from ..subject_codes import check_subject, day_of
 from ..transactions import next_id
+
+#: Return a `PblError` USAGE about a registration.
+usage = functools.partial(PblError, "USAGE", next_step="see `pbl ingest --help`")
 
 
 def set_condition(video_id: int, activity: str | None = None, pace: str | None = None) -> list[str]:
@@ -204,8 +208,8 @@ class RefusedFile(Exception):
         return usage(
             f"{path.name} with {self.path.name}, which is refused ({self.error.code})",
             "all videos of the trial",
-            path,
-            "correct that one, then register the trial again",
+            next_step="correct that one, then register the trial again",
+            key=path,
         )
 
 
@@ -215,22 +219,17 @@ def check_path(path: Path) -> None:
         raise usage(
             "a path with line breaks, other control characters, or bytes that are not UTF-8",
             "a path of ordinary characters",
-            ascii(str(path)),
-            "rename the file or folder",
+            next_step="rename the file or folder",
+            key=ascii(str(path)),
         )
     if len(str(path)) > 1000:
         found = f"a path of {len(str(path))} characters"
-        raise usage(found, "at most 1000", path, "move the file to a shorter path")
+        raise usage(found, "at most 1000", next_step="move the file to a shorter path", key=path)
 
 
 def _no_video(code: str, found: str, path: Path) -> PblError:
     next_step = "check the path" if code == "VIDEO_MISSING" else "copy it from the phone again"
     return PblError(code, found=found, expected="a video file", next_step=next_step, key=path)
-
-
-def usage(found: str, expected: str, key: object = None, next_step: str = "see `pbl ingest --help`") -> PblError:
-    """Return a `PblError` USAGE about a registration."""
-    return PblError("USAGE", found=found, expected=expected, next_step=next_step, key=key)
 
 
 def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:

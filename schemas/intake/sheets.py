@@ -6,6 +6,7 @@ import contextlib
 import csv
 import dataclasses
 import datetime
+import functools
 import io
 import math
 import re
@@ -15,11 +16,17 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.bounded import MAX_TEXT, count_cells, count_rows, read_bytes
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.workbook import READ_BYTES, READ_S, read_workbook
 
 from ..subject_codes import folded
+
+#: A `PblError` SHEET_CONFLICT about rows that cannot all be true.
+conflict = functools.partial(PblError, "SHEET_CONFLICT")
+
+#: A `PblError` SHEET_FORMAT about a sheet or row.
+refused = functools.partial(PblError, "SHEET_FORMAT")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,19 +101,9 @@ def read_sheets(path: Path) -> list[Sheet]:
     try:
         tables = _workbook(path) if path.suffix.lower() in (".xlsx", ".xlsm") else [(path.name, _csv(path))]
     except (ValueError, OSError, csv.Error) as error:
-        raise refused(str(path), f"{error}"[:200], "a sheet as CSV in UTF-8 or as .xlsx", "save it anew") from error
+        raise refused(f"{error}"[:200], "a sheet as CSV in UTF-8 or as .xlsx", "save it anew", path) from error
     found = [_sheet(name, list(cells)) for name, cells in tables]
     return [sheet for sheet in found if sheet is not None]
-
-
-def refused(where: str, found: str, expected: str, next_step: str) -> PblError:
-    """A `PblError` SHEET_FORMAT about a sheet or row."""
-    return PblError("SHEET_FORMAT", found=found, expected=expected, next_step=next_step, key=where)
-
-
-def conflict(found: str, expected: str, next_step: str) -> PblError:
-    """A `PblError` SHEET_CONFLICT about rows that cannot all be true."""
-    return PblError("SHEET_CONFLICT", found=found, expected=expected, next_step=next_step)
 
 
 def check_same(first: Any, value: Any, what: str, whose: str, expected: str = "one value") -> None:
@@ -129,7 +126,7 @@ def similar_codes(stated: Iterable[str], registered: Iterable[str]) -> dict[str,
 def needed(row: Row, column: str) -> str:
     """The cell of a row in a column. Raises `PblError` SHEET_FORMAT where it is empty."""
     if column not in row.cells:
-        raise refused(row.where, f"no {column}", f"a value in the column {column}", "write it, or remove the row")
+        raise refused(f"no {column}", f"a value in the column {column}", "write it, or remove the row", row.where)
     return row.cells[column]
 
 
@@ -142,10 +139,10 @@ def date_of(row: Row, column: str) -> datetime.date:
         with contextlib.suppress(ValueError):
             return datetime.date.fromisoformat(text)
     raise refused(
-        row.where,
         f"{column} {row.cells[column]!r}",
         "a day as YYYY-MM-DD, such as 2026-03-09, or as 9.3.2026, or a date cell of a workbook",
         "write it so: 03/09 is another day in other countries",
+        row.where,
     )
 
 
@@ -155,7 +152,7 @@ def number_of(row: Row, column: str, text: str) -> float:
         if math.isfinite(value := float(with_point(text))) and "_" not in text:
             return value
     expected = "a number with a decimal point, or with a comma that cannot divide thousands"
-    raise refused(row.where, f"{column} {text!r}", expected, "correct it, or leave it empty")
+    raise refused(f"{column} {text!r}", expected, "correct it, or leave it empty", row.where)
 
 
 def with_point(text: str) -> str:
@@ -167,24 +164,16 @@ def with_point(text: str) -> str:
 def write_template(path: Path, columns: Sequence[str]) -> None:
     """Write an empty sheet (.csv or .xlsx) with these columns. Raises `PblError` FILE_UNWRITABLE, also for a file that
     exists."""
-    try:
-        with path.open("xb") as out:
-            if path.suffix.lower() == ".xlsx":
-                from openpyxl import Workbook
+    expected = "a file, .csv or .xlsx, that does not exist yet"
+    with os_errors_as("FILE_UNWRITABLE", expected, "pass another path", path), path.open("xb") as out:
+        if path.suffix.lower() == ".xlsx":
+            from openpyxl import Workbook
 
-                book = Workbook()
-                book.worksheets[0].append(list(columns))
-                book.save(out)
-            else:
-                out.write((",".join(columns) + "\n").encode())
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="a file, .csv or .xlsx, that does not exist yet",
-            next_step="pass another path",
-            key=path,
-        ) from error
+            book = Workbook()
+            book.worksheets[0].append(list(columns))
+            book.save(out)
+        else:
+            out.write((",".join(columns) + "\n").encode())
 
 
 def _csv(path: Path) -> list[list[str]]:
@@ -217,13 +206,13 @@ def _sheet(name: str, lines: list[list[str]]) -> Sheet | None:
         header = header[:-1]
     if wrong := sorted(c for c, n in Counter(header).items() if not c or n > 1):
         what = f"column {wrong[0]!r} twice" if wrong[0] else "a column without a name"
-        raise refused(name, what, "a header row that names each column once", "name the columns")
+        raise refused(what, "a header row that names each column once", "name the columns", name)
     rows = []
     for number, line in numbered[1:]:
         where = f"{name}, row {number}"
         error = None
         if any(line[len(header) :]):
             found = f"{len(line)} cells under {len(header)} columns"
-            error = refused(where, found, "no cell beside the columns", "remove them, or quote a text with commas")
+            error = refused(found, "no cell beside the columns", "remove them, or quote a text with commas", where)
         rows.append(Row(where, {c: v for c, v in zip(header, line, strict=False) if v}, error))
     return Sheet(name, tuple(header), tuple(rows))

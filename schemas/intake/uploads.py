@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 import fsspec
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 
 from ..operations.folders import secret
 from ..store import purge, store_error
@@ -68,17 +68,16 @@ class Folder:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        try:
-            with self._open(()) as handle:
-                self.owner = os.fstat(handle).st_uid
-        except OSError as error:
-            raise PblError(
+        with (
+            os_errors_as(
                 "FILE_MISSING",
-                key=root,
-                found=error.strerror or str(error),
-                expected="the folder into which recordings are uploaded",
-                next_step="create it, or correct PBL_INCOMING",
-            ) from error
+                "the folder into which recordings are uploaded",
+                "create it, or correct PBL_INCOMING",
+                root,
+            ),
+            self._open(()) as handle,
+        ):
+            self.owner = os.fstat(handle).st_uid
 
     def uploads(self, subject: str | None = None) -> Iterator[Upload]:
         """Yield all entries, or those of one person: every entry of the third level, and above it those that are not

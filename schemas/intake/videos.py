@@ -92,7 +92,7 @@ class SeveralCameras(Recording):
         sha256 = [file.sha256 for file in files]
         if twice := [p for i, p in enumerate(paths) if sha256[i] in sha256[:i]]:
             found = "the same video as two cameras"
-            raise usage(found, "a video of each camera", twice[0], "name each camera's own video")
+            raise usage(found, "a video of each camera", next_step="name each camera's own video", key=twice[0])
         check_same_times(times, paths[0])
         self.files = tuple(files)
         self.rig = {"rig_sha256": sha256_of(self.calibration), "rig_cameras": names}
@@ -108,8 +108,8 @@ class SeveralCameras(Recording):
                 f"{len(self.files)} videos, {len(numbers)} of them registered "
                 f"(video_id {', '.join(map(str, numbers))}), not as these cameras of one trial with this calibration",
                 "videos that are new, or registered together with this calibration",
-                self.files[0].path,
-                "register them as they were, or delete these rows of video.Video and register them again",
+                next_step="register them as they were, or delete these rows of video.Video and register them again",
+                key=self.files[0].path,
             )
 
     def check_session(self, session_id: int) -> None:
@@ -144,8 +144,8 @@ def check_same_number(session_id: int, n: int, path: Path) -> None:
             raise usage(
                 f"{n} cameras in a session whose trial {row['rig_trial']} has {row['n_views']}",
                 "the same cameras in all trials of a session: they are fitted with one body",
-                path,
-                "register it in a separate session",
+                next_step="register it in a separate session",
+                key=path,
             )
 
 
@@ -184,15 +184,15 @@ class OneCamera(Recording):
             raise usage(
                 f"bytes that are registered as laboratory markers, video_id {number}",
                 "a video",
-                path,
-                "name the file with --markers",
+                next_step="name the file with --markers",
+                key=path,
             )
         if self.visit.camera_file is not None and fit.trials_of([number]):
             raise usage(
                 f"--camera for one of several cameras, video_id {number}",
                 "the lens of its rig's calibration",
-                path,
-                "to use another calibration, delete the trial's rows of video.Video and register it with that",
+                next_step="for another calibration, delete the trial's rows of video.Video and register it with that",
+                key=path,
             )
 
     def update(self, row: Mapping[str, Any]) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -18,6 +19,8 @@ from schemas.operations import catalog
 from schemas.operations.declare import declare_all
 from schemas.stages import STAGES, modules
 from schemas.tables_version import applied, numbered, record, refuse_newer, title
+
+_error = functools.partial(PblError, "DB_MIGRATION")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,7 +191,3 @@ def _differs(left: Sequence[str]) -> PblError:
         "tables as this version defines them",
         "they need a migration: see docs/deployment.md, section Upgrade",
     )
-
-
-def _error(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("DB_MIGRATION", found=found, expected=expected, next_step=next_step)

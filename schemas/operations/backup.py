@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import gzip
 import hashlib
 from collections.abc import Callable
@@ -40,6 +41,8 @@ FORMAT = 1
 _MARKER = "restoring"
 
 Say = Callable[[str], None]
+_refused = functools.partial(PblError, "DB_REFUSED")
+_invalid = functools.partial(PblError, "BACKUP_INVALID", next_step="use another backup; nothing was changed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,10 +129,8 @@ def backup(
         "recordings_left": copied.left,
         "sha256": {name: sha256_of(folder / name) for name in ("database.sql.gz", *listings)},
     }
-    try:
+    with unwritable(folder):
         write_json(folder / "manifest.json", manifest)
-    except OSError as error:
-        raise unwritable(folder, error) from error
     return Backup(folder, created, rows, manifest["n_files"], manifest["n_bytes"], len(copied.paths), copied.left)
 
 
@@ -143,20 +144,20 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
         parts = dict(manifest["sha256"])
         manifest.setdefault("n_recordings", 0)  # a backup from before they were saved
         if manifest["format"] != FORMAT:
-            raise _invalid(folder, f"format {manifest['format']}", f"format {FORMAT}")
+            raise _invalid(f"format {manifest['format']}", f"format {FORMAT}", key=folder)
         expected = int(manifest["n_files"]) + int(manifest["n_recordings"])
         if absent := {"created", "prefix", "rows", "store", "n_bytes"} - set(manifest):
             raise KeyError(*absent)
     except FileNotFoundError as error:
         found = "no manifest.json: this is not a backup, or an interrupted one"
-        raise _invalid(folder, found, "manifest.json, written last") from error
+        raise _invalid(found, "manifest.json, written last", key=folder) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise _invalid(
-            folder, f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote"
+            f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote", key=folder
         ) from error
     for name, sha in parts.items():
         if not (folder / name).is_file() or sha256_of(folder / name) != sha:
-            raise _invalid(folder, f"{name} is missing or was changed", f"SHA-256 {sha}")
+            raise _invalid(f"{name} is missing or was changed", f"SHA-256 {sha}", key=folder)
     files = [(part, *file) for part in PARTS if f"{part}.sha256" in parts for file in listed(folder, part)]
     say(f"Checking {len(files)} files of the backup")
     wrong = []
@@ -169,7 +170,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     if wrong or len(files) != expected:
         found = f"{len(wrong)} files are missing or were changed: {', '.join(wrong[:5])}"
         raise _invalid(
-            folder, found, f"{expected} files as listed in {', '.join(p for p in parts if p.endswith('256'))}"
+            found, f"{expected} files as listed in {', '.join(p for p in parts if p.endswith('256'))}", key=folder
         )
     return manifest
 
@@ -274,8 +275,9 @@ def _save_files(paths: list[str], folder: Path) -> int:
                 n_bytes += target.stat().st_size
             except FileNotFoundError:
                 lost.append(path)
-            except OSError as error:
-                raise unwritable(target, error) from error
+            except OSError:
+                with unwritable(target):
+                    raise
             except Exception as error:
                 raise store_error(error) from error
             update(1)
@@ -346,13 +348,11 @@ def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
 
 # ------------------------------------------------------------------------------------------------------------ files
 def _new_folder(folder: Path) -> None:
-    try:
+    with unwritable(folder):
         private_folder(folder)
         empty = not any(folder.iterdir())
         if empty:
             make_private(folder)
-    except OSError as error:
-        raise unwritable(folder, error) from error
     if not empty:
         raise PblError(
             "FILE_UNWRITABLE",
@@ -361,17 +361,3 @@ def _new_folder(folder: Path) -> None:
             expected="a new or empty folder: no backup is ever written over another",
             next_step="name another folder, such as one with today's date",
         )
-
-
-def _invalid(folder: Path, found: str, expected: str) -> PblError:
-    return PblError(
-        "BACKUP_INVALID",
-        key=folder,
-        found=found,
-        expected=expected,
-        next_step="use another backup; nothing was changed",
-    )
-
-
-def _refused(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("DB_REFUSED", found=found, expected=expected, next_step=next_step)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import gzip
 import hashlib
 import json
@@ -29,13 +30,20 @@ from pymysql.converters import escape_string
 from pymysql.cursors import SSCursor
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 
 from .catalog import Column, quote
 
 #: A statement of inserts is ended when it is longer than this (characters); the server takes far more.
 STATEMENT = 1_000_000
 _FETCH = 500
+#: For a block that writes a backup to a path.
+unwritable = functools.partial(
+    os_errors_as,
+    "FILE_UNWRITABLE",
+    "a folder with room for the whole backup",
+    "free space, remove what was begun, and run it again",
+)
 HEADER = (
     "SET NAMES utf8mb4",
     "SET SESSION time_zone = '+00:00'",
@@ -145,17 +153,6 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def unwritable(path: Path, error: OSError) -> PblError:
-    """Return the error for a folder without room or rights."""
-    return PblError(
-        "FILE_UNWRITABLE",
-        key=path,
-        found=error.strerror or str(error),
-        expected="a folder with room for the whole backup",
-        next_step="free space, remove what was begun, and run it again",
-    )
-
-
 @dataclasses.dataclass
 class Recordings:
     """Recordings that were copied."""
@@ -184,10 +181,8 @@ def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: P
             name = path.lstrip("/")
             target = folder / RECORDINGS / name
             old = previous / RECORDINGS / name if previous is not None and (sha, name) in before else None
-            try:
+            with unwritable(target):
                 why = _save_recording(Path(path), sha, target, old)
-            except OSError as error:
-                raise unwritable(target, error) from error
             if why:
                 done.left[path] = why
                 continue
@@ -233,19 +228,18 @@ def restore_recordings(folder: Path) -> Recordings:
             if sha256_of(path) != sha:
                 done.left[str(path)] = "another file is there"
             continue
-        try:
-            with _private():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(folder / RECORDINGS / name, part := path.with_name(f".{path.name}.part"))
-                os.replace(part, path)
-        except OSError as error:
-            raise PblError(
+        with (
+            os_errors_as(
                 "FILE_UNWRITABLE",
-                key=path,
-                found=error.strerror or str(error),
-                expected="the place where this recording was registered",
-                next_step="make it writable, with room, then copy recordings/ of the backup there by hand (cp -n -r)",
-            ) from error
+                "the place where this recording was registered",
+                "make it writable, with room, then copy recordings/ of the backup there by hand (cp -n -r)",
+                path,
+            ),
+            _private(),
+        ):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(folder / RECORDINGS / name, part := path.with_name(f".{path.name}.part"))
+            os.replace(part, path)
         done.paths.append(str(path))
         done.n_bytes += path.stat().st_size
     return done

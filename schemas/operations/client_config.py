@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from schemas import connection
 from schemas.datajoint_setup import dj
 from schemas.operations.folders import private_folder, write_json, write_text
@@ -17,6 +17,7 @@ CONFIG, SECRETS = "datajoint.json", ".secrets"
 AGGREGATE = """dj.conn().query("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")"""
 #: Attributes of a store that are secret.
 _SECRET = ("access_key", "secret_key", "account_key", "connection_string", "token", "password")
+_EXPECTED = f"a folder for {CONFIG} and {SECRETS}/"
 
 
 def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
@@ -39,7 +40,8 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
     refuse_other_version()
     config, here = dj.config, folder / CONFIG
     if not overwrite and (here.exists() or (folder / SECRETS).exists()):
-        raise _unwritable(here, "it is there already", "pass --overwrite to replace it and .secrets/, or another --out")
+        next_step = "pass --overwrite to replace it and .secrets/, or another --out"
+        raise PblError("FILE_UNWRITABLE", "it is there already", _EXPECTED, next_step, here)
     stores, secrets = _without_secrets(dict(config.stores))
     secrets |= {"database.user": config["database.user"], "database.password": config["database.password"]}
     database = {name: config[f"database.{name}"] for name in ("host", "port", "use_tls", "reconnect")}
@@ -48,14 +50,12 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
         "safemode": True,
         "stores": stores,
     }
-    try:
+    with os_errors_as("FILE_UNWRITABLE", _EXPECTED, "pass another place with --out", folder):
         folder.mkdir(parents=True, exist_ok=True)
         kept = private_folder(folder / SECRETS)
         for name, value in {".gitignore": "*\n", **secrets}.items():
             write_text(kept / name, value)  # other files in this folder stay
         write_json(here, content, 0o644)
-    except OSError as error:
-        raise _unwritable(folder, error.strerror or str(error), "pass another place with --out") from error
     return [here, *(kept / name for name in secrets)]
 
 
@@ -73,13 +73,3 @@ def _without_secrets(stores: dict[str, Any]) -> tuple[dict[str, Any], dict[str, 
             spec = {k: v for k, v in spec.items() if k not in _SECRET}
         plain[name] = spec
     return plain, secrets
-
-
-def _unwritable(path: Path, found: str, next_step: str) -> PblError:
-    return PblError(
-        "FILE_UNWRITABLE",
-        key=path,
-        found=found,
-        expected=f"a folder for {CONFIG} and {SECRETS}/",
-        next_step=next_step,
-    )

@@ -20,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pbl_pipeline import progress, settings, temporary
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from schemas import connection, fit, lab, session, video, worker
 from schemas.datajoint_setup import RightMissing, full_path
 from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
@@ -424,17 +424,14 @@ def read_manifest(subject: str) -> dict[str, Any]:
 
 def _write(subject: str, manifest: dict[str, Any]) -> None:
     path = manifest_path(subject)
-    try:
+    with os_errors_as(
+        "FILE_UNWRITABLE",
+        "a place for the list of what is removed: nothing was removed without it",
+        "free space, or set PBL_HOME to a folder you may write to",
+        path,
+    ):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_json(path, manifest)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            key=path,
-            found=error.strerror or str(error),
-            expected="a place for the list of what is removed: nothing was removed without it",
-            next_step="free space, or set PBL_HOME to a folder you may write to",
-        ) from error
 
 
 def _now() -> str:

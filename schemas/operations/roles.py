@@ -12,6 +12,7 @@ declares all of them before (`pbl db init`, `pbl db migrate`).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -24,7 +25,7 @@ from typing import Any
 import pymysql
 from pymysql.converters import escape_string
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, os_errors_as
 from schemas import connection
 from schemas.stages import STAGES
 
@@ -121,20 +122,11 @@ def password_file(folder: Path, account: Account) -> Path:
     Raises `PblError` FILE_UNWRITABLE, FILE_MISSING.
     """
     path = folder / account.user
-    try:
+    expected, next_step = "a folder for passwords that you may write to", "pass another folder with --secrets"
+    with os_errors_as("FILE_UNWRITABLE", expected, next_step, path), contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as out:
             out.write(secrets.token_hex(24))
-    except FileExistsError:
-        pass
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            key=path,
-            found=error.strerror or str(error),
-            expected="a folder for passwords that you may write to",
-            next_step="pass another folder with --secrets",
-        ) from error
     return path
 
 

@@ -265,21 +265,19 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
     series, curves = None, {}
     if row["trial_forces"] is not None:
         with stored_file(file_ref(row["trial_forces"])) as path:
-            series, found = load_arrays(path)
-        curves = {c["number"]: c for c in found}
+            series, curves = load_arrays(path)
     cycles = {int(r["cycle_no"]): r for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
 
     def cycle(own: Mapping[str, Any]) -> CycleKinetics:
         number_of = int(own["cycle_no"])
-        about, drawn = gait.cycle_of_row(cycles[number_of], ""), curves.get(number_of, {})
+        about = gait.cycle_of_row(cycles[number_of], "")
         return lib.CycleKinetics(
             number_of,
             about.side,
             about.used,
-            drawn.get("curves", {}),
-            drawn.get("curves_sd", {}),
-            {n: float(own[n]) for n in lib.MEASURES if own[n] is not None},
-            own["forces_missing"],
+            measures={n: float(own[n]) for n in lib.MEASURES if own[n] is not None},
+            missing=own["forces_missing"],
+            **curves.get(number_of, {}),
         )
 
     of_trial = {**_of(kinetics.Kinetics, row), "video_id": row["video_id"]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 #: One kind of recordings and chain of methods; the kind is `slice_kind` in StudySlice.
 CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
+_none = functools.partial(PblError, "DB_NOT_FOUND")
+_usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --help`")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -478,11 +481,3 @@ def _text(value: Any) -> str:
 
 def _digest(texts: Any) -> str:
     return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:16]
-
-
-def _usage(found: str, expected: str) -> PblError:
-    return PblError("USAGE", found=found, expected=expected, next_step="see `pbl study slice --help`")
-
-
-def _none(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("DB_NOT_FOUND", found=found, expected=expected, next_step=next_step)

@@ -72,11 +72,11 @@ def _add(row: Row, by: str) -> dict[str, PblError]:
     low, high = (made.get(f"instrument_{end}") for end in ("low", "high"))
     if low is not None and high is not None and low >= high:
         expected = f"more than the lowest value, {low:g}"
-        errors["instrument_high"] = refused("instrument_high", f"{high:g}", expected, "correct one of them")
+        errors["instrument_high"] = refused(f"{high:g}", expected, "correct one of them", "instrument_high")
     if made.get("minimal_change") is not None and made.get("minimal_change_source") == "":
         found = "a minimal important change without its source"
         expected = "who found it, in whom"
-        errors["minimal_change_source"] = refused("minimal_change_source", found, expected, "write it, or neither")
+        errors["minimal_change_source"] = refused(found, expected, "write it, or neither", "minimal_change_source")
     if not errors:
         study.ClinicalInstrument.insert1(made)
         record("instrument", by, {"instrument": made["instrument"]}, {}, made)
@@ -86,22 +86,22 @@ def _add(row: Row, by: str) -> dict[str, PblError]:
 def _value(row: Row, field: str) -> Any:
     text = row.cells.get(field, "")
     if not text and field in _NEEDED:
-        raise refused(field, "nothing", "a value", "write it")
+        raise refused("nothing", "a value", "write it", field)
     if field in FLAGS:
         if text not in ("yes", "no"):
-            raise refused(field, repr(text[:20]), "yes or no", "choose one of them")
+            raise refused(repr(text[:20]), "yes or no", "choose one of them", field)
         return text == "yes"
     if field in NUMBERS:
         value = number_of(row, field, text) if text else None
         if field == "minimal_change" and value is not None and value <= 0:
-            raise refused(field, text, "a change above 0", "correct it, or leave it empty")
+            raise refused(text, "a change above 0", "correct it, or leave it empty", field)
         return value
     check_label(field, text, TEXTS[field])
     if field == "instrument":
         taken = {*COLUMNS, "instrument", "value", "video"}
         taken |= {str(name).lower() for name in study.ClinicalInstrument().to_arrays("instrument")}
         if text.lower() in taken or text.lower().replace(" ", "_") in taken:
-            raise refused(field, repr(text), "a name that no instrument and no column of a sheet has", "choose another")
+            raise refused(repr(text), "a name that no instrument and no column of a sheet has", "choose another", field)
     if field == "instrument_unit" and text.lower() == "punkte":
         return "points"  # the word by which whole numbers are asked for (`study.check_score`)
     return text
@@ -211,10 +211,10 @@ class _Plan:
         if unknown:
             scores = f"; or a clinical score: {', '.join(self.instruments)}" if kind is COLUMNS else ""
             error = refused(
-                sheet.name,
                 f"unknown column {', '.join(map(repr, unknown[:5]))}",
                 f"columns of {', '.join(kind)}{scores}",
                 "rename or remove it; a score of your own first: pbl study instrument add",
+                sheet.name,
             )
             self.lines[sheet.name] = Line(sheet.name, errors=[error])
         read = {TRIAL_COLUMNS: self._trial, SCORE_COLUMNS: self._long_score, COLUMNS: self._visit}[kind]
@@ -343,10 +343,10 @@ class _Plan:
     def _score(self, row: Row, key: tuple[str, str], name: str, text: str) -> None:
         if name not in self.instruments:
             raise refused(
-                row.where,
                 f"instrument {name!r}",
                 f"one of {', '.join(self.instruments)}",
                 "correct the name, or add your own first: pbl study instrument add",
+                row.where,
             )
         value = self._number(row, name, text)
         if (other := self.scores.get((*key, name))) is not None:
@@ -437,10 +437,10 @@ class _Plan:
         role = merged.get("visit_role")
         if not role:
             raise refused(
-                stated.row.where,
                 "no role of the visit",
                 "a role, such as baseline, pre, 6_weeks",
                 "write it into the column role",
+                stated.row.where,
             )
         if day is None or not isinstance(event, datetime.date):
             return
@@ -589,7 +589,7 @@ def _day(row: Row, column: str) -> datetime.date:
 def _flag(row: Row, column: str) -> bool:
     text = row.cells[column].lower()
     if text not in (*_YES, *_NO):
-        raise refused(row.where, f"{column} {text!r}", "yes or no", "write one of them")
+        raise refused(f"{column} {text!r}", "yes or no", "write one of them", row.where)
     return text in _YES
 
 
@@ -598,10 +598,10 @@ def _visit_value(row: Row, column: str) -> Any:
     if column == "role":
         if not study.is_role(text):
             raise refused(
-                row.where,
                 f"role {text!r}",
                 "baseline, pre, 6_weeks, 3_months, 6_months, or a word of small letters, digits and _",
                 "write it so",
+                row.where,
             )
         return text
     if text == CLEAR:
@@ -614,7 +614,7 @@ def _visit_value(row: Row, column: str) -> Any:
             column == "days" and not (number.is_integer() and abs(number) < 1e5)
         ):
             expected = "an age of 0 to 130 years" if column == "age" else "whole days"
-            raise refused(row.where, f"{column} {text}", expected, "correct it")
+            raise refused(f"{column} {text}", expected, "correct it", row.where)
         return int(number) if column == "days" else number
     check_label(column, text, _LONGEST[column])
     return text

@@ -97,7 +97,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
     errors: dict[str, PblError] = {}
     for name in ("subject", "visit"):
         if name not in given:
-            errors[name] = refused(name, "nothing", "a value", "write it")
+            errors[name] = refused("nothing", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": lambda text: check_label("visit", text, NEW["visit"]),
@@ -255,7 +255,7 @@ def _enter(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tupl
     changed = {name: text[:200] for name, text in given.items() if not now.same(name, text[:200])}
     errors: dict[str, PblError] = {}
     if changed.get(ROLE) == "":
-        errors[ROLE] = refused(ROLE, "no role", f"a role, such as {', '.join(USUAL_ROLES[:3])}", "write it")
+        errors[ROLE] = refused("no role", f"a role, such as {', '.join(USUAL_ROLES[:3])}", "write it", ROLE)
     of_visit = {"subject": now.subject, "visit": now.label}
     cells = {n: {ROLE: t} if n == ROLE else {"instrument": n, "value": t or CLEAR} for n, t in changed.items()}
     rows = {name: Row(name, {**of_visit, **cells[name]}) for name in changed if name not in errors}
@@ -310,7 +310,7 @@ def _label(name: str, longest: int) -> Callable[[str], None]:
 def _check_role(text: str) -> None:
     if not study.is_role(text):
         expected = "baseline, pre, 6_weeks, 3_months, or a word of small letters, digits and _"
-        raise refused("role", repr(text[:40]), expected, "write it so")
+        raise refused(repr(text[:40]), expected, "write it so", "role")
 
 
 def _height(text: str) -> float:

@@ -182,7 +182,8 @@ def hostile(tables: None, tmp_path: Path) -> Iterator[None]:
 
 
 PAGES = ("/visits", "/visits/1", "/visits/2", "/visits/3", "/visits/1/enter", "/recordings/1", "/recordings/3",
-         "/compare?v=1&v=2", "/operate", f"/visits?role={EVIL}&cohort={EVIL}", f"/compare?v={EVIL}")  # fmt: skip
+         "/compare?v=1&v=2", "/operate",
+         f"/visits?role={EVIL}&cohort={EVIL}&quality={EVIL}", f"/compare?v={EVIL}")  # fmt: skip
 
 
 def test_names_are_text_on_every_page(hostile: None):
@@ -191,6 +192,7 @@ def test_names_are_text_on_every_page(hostile: None):
     for path in PAGES:
         page = (operator if path == "/operate" else browser).get(path)
         assert page.status_code in (200, 400, 404), path
+        assert "&lt;script&gt;" in page.text, path
         assert "onerror=alert" not in re.sub(r"&lt;img src=x onerror=alert|&lt;img src=x onerror", "", page.text), path
         assert not re.search(r"<img src=x|<script>", page.text), path
         assert not re.search(r"<style|\sstyle=|<script(?![^>]*\ssrc=\"/)", page.text), path

@@ -110,12 +110,6 @@ def test_ranges_of_a_video(looked_at, asked: str, status: int):
     assert answer.headers["content-security-policy"]
 
 
-def test_a_video_needs_a_session(looked_at):
-    _, walk, _ = looked_at
-    for what in ("", "/video", "/movement", "/body"):
-        assert web.client(signed_in=False).get(f"/recordings/{walk}{what}").status_code == 401
-
-
 def test_a_video_that_is_gone_leaves_the_rest(looked_at):
     path, walk, _ = looked_at
     away = path.rename(path.with_suffix(".away"))

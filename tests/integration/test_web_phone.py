@@ -392,15 +392,6 @@ def test_a_phone_reaches_nothing_but_its_own_visit(visit: int, tmp_path: Path):
     assert {int(n) for n in PhoneRecording().to_arrays("session_id")} == {visit}
 
 
-def test_a_session_is_no_phone(visit: int):
-    for role in ("reader", "reviewer", "operator"):
-        browser = web.client(role, target=nothing)
-        for method, path in (("GET", "/phone"), ("GET", "/phone/state.json"), ("POST", "/phone/recordings.json"),
-                             ("PUT", "/phone/recordings/1.json"), ("POST", "/phone/finish/1.json")):  # fmt: skip
-            assert browser.request(method, path).status_code == 403, (role, path)
-    assert web.client("reader").post(f"/visits/{visit}/film").status_code == 403
-
-
 def test_what_is_not_a_recording_is_refused(visit: int, tmp_path: Path):
     browser, whole = phone(visit), film(tmp_path)
     most = phone_recordings.PART_BYTES * MOST_PARTS

@@ -80,7 +80,7 @@ def test_tiles_cover_the_frame_and_overlap(width, height, overlap):
 class Spots:
     """A detector that finds square spots: a spot of brightness 200 + n is a person n tens of px high."""
 
-    name, model_sha256, window_px = "spots", "0" * 64, 0
+    name, model_sha256 = "spots", "0" * 64
 
     def detect(self, image: np.ndarray) -> list[Detection]:
         found = []

@@ -51,7 +51,7 @@ def noise_frames(n: int) -> Iterator[np.ndarray]:
 def code_of(path: Path) -> str:
     with pytest.raises(PblError) as error:
         probe(path)
-    assert error.value.key == path
+    assert error.value.key == str(path)
     return error.value.code
 
 
@@ -653,7 +653,7 @@ def test_unusable_cameras(tmp_path, size, changes):
     with pytest.raises(PblError) as error:
         load_camera(path, size)
     assert error.value.code == "CAMERA_INVALID"
-    assert error.value.key == path
+    assert error.value.key == str(path)
 
 
 def test_camera_file_of_several(shared_data, tmp_path):

@@ -285,6 +285,11 @@ async def form_of(request: Request) -> Mapping[str, str]:
     return fields
 
 
+def sender(request: Request) -> str:
+    """Return the name that decisions of who sent a request carry; it has a session."""
+    return request.state.session.name
+
+
 def check_token(request: Request, sent: str) -> None:
     """Raise `Refused` for another token than that of the session."""
     session: Session | None = request.state.session

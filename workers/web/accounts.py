@@ -14,6 +14,7 @@ import base64
 import contextlib
 import dataclasses
 import datetime
+import functools
 import hashlib
 import hmac
 import json
@@ -47,6 +48,7 @@ LOG_N, R, P = 17, 8, 1
 #: Fewest and most characters of a password (NIST SP 800-63B asks for 15 where it is the only factor).
 SHORTEST, LONGEST = 15, 256
 _NAME = re.compile(r"[\w.@-][\w.@ -]{0,62}[\w.@-]|[\w.@-]")
+_refused = functools.partial(PblError, "WEB_ACCOUNT")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,10 +189,6 @@ def _nobody() -> str:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat()
-
-
-def _refused(found: str, expected: str, next_step: str) -> PblError:
-    return PblError("WEB_ACCOUNT", found=found, expected=expected, next_step=next_step)
 
 
 @dataclasses.dataclass

@@ -13,7 +13,7 @@ from schemas import fit
 from schemas.decisions import event_corrections, not_usable, review_decisions
 
 from ..refresh import queue_visit_of
-from .access import Refused, Session, form_of
+from .access import Refused, form_of, sender
 from .address import Address, number_of
 from .tables import Tables
 
@@ -45,13 +45,12 @@ def routes(tables: Tables) -> list[Address]:
 
     async def usable_or_not(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("usable") == "yes":
-            await tables.ask(review_decisions.take_back, number, session.name, seen)
+            await tables.ask(review_decisions.take_back, number, sender(request), seen)
         elif fields.get("usable") == "no":
             reason, note = fields.get("reason", ""), fields.get("note", "")
-            await tables.ask(review_decisions.mark_not_usable, number, reason, note, session.name, seen)
+            await tables.ask(review_decisions.mark_not_usable, number, reason, note, sender(request), seen)
         else:
             raise Refused("form")
         await tables.ask(queue_visit_of, number)
@@ -59,13 +58,12 @@ def routes(tables: Tables) -> list[Address]:
 
     async def events(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         number, seen = number_of(request), fields.get("seen", "")
         if fields.get("back") == "automatic":
-            await tables.ask(event_corrections.take_back, number, session.name, seen)
+            await tables.ask(event_corrections.take_back, number, sender(request), seen)
         else:
             found = _events(fields.get("events", ""))
-            await tables.ask(event_corrections.save, number, found, session.name, seen)
+            await tables.ask(event_corrections.save, number, found, sender(request), seen)
         await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 

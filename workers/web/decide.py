@@ -17,7 +17,7 @@ from schemas import reading, video
 from schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit, queue_visit_of
-from .access import Refused, Session, form_of
+from .access import Refused, form_of, sender
 from .address import Address, number_of, whole_number
 from .pages import Pages
 from .tables import Tables
@@ -31,11 +31,10 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def person(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         number = number_of(request)
         chosen = _number(fields.get("person", ""))
         method, seen = fields.get("method", ""), fields.get("seen", "")
-        await tables.ask(review_decisions.decide_person, number, chosen, method, session.name, seen)
+        await tables.ask(review_decisions.decide_person, number, chosen, method, sender(request), seen)
         await tables.ask(queue_visit_of, number)
         return RedirectResponse(f"/recordings/{number}", 303)
 
@@ -43,7 +42,6 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         from schemas.reading.shown import shown_visit
 
         fields = await form_of(request)
-        session: Session = request.state.session
         number, shown = number_of(request), _number(fields.get("result", ""))
 
         def write() -> None:
@@ -57,7 +55,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
                     key=f"session_id={number}",
                 )
             number_of_check = _number(fields.get("check", ""))
-            review_decisions.accept_check(about.key, number_of_check, session.name, fields.get("reason", ""))
+            review_decisions.accept_check(about.key, number_of_check, sender(request), fields.get("reason", ""))
 
         await tables.ask(write)
         await tables.ask(queue_visit, number)

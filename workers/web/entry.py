@@ -10,7 +10,7 @@ from starlette.responses import RedirectResponse, Response
 from pbl_pipeline.errors import PblError
 from schemas.studies import study_sheets, visit_forms
 
-from .access import Session, form_of
+from .access import form_of, sender
 from .address import Address, number_of
 from .pages import Pages
 from .tables import Tables
@@ -41,11 +41,10 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def send(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         number = number_of(request)
         values = {name.removeprefix(_FIELD): text for name, text in fields.items() if name.startswith(_FIELD)}
         reason = fields.get("reason", "").strip()
-        _, errors = await tables.ask(visit_forms.enter, number, values, session.name, fields.get("seen", ""), reason)
+        _, errors = await tables.ask(visit_forms.enter, number, values, sender(request), fields.get("seen", ""), reason)
         if errors:
             return page(request, await tables.ask(visit_forms.entry, number), values, errors)
         return RedirectResponse(f"/visits/{number}#entered", 303)
@@ -55,8 +54,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def add_instrument(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
-        errors = await tables.ask(study_sheets.add_instrument, fields, session.name)
+        errors = await tables.ask(study_sheets.add_instrument, fields, sender(request))
         if errors:
             return await instrument_page(request, fields, errors)
         return RedirectResponse("/instruments", 303)

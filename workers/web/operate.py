@@ -20,7 +20,7 @@ from schemas.transactions import in_transaction
 
 from ..requeue import retry
 from ..summary import disks
-from .access import Refused, Session, form_of
+from .access import Refused, form_of, sender
 from .address import Address, whole_number
 from .pages import Pages
 from .tables import Tables
@@ -60,11 +60,10 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def again(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         table, code, key = fields.get("table", ""), fields.get("code", ""), _key(fields.get("key", ""))
         if not table or not code:
             raise Refused("form")
-        n = await tables.ask(_retry, table, code, key, session.name)
+        n = await tables.ask(_retry, table, code, key, sender(request))
         return RedirectResponse(f"/operate?retried={n}", 303)
 
     return [

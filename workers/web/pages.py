@@ -28,6 +28,20 @@ from .address import JSON
 
 #: The folders of an absolute path in a text.
 _FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
+_unforeseen = functools.partial(
+    PblError,
+    "INTERNAL",
+    found="an unforeseen error of the page",
+    expected="an answer",
+    next_step="report what the terminal of `pbl web` says",
+)
+_not_there = functools.partial(
+    PblError,
+    "DB_NOT_FOUND",
+    found="no page at this address",
+    expected="/visits.json, /visits/NUMBER.json, /recordings/NUMBER.json or /compare.json",
+    next_step="take the numbers from /visits.json",
+)
 
 
 def plain(value: Any) -> Any:
@@ -166,21 +180,3 @@ class Pages:
 def _refusal(found: str, next_step: str) -> PblError:
     expected = "a request of somebody who is signed in and has the right"
     return PblError("WEB_REFUSED", found=found, expected=expected, next_step=next_step)
-
-
-def _not_there() -> PblError:
-    return PblError(
-        "DB_NOT_FOUND",
-        found="no page at this address",
-        expected="/visits.json, /visits/NUMBER.json, /recordings/NUMBER.json or /compare.json",
-        next_step="take the numbers from /visits.json",
-    )
-
-
-def _unforeseen() -> PblError:
-    return PblError(
-        "INTERNAL",
-        found="an unforeseen error of the page",
-        expected="an answer",
-        next_step="report what the terminal of `pbl web` says",
-    )

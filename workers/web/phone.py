@@ -28,7 +28,7 @@ from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 from .. import phone_uploads
 from ..process_queue import ProcessQueue
 from . import certificates, texts
-from .access import BODY_BYTES, Cookie, Refused, Session, form_of, read_body
+from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
 from .address import FILM, OPEN, Address, number_of, whole_number
 from .computing import Target
 from .computing import begin as compute
@@ -70,12 +70,11 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def make(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
         number, hours = number_of(request), fields.get("hours", "")
         if hours not in HOURS:
             raise Refused("form")
         make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
-        link, key = await tables.ask(make_link, number, session.name, float(hours))
+        link, key = await tables.ask(make_link, number, sender(request), float(hours))
         page = f"{request.url.scheme}://{request.headers['host']}/phone"
         address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
         shown = {

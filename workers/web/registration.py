@@ -19,7 +19,7 @@ from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
 from ..incoming import VIDEO_ENDINGS, Copy
 from ..refresh import queue_visit
-from .access import BODY_BYTES, Refused, Session, check_fields, check_token, form_of
+from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
@@ -29,6 +29,16 @@ from .tables import Tables, on_disk
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
 _on_disk = functools.partial(on_disk, "tell who runs the server")
+_busy = functools.partial(
+    PblError,
+    "DB_REFUSED",
+    found="recordings of the drop folder are being taken over",
+    expected="one import at a time",
+    next_step="send it again in some minutes",
+)
+_no_file = functools.partial(
+    PblError, "USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it"
+)
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
@@ -52,8 +62,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def register(request: Request) -> Response:
         fields = await form_of(request)
-        session: Session = request.state.session
-        number, errors = await tables.ask(visit_forms.register_visit, fields, session.name)
+        number, errors = await tables.ask(visit_forms.register_visit, fields, sender(request))
         if errors:
             return await new_page(request, fields, errors)
         if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
@@ -81,9 +90,8 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
     async def correct(request: Request) -> Response:
         fields = dict(await form_of(request))
-        session: Session = request.state.session
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_forms.correct, number, fields, session.name, seen, reason)
+        changed, errors = await tables.ask(visit_forms.correct, number, fields, sender(request), seen, reason)
         if errors:
             return await facts_page(request, fields, errors)
         if changed:
@@ -140,15 +148,14 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def taken_in(
         request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
     ) -> list[Outcome]:
-        session: Session = request.state.session
         for _ in range(int(_WAIT_S) if good else 0):
             done = await tables.ask(
-                browser_uploads.register, to, good, stated["activity"], stated["pace"], session.name
+                browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
             )
             if done is not None:
                 return done
             await asyncio.sleep(1.0)
-        return [Outcome(one.name, "refused", error=_busy(one.name)) for one, _ in good]
+        return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
 
     return [
         *page("/visits/new", new, "decide"),
@@ -229,17 +236,3 @@ def _visits_of_person_of(session_id: int) -> list[int]:
 
 def _populations() -> list[str]:
     return [str(p) for p in lab.Population().to_arrays("population") if p != "unknown"]
-
-
-def _no_file() -> PblError:
-    return PblError("USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it")
-
-
-def _busy(name: str) -> PblError:
-    return PblError(
-        "DB_REFUSED",
-        found="recordings of the drop folder are being taken over",
-        expected="one import at a time",
-        next_step="send it again in some minutes",
-        key=name,
-    )

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 import pymysql
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import os_errors_as
 
 T = TypeVar("T")
 
@@ -35,15 +35,8 @@ async def on_disk(next_step: str, work: Callable[..., T], *args: Any) -> T:
 
     Raises the error of the function; FILE_UNWRITABLE, with `next_step`, for its OSError.
     """
-    try:
+    with os_errors_as("FILE_UNWRITABLE", "room and rights in the archive of the server", next_step):
         return await asyncio.to_thread(work, *args)
-    except OSError as error:
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=error.strerror or str(error),
-            expected="room and rights in the archive of the server",
-            next_step=next_step,
-        ) from error
 
 
 class Tables:

@@ -8,12 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
-import numpy as np
-from markupsafe import Markup
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
-from pbl_pipeline import charts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
@@ -28,6 +25,7 @@ from pbl_pipeline.gait import (
     normal_bands,
 )
 from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.report.curves import CycleCurve, Ranges, cycle_curves
 from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import ANGLES, KINETICS
@@ -45,19 +43,6 @@ from .tables import Asks, Tables
 
 #: Angles of the first screen: those of the index of three angles, and the ankle.
 SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
-SIDES = ("left", "right")
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """One angle: its chart; lowest and highest value (deg) of each side's mean curve and of that of the children."""
-
-    name: str
-    title: str
-    positive: str
-    picture: Markup
-    ranges: dict[str, tuple[float, float]]
-    norm: tuple[float, float] | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +50,7 @@ class Curves:
     """The angles of a visit. far: the leg that was behind the other, empty where both were seen alike. adults: ranges
     of adults beside the children's bands."""
 
-    angles: tuple[Curve, ...]
+    angles: tuple[CycleCurve, ...]
     bands: NormalBands
     far: str
     adults: AdultRanges
@@ -78,25 +63,14 @@ def curves_of(visit: Visit, language: str) -> Curves | None:
     cycles = [c for c in visit.measures.cycles if c.used and c.curves]
     if not cycles:
         return None
+
+    def label(title: str, _: Ranges) -> str:
+        return texts.text(language, "curves.chart", name=texts.library_words(language, title))
+
     leg_m = None if visit.solution is None else leg_length_m(visit.solution.scale)
-    bands, far = normal_bands(visit.measures.spatiotemporal, leg_m), far_leg_of(cycles)
-    drawn = []
-    for name in SHOWN:
-        by_side = {s: [c.curves[name] for c in cycles if c.side == s and name in c.curves] for s in SIDES}
-        if not any(by_side.values()):
-            continue
-        band = (bands.percent, *bands.curves[name]) if name in bands.curves else None
-        percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
-        off = {s: [100 * (c.foot_up_s - c.start_s) / c.stride_time_s for c in cycles if c.side == s] for s in SIDES}
-        foot_off = {s: float(np.mean(v)) for s, v in off.items() if v}
-        title, positive = ANGLES[name]
-        label = texts.text(language, "curves.chart", name=texts.library_words(language, title))
-        picture = charts.cycle_chart(label, percent, by_side, foot_off, band, far)
-        means = {s: charts.mean_curve(curves) for s, curves in by_side.items() if curves}
-        ranges = {s: (float(m.min()), float(m.max())) for s, m in means.items() if np.isfinite(m).all()}
-        normal = None if band is None else (float(band[1].min()), float(band[1].max()))
-        drawn.append(Curve(name, title, positive, picture, ranges, normal))
-    return Curves(tuple(drawn), bands, far, adult_ranges())
+    bands = normal_bands(visit.measures.spatiotemporal, leg_m)
+    drawn = cycle_curves(cycles, bands, {name: ANGLES[name] for name in SHOWN}, label)
+    return Curves(tuple(drawn), bands, far_leg_of(cycles), adult_ranges())
 
 
 def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:

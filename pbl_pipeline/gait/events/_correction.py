@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Collection, Iterable, Sequence
 
@@ -22,6 +23,9 @@ LONGEST_CYCLE_S = 3.0
 LONGEST_PHASE_S = 1.5
 #: Most events of a recording.
 MOST_EVENTS = 5000
+_implausible = functools.partial(
+    PblError, "EVENTS_IMPLAUSIBLE", next_step="move, add or delete that event and save again; nothing was written"
+)
 
 
 def check_correction(
@@ -131,12 +135,3 @@ def _key(e: GaitEvent) -> tuple[float, str, str]:
 
 def _said(e: GaitEvent) -> str:
     return f"{_WORDS[e.event]} of the {e.side} foot at {e.time_s:.2f} s"
-
-
-def _implausible(found: str, expected: str) -> PblError:
-    return PblError(
-        "EVENTS_IMPLAUSIBLE",
-        found=found,
-        expected=expected,
-        next_step="move, add or delete that event and save again; nothing was written",
-    )

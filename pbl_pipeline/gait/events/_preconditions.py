@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -23,6 +24,10 @@ SEATED_HEIGHT = 0.8
 SEATED_SHARE = 0.95
 #: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
 BACKWARDS = -0.5
+#: GAIT_INPUT of points that cannot be searched.
+input_error = functools.partial(
+    PblError, "GAIT_INPUT", next_step="correct the points or the axes; the overlay shows which leg is which"
+)
 
 
 def check_preconditions(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
@@ -115,13 +120,3 @@ def check_upright(grid: Grid) -> float:
             "left and right as they are: points are mirrored, or the sides are exchanged",
         )
     return height
-
-
-def input_error(found: str, expected: str) -> PblError:
-    """GAIT_INPUT of points that cannot be searched."""
-    return PblError(
-        "GAIT_INPUT",
-        found=found,
-        expected=expected,
-        next_step="correct the points or the axes; the overlay shows which leg is which",
-    )

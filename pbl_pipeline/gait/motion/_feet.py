@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 HEADING_WINDOW_S = 1.0
 #: Below this speed the direction of travel says nothing about the heading.
 MIN_TRAVEL_M_PER_S = 0.3
+_input_error = functools.partial(
+    PblError, "GAIT_INPUT", next_step="pass a fit.npz of `pbl fit`, or a keypoints.npz with 3D points of hips and feet"
+)
 
 
 def heading_from_hips(time_s: np.ndarray, hip_m: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -270,12 +274,3 @@ def _assemble(time_s, hip, heel, toe, up, confidence, source, travels, legs) -> 
     forward = heading_from_hips(time, hip, up)
     agreement = heading_agreement(time, pelvis, forward, up) if travels else float("nan")
     return FootTrajectories(time, heel, toe, pelvis, forward, up, confidence, source, agreement, legs)
-
-
-def _input_error(found: str, expected: str) -> PblError:
-    return PblError(
-        "GAIT_INPUT",
-        found=found,
-        expected=expected,
-        next_step="pass a fit.npz of `pbl fit`, or a keypoints.npz with 3D points of hips and feet",
-    )

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
 _CHUNK = 128
+_input_error = functools.partial(
+    PblError, "GAIT_INPUT", next_step="pass a fit.npz that `pbl fit` of this version wrote"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,12 +83,6 @@ def _compiled() -> Any:
 
     body = load_body()
     return jax.jit(lambda qpos, scale: body_poses(body, qpos, scale))
-
-
-def _input_error(found: str, expected: str) -> PblError:
-    return PblError(
-        "GAIT_INPUT", found=found, expected=expected, next_step="pass a fit.npz that `pbl fit` of this version wrote"
-    )
 
 
 #: Joints in the order of `legs_m`; a marker set may lack some.

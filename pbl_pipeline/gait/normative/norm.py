@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Sequence
@@ -53,6 +54,11 @@ PELVIS_SLOPE_DEG = 12.0
 #: adduction and rotation as they are; of the pelvis' angles it changes the tilt. (Exactly so only where obliquity and
 #: rotation are zero; where both are 10 deg the tilt is 0.1 deg off, obliquity and rotation change by 2.3 deg.)
 OFFSET_DEG = {"hip_flexion": PELVIS_SLOPE_DEG, "pelvis_tilt": PELVIS_SLOPE_DEG}
+_invalid = functools.partial(
+    PblError,
+    "NORM_INVALID",
+    next_step="add cycles or correct the data, and build the set again (docs/measures.md, section Normative sets)",
+)
 
 
 def offset_deg(angle: str, source: str, target: str) -> float:
@@ -349,13 +355,4 @@ def _unknown(name: str) -> PblError:
         found=f"normative set {name!r}",
         expected=f"one of {', '.join(norm_names())}, or a .json file of build_norm",
         next_step="name one of these with --norm",
-    )
-
-
-def _invalid(found: str, expected: str) -> PblError:
-    return PblError(
-        "NORM_INVALID",
-        found=found,
-        expected=expected,
-        next_step="add cycles or correct the data, and build the set again (docs/measures.md, section Normative sets)",
     )
