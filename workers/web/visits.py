@@ -28,6 +28,7 @@ from pbl_pipeline.gait import (
     normal_bands,
 )
 from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import ANGLES, KINETICS
@@ -36,7 +37,7 @@ from schemas.reading.shown import ShownVisit
 
 from . import texts
 from .access import Session, form_of
-from .address import Address, interval, number_of, page, shown_of, whole_number
+from .address import Address, interval, number_of, page, shown_of
 from .computing import told as told_of
 from .pages import Pages, as_json, plain, reader_language
 from .phone import verdict
