@@ -115,6 +115,10 @@ def test_a_page_in_english_has_no_codes_either():
     limit = held.format("neck_extension, hip_flexion_r")
     assert texts.library_words("en", limit) == held.format("extension of the neck, hip flexion right")
     assert texts.library_words("de", limit).endswith(": Extension des Halses, Hüftflexion rechts")
+    camera = "the focal length is not measured ({}): pass --camera with a calibration (`pbl calibrate`)"
+    assert texts.on_page("en", camera.format("guess: a lens; no distortion")).endswith(
+        "; have the camera calibrated once"
+    )
     assert {n for n in load_body().joint_names if texts.library_words("en", n) == n} == {*SLIDES}
 
 
