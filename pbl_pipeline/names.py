@@ -3,6 +3,7 @@ different; a body height."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from unicodedata import category
@@ -16,6 +17,7 @@ _ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
 _JOINERS = "\u200c\u200d"
 #: Letters and marks that show nothing.
 _BLANK = "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
+_NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 def is_plain(text: str) -> bool:
@@ -37,6 +39,11 @@ def check_label(what: str, text: str, longest: int, least: int = 0) -> None:
         expected=f"{least} to {longest} characters" if plain else "one line without control or invisible characters",
         next_step="choose another one",
     )
+
+
+def whole_number(text: str) -> int | None:
+    """Return the number that a text is, None if it is not in its shortest form or has over nine digits."""
+    return int(text) if _NUMBER.fullmatch(text) else None
 
 
 def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:

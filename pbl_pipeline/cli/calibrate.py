@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pbl_pipeline.names import whole_number
+
 
 class Squares(click.ParamType):
     """`9x6`: squares along and across."""
@@ -17,9 +19,9 @@ class Squares(click.ParamType):
     ) -> tuple[int, int] | None:
         if isinstance(value, tuple):
             return value
-        parts = str(value).lower().split("x")
-        if len(parts) == 2 and all(p.isdecimal() for p in parts):
-            return int(parts[0]), int(parts[1])
+        along, _, across = str(value).lower().partition("x")
+        if (a := whole_number(along)) is not None and (b := whole_number(across)) is not None:
+            return a, b
         return self.fail(f"{value!r} is not of the form 9x6", param, ctx)
 
 

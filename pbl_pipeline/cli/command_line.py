@@ -117,7 +117,8 @@ def _explain(error: Exception) -> None:
 
 
 def _unforeseen(error: Exception) -> PblError:
-    """What is said of an error that no stage gave a code: a full disk by its name, all else as INTERNAL."""
+    """What is said of an error that no stage gave a code: a full disk and a name too long by theirs, all else as
+    INTERNAL."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
         return PblError(
             "FILE_UNWRITABLE",
@@ -125,6 +126,14 @@ def _unforeseen(error: Exception) -> PblError:
             expected="room for the results",
             next_step="free space on this disk, or write to another one",
             key=error.filename,
+        )
+    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+        return PblError(
+            "USAGE",
+            found=error.strerror or str(error),
+            expected="names of files and folders that this system can have",
+            next_step="shorten the name",
+            key=str(error.filename)[:200],
         )
     frames = traceback.extract_tb(error.__traceback__)
     where = f", at {Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}" if frames else ""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, Points
@@ -92,8 +93,8 @@ class Person(click.ParamType):
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:
         if value is None or value == "auto" or isinstance(value, int):
             return value if isinstance(value, int) else None
-        if isinstance(value, str) and value.isdecimal():
-            return int(value)
+        if (number := whole_number(str(value))) is not None:
+            return number
         return self.fail(f"{value!r} is neither 'auto' nor the number of a person", param, ctx)
 
 

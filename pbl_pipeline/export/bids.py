@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pbl_pipeline.body import SLIDES, angle_of
+from pbl_pipeline.bounded import read_text
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.angles_file import angles_table
@@ -23,6 +24,7 @@ from .visit_tables import joint_sign
 BIDS_VERSION = "1.10.0"
 #: Label of the tracking system in names of files.
 TRACKSYS = "video"
+_PARTICIPANTS = "participants.tsv"
 _AXES = {"tx": "x", "ty": "y", "tz": "z"}
 
 
@@ -55,18 +57,21 @@ class _Channel(NamedTuple):
 
 
 def bids_files(
-    trials: Sequence[ExportTrial], origins: Mapping[str, Mapping[str, str]], labels: Labels, participants: Sequence[str]
+    trials: Sequence[ExportTrial], origins: Mapping[str, Mapping[str, str]], labels: Labels, root: Path
 ) -> dict[str, bytes]:
     """Return the content of each file by its path in the data set.
+
+    Raises `PblError` EXPORT_INPUT where the data set has a participants.tsv to which no participant can be added.
 
     Parameters
     ----------
     origins
         By the name of a trial, how it was made (`provenance.origin_of`).
-    participants
-        Labels that the data set has.
+    root
+        Folder of the data set. What it says of itself and of its participants already is kept.
     """
-    out = _of_data_set(sorted({*participants, labels.participant}))
+    out = {name: data for name, data in _of_data_set().items() if not (root / name).exists()}
+    out[_PARTICIPANTS] = _with_participant(root / _PARTICIPANTS, f"sub-{labels.participant}")
     tasks = [_task(t) for t in trials]
     for i, (trial, task) in enumerate(zip(trials, tasks, strict=True)):
         entities = [*labels.folder.split("/"), f"task-{task}"]
@@ -90,11 +95,28 @@ def bids_files(
     return out
 
 
-def known_participants(root: Path) -> list[str]:
-    """Return the labels of the participants that a data set has; empty if it does not exist yet."""
-    path = root / "participants.tsv"
-    rows = path.read_text(encoding="utf-8").splitlines()[1:] if path.exists() else []
-    return [row.split("\t")[0].removeprefix("sub-") for row in rows]
+def _with_participant(path: Path, participant: str) -> bytes:
+    """Return the table of participants with a row for one of them, the rows and columns that it has already kept."""
+    try:
+        lines = read_text(path).splitlines() if path.exists() else ["participant_id"]
+    except (OSError, ValueError) as error:
+        raise _no_table(path, str(error)) from error
+    header, *rows = [line.split("\t") for line in lines if line.strip()] or [[""]]
+    if header[0] != "participant_id":
+        raise _no_table(path, f"a first column {header[0][:80]!r}")
+    if participant not in (row[0] for row in rows):
+        rows = sorted([*rows, [participant, *["n/a"] * (len(header) - 1)]])
+    return _tsv(header, rows)
+
+
+def _no_table(path: Path, found: str) -> PblError:
+    return PblError(
+        "EXPORT_INPUT",
+        found=found,
+        expected="a table in UTF-8 with tabs between its columns, the first of them participant_id",
+        next_step="correct the table, or pass another --out",
+        key=str(path),
+    )
 
 
 def check_labels(root: Path, labels: Labels, overwrite: bool) -> None:
@@ -114,7 +136,7 @@ def check_labels(root: Path, labels: Labels, overwrite: bool) -> None:
         )
 
 
-def _of_data_set(participants: Sequence[str]) -> dict[str, bytes]:
+def _of_data_set() -> dict[str, bytes]:
     software = {"Name": "pbl-pipeline", "Version": code_version()}
     about: dict[str, Any] = {"Name": "Movement fitted to video", "BIDSVersion": BIDS_VERSION, "DatasetType": "raw"}
     about["GeneratedBy"] = [software]
@@ -122,11 +144,7 @@ def _of_data_set(participants: Sequence[str]) -> dict[str, bytes]:
         "Joint angles and marker positions of a body model that was fitted to videos by pbl-pipeline.\n"
         "Each angle has a channel with its standard deviation. Signs and axes: docs/export.md of pbl-pipeline.\n"
     )
-    return {
-        "dataset_description.json": _json(about),
-        "README.md": readme.encode(),
-        "participants.tsv": _tsv(("participant_id",), [(f"sub-{p}",) for p in participants]),
-    }
+    return {"dataset_description.json": _json(about), "README.md": readme.encode()}
 
 
 def _task(trial: ExportTrial) -> str:

@@ -50,9 +50,10 @@ def number_cells(values: np.ndarray, decimals: int) -> np.ndarray:
 
 
 def text_cells(texts: Sequence[bytes]) -> np.ndarray:
-    """(N, W) bytes of N texts, none of which has a byte of value 0."""
+    """(N, W) bytes of N texts, none of which has a byte of value 0; may be written into."""
     width = max(map(len, texts), default=0) or 1
-    return np.frombuffer(b"".join(t.ljust(width, b"\0") for t in texts), np.uint8).reshape(len(texts), width)
+    together = bytearray().join(t.ljust(width, b"\0") for t in texts)
+    return np.frombuffer(together, np.uint8).reshape(len(texts), width)
 
 
 def lines(blocks: Sequence[np.ndarray], separator: str) -> bytes:

@@ -25,7 +25,7 @@ from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import Check, failed
 from pbl_pipeline.visit import Visit
 
-from .bids import Labels, bids_files, check_labels, known_participants
+from .bids import Labels, bids_files, check_labels
 from .c3d import check_frames, write_c3d
 from .columns import Table, dictionary, write_csv, write_parquet
 from .ground import check_forces, on_floor, taken_off, write_forces, write_mot
@@ -200,7 +200,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     out.mkdir(parents=True, exist_ok=True)
     paths += _write_tables(trials, visit, formats, out, _common(about))
     if "bids" in formats:
-        for name, data in bids_files(trials, origins, labels, known_participants(root)).items():
+        for name, data in bids_files(trials, origins, labels, root).items():
             path = root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             paths.append(_written(path, lambda part, data=data: part.write_bytes(data)))

@@ -12,6 +12,7 @@ from ..capture import PhoneLink, PhoneRecording, Protocol
 from ..reading.usable import UNUSABLE, usable
 from ..rows import utc_now
 from ..transactions import in_transaction
+from .phone_recordings import MOST_RECORDINGS
 from .records import usage
 from .sheets import needed, number_of, read_sheets, refused
 
@@ -56,8 +57,9 @@ def read_protocol(path: Path) -> list[Step]:
                 f"view {view!r}, passes {passes:g}", f"view {', '.join(VIEWS)}; passes 1 to 99", "correct it", row.where
             )
         steps.append(Step(number, activity, pace, view, int(passes)))
-    if not steps:
-        raise refused("no rows", f"a row for each step: {', '.join(COLUMNS)}", "add the steps", path)
+    if not 1 <= len(steps) <= MOST_RECORDINGS:
+        expected = f"a row for each step, 1 to {MOST_RECORDINGS}: {', '.join(COLUMNS)}"
+        raise refused(f"{len(steps)} rows", expected, "add the steps, or make two protocols", path)
     return steps
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.progress import track
 from pbl_pipeline.video import recorded_utc
 
@@ -143,9 +144,9 @@ def _value(row: Row, column: str, text: str) -> Any:
     if column == "camera_motion" and text not in CAMERA_MOTIONS:
         raise refused(f"camera_motion {text!r}", f"one of {', '.join(CAMERA_MOTIONS)}", "correct it", row.where)
     if column == "person":
-        if not (text.isdecimal() and 1 <= int(text) < 1000):
+        if not 1 <= (number := whole_number(text) or 0) < 1000:
             raise refused(f"person {text!r}", "the number of a person, from 1", "correct it", row.where)
-        return int(text)
+        return number
     if column in ("height_m", "mass_kg"):
         return number_of(row, column, text)
     return date_of(row, column) if column == "date" else text

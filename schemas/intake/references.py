@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import fields_of
-from pbl_pipeline.names import check_label
+from pbl_pipeline.names import check_label, whole_number
 from pbl_pipeline.paramset import canonical_json
 from pbl_pipeline.temporary import new_folder
 
@@ -248,8 +248,8 @@ def find_video(about: int | str | Path) -> int:
     from pbl_pipeline.video import sha256_of
 
     text = str(about)
-    if text.isdecimal():
-        found = (video.Video & {"video_id": int(text)}).to_arrays("video_id")
+    if (number := whole_number(text)) is not None:
+        found = (video.Video & {"video_id": number}).to_arrays("video_id")
     else:
         path = Path(text).absolute()
         found = (video.Video & {"video_path": str(path)}).to_arrays("video_id")

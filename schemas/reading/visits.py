@@ -23,7 +23,6 @@ from ..method_names import with_keys
 from ..operations.archive import plain_name
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
-from ..studies.slices import chain_of
 from .objects import (
     load_choice,
     load_fit_checks,
@@ -34,6 +33,7 @@ from .objects import (
     load_trial_fit,
     videos_of,
 )
+from .slice_rows import chain_of
 
 if TYPE_CHECKING:
     from pbl_pipeline.tracking import SubjectChoice

@@ -23,6 +23,7 @@ from ..decisions.not_usable import unusable
 from ..method_names import with_keys
 from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
+from ..reading.slice_rows import slice_row
 from ..rows import inside, utc_now
 from ..stored_files import file_ref, stored_file
 from ..transactions import in_transaction
@@ -132,7 +133,7 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     """
     from pbl_pipeline.study import StudyData, StudyDescription
 
-    about = _about(name)
+    about = slice_row(name)
     rows = _frozen(about)
     frames = _frames(rows, about)
     frames["visits"] = frames["visits"].merge(_recordings(rows, about), how="left", on=["subject", "visit"])
@@ -181,23 +182,12 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
     return pd.DataFrame(out)
 
 
-def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
-    """Kind and methods of a slice's results, from the fit on, and the sets of the visits that count.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown slice.
-    """
-    about = _about(name)
-    own = study.StudySliceVisit & {"study_slice": name, "slice_included": True} & "slice_fit_set != ''"
-    later = ("fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
-    return {k: about[k] for k in later}, sorted(map(str, own.to_arrays("slice_fit_set")))
-
-
 def changes(name: str) -> list[str]:
     """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
 
     Raises `PblError` DB_NOT_FOUND for an unknown slice.
     """
-    about = _about(name)
+    about = slice_row(name)
     rows = _frozen(about)
     out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]
     hashes = _hashes(_frames(rows, about)) if len(rows) else {}
@@ -297,14 +287,6 @@ def _line(text: str) -> str:
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
-def _about(name: str) -> dict[str, Any]:
-    found = (study.StudySlice & {"study_slice": name}).to_dicts()
-    if not found:
-        known = ", ".join(sorted(study.StudySlice().to_arrays("study_slice"))) or "none yet"
-        raise _none(f"no slice {name!r}", f"a slice that was frozen ({known})", "`pbl study slice NAME` freezes one")
-    return {**found[0], "fit_set_kind": found[0]["slice_kind"]}
-
-
 def _frozen(about: Mapping[str, Any]) -> Any:
     own = study.StudySliceVisit & {"study_slice": about["study_slice"]}
     named = session.Session.proj("subject", visit="session_label")

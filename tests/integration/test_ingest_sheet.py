@@ -122,6 +122,13 @@ def test_one_bad_row_and_nothing_is_registered(tables, recordings, row, code, wo
     assert everything() == before
 
 
+def test_a_person_is_a_number_of_few_digits(tables, recordings):
+    rows = [f"{name}.mp4,P003,1,{text}" for name, text in (("one", "9" * 5000), ("two", "0"), ("three", "x"))]
+    done = pbl("ingest", "--sheet", sheet(recordings, *rows, header="file,subject,visit,person", name="people.csv"))
+    assert (done.code, done.error_code) == (1, "SHEET_FORMAT")
+    assert all(f"people.csv, row {n}" in done.err for n in (2, 3, 4))
+
+
 def test_all_errors_of_all_rows_at_once(tables, recordings):
     """Wrong, empty, too long, out of range, of another language, twice, contradicting, of one row and of several."""
     long = [letter * n for letter, n in (("P", 33), ("v", 65), ("f", 33), ("a", 33), ("x", 33), ("y", 33))]

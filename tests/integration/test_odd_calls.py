@@ -249,6 +249,11 @@ def test_a_full_disk_is_named(monkeypatch, folder, tmp_path):
     assert "No space left" in done.err
 
 
+@pytest.mark.parametrize("words", [("synth", "--out"), ("models", "add"), ("fit", "x.npz", "--out", "o", "--params")])
+def test_a_name_too_long_is_wrong_usage(words):
+    check(pbl(*words, "a" * 5000), "USAGE")
+
+
 def test_an_interrupt_is_no_error(monkeypatch, folder, tmp_path):
     monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(KeyboardInterrupt()))
     done = pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")

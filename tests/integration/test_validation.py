@@ -178,7 +178,7 @@ def test_a_video_by_number_path_copy_or_name(tables: None, tmp_path: Path):
     shutil.copy(path, copy)
     for about in (number, str(number), path, copy, path.name):
         assert find_video(about) == number
-    for unknown in (number + 1, "nobody.mp4"):
+    for unknown in (number + 1, "nobody.mp4", "9" * 250):
         with pytest.raises(PblError, match="DB_NOT_FOUND"):
             find_video(unknown)
     other = tmp_path / "other"

@@ -16,7 +16,7 @@ import pbl_pipeline
 import pbl_pipeline.fit
 from pbl_pipeline.kinetics import REASONS
 from pbl_pipeline.words import check_words
-from schemas import study
+from schemas import session, study
 from schemas.intake.records import set_condition
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
@@ -118,6 +118,18 @@ NAMES = (
     r"Schwartz et al\. 2008|"
     r"csv|pre|baseline|\d+_\w+|Worker|Video_ID|WebGL|[A-Z]\w+[a-z][A-Z]\w+|Tracking|Keypoints|VIDEO_SCREEN|--[\w-]+"
 )
+
+
+@pytest.mark.parametrize("page", ["", "/letter"])
+def test_a_visit_without_walking_says_so_once_and_shows_its_task(clinic: None, page: str):
+    number = (session.Session & {"subject": "P002"}).fetch1("session_id")
+    shown = web.client().get(f"/visits/{number}{page}").text
+    assert shown.count("no recording of walking at the pace self-selected (there are: sit to stand)") <= 4
+    assert "Stride time" not in shown
+    assert "typically developing" not in shown
+    assert shown.count("these times are shorter than those of a stopwatch") == 1
+    walked = web.client().get(f"/visits/1{page}").text
+    assert "Stride time" in walked
 
 
 @pytest.mark.parametrize(

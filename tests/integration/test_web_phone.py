@@ -346,7 +346,8 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
 @pytest.mark.parametrize(
     "text",
     ["activity,view\nwalking,above\n", "view\nleft\n", "activity\n"]
-    + [f"activity,passes\nwalking,{n}\n" for n in ("0", "1.5", "x")],
+    + [f"activity,passes\nwalking,{n}\n" for n in ("0", "1.5", "x")]
+    + ["activity\n" + "walking\n" * 101],
 )
 def test_a_protocol_that_cannot_be_is_refused(text: str, tmp_path: Path):
     (tmp_path / "p.csv").write_text(text)
@@ -489,6 +490,23 @@ def test_a_visit_that_was_removed_meanwhile_is_not_made_again(visit: int, tmp_pa
     with pytest.raises(Exception, match="DB_NOT_FOUND"):  # between the two
         phone_uploads.register(owner, sent, phone_uploads.put_together(owner, sent))
     assert len(session.Session()) == len(video.Video()) == 0
+
+
+def test_a_part_that_was_on_its_way_while_the_person_was_forgotten_is_not_kept(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    browser, whole = phone(visit), film(tmp_path)
+    told = begin(browser, whole)
+    keep = phone_uploads.keep_part
+
+    def forgotten_first(*args: Any) -> None:
+        (session.Session & {"session_id": visit}).delete(prompt=False)
+        keep(*args)
+
+    monkeypatch.setattr(phone_uploads, "keep_part", forgotten_first)
+    answer = put(browser, told["number"], 0, parts_of(whole)[0], len(whole))
+    assert (answer.status_code, code(answer)) == (404, "DB_NOT_FOUND")
+    assert not [p for p in (tmp_path / "archive").rglob("*") if "P001" in p.parts]
 
 
 def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

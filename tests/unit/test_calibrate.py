@@ -212,3 +212,9 @@ def test_boards_that_cannot_be():
         with pytest.raises(PblError) as error:
             Board(**{"kind": "checkerboard", "squares": (9, 6), "square_mm": 30.0, **bad})
         assert error.value.code == "USAGE", bad
+
+
+@pytest.mark.parametrize("squares", ["9x" + "6" * 5000, "9", "9x6x5", "-9x6"])
+def test_squares_that_are_no_numbers_are_wrong_usage(squares, tmp_path):
+    done = pbl("calibrate", "a.mov", "--board", "charuco", "--squares", squares, "--square-mm", "30", "--out", tmp_path)
+    assert (done.code, "INTERNAL" in done.err) == (2, False)

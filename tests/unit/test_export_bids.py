@@ -106,6 +106,18 @@ def test_channels_hold_the_fit_and_its_standard_deviations(dataset: Path, fit: T
     assert about["SamplingFrequency"] == pytest.approx(1.0 / np.median(np.diff(fit.time_s)), abs=1e-5)
 
 
+def test_a_number_that_no_table_shows_exactly_leaves_missing_ones_missing(visit: Visit, tmp_path: Path):
+    (walk,) = visit.recordings[:1]
+    assert walk.fit is not None
+    far = walk.fit.markers_world_m.copy()
+    far[:, 0, 0], far[2, 0, 1] = 1e12, np.nan
+    fit = dataclasses.replace(walk.fit, markers_world_m=far)
+    one = Visit((dataclasses.replace(walk, load_fit=lambda: fit),), measures=visit.measures)
+    write_export(one, ["bids"], tmp_path, ExportOptions())
+    (path,) = tmp_path.rglob("*_motion.tsv")
+    assert "1000000000000.000000\tn/a\t" in path.read_text().splitlines()[2]
+
+
 def test_events_are_those_of_the_gait(dataset: Path, visit: Visit):
     path = dataset / "sub-P002/ses-20260301/motion/sub-P002_ses-20260301_task-walking_run-1_events.tsv"
     found = pd.read_csv(path, sep="\t")
@@ -115,6 +127,32 @@ def test_events_are_those_of_the_gait(dataset: Path, visit: Visit):
     assert len(events) > 4
     np.testing.assert_allclose(found["onset"], [e.time_s for e in events], atol=1e-6)
     assert found["trial_type"].tolist() == [f"{e.side}_{e.event}" for e in events]
+
+
+def test_what_a_lab_added_to_the_data_set_stays(visit: Visit, tmp_path: Path):
+    root = tmp_path / "bids"
+    root.mkdir()
+    own = "participant_id\tage\tsex\nsub-P003\t71\tF\n"
+    (root / "participants.tsv").write_text(own)
+    (root / "README.md").write_text("A walk a day.\n")
+    (root / "dataset_description.json").write_text('{"Name": "Walks", "BIDSVersion": "1.10.0", "Authors": ["A"]}')
+    for label in ("1", "2"):
+        write_export(visit, ["bids"], tmp_path / label, ExportOptions(bids=(root, Labels("P001", label))))
+    assert (root / "participants.tsv").read_text() == own.replace("sub-P003", "sub-P001\tn/a\tn/a\nsub-P003")
+    assert (root / "README.md").read_text() == "A walk a day.\n"
+    assert json.loads((root / "dataset_description.json").read_text())["Authors"] == ["A"]
+
+
+@pytest.mark.parametrize(
+    "table", ["participant_id\tage\n".encode("utf-16"), b"name\n1\n", b"participant_id\nsub-\xff\n"]
+)
+def test_a_table_of_participants_that_cannot_be_read_is_left(visit: Visit, tmp_path: Path, table: bytes):
+    (tmp_path / "bids").mkdir()
+    (tmp_path / "bids/participants.tsv").write_bytes(table)
+    with pytest.raises(PblError, match=r"^EXPORT_INPUT: "):
+        write_export(visit, ["bids"], tmp_path, ExportOptions(overwrite=True))
+    assert (tmp_path / "bids/participants.tsv").read_bytes() == table
+    assert not list((tmp_path / "bids").rglob("*_motion.tsv"))
 
 
 def test_a_visit_of_its_own_is_in_the_folder_bids(visit: Visit, tmp_path: Path):

@@ -35,10 +35,11 @@ from starlette.responses import RedirectResponse, Response
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import one_process
+from pbl_pipeline.names import whole_number
 from schemas.operations.folders import private_folder, write_json
 
 from .access import HOURS, RIGHTS, Cookie, Sessions, form_of, read_form
-from .address import OPEN, Address, whole_number
+from .address import OPEN, Address
 from .connections import customer
 from .pages import Pages
 

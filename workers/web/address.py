@@ -10,6 +10,8 @@ from starlette.requests import Request
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
+from pbl_pipeline.names import whole_number
+
 from .access import Refused, Session
 
 if TYPE_CHECKING:
@@ -22,7 +24,6 @@ FILM = "film"
 #: Ending of the address of a page as JSON.
 JSON = ".json"
 _OWN = re.compile(r"/(visits|recordings)(/[0-9]{1,9}(/enter)?)?|/operate")
-_NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 class Address(Route):
@@ -70,11 +71,6 @@ def page(path: str, answer: Callable[..., Any], right: str, *, look: str = "") -
 def number_of(request: Request) -> int:
     (number,) = request.path_params.values()
     return number
-
-
-def whole_number(text: str) -> int | None:
-    """Return the number that a form or query names, None if it is not in its shortest form or has over nine digits."""
-    return int(text) if _NUMBER.fullmatch(text) else None
 
 
 def own_address(text: str) -> str:

@@ -16,11 +16,12 @@ from starlette.responses import Response
 from pbl_pipeline import charts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
 from . import texts
-from .address import Address, interval, page, whole_number
+from .address import Address, interval, page
 from .pages import Pages, as_json, plain, reader_language
 from .source import Videos
 from .tables import Tables

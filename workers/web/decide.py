@@ -12,13 +12,14 @@ from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.temporary import new_folder
 from schemas import reading, video
 from schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit, queue_visit_of
 from .access import Refused, form_of, sender
-from .address import Address, number_of, whole_number
+from .address import Address, number_of
 from .pages import Pages
 from .tables import Tables
 

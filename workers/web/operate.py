@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from pbl_pipeline.bounded import parse_json
+from pbl_pipeline.names import whole_number
 from schemas import fit
 from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
@@ -21,7 +22,7 @@ from schemas.transactions import in_transaction
 from ..requeue import retry
 from ..summary import disks
 from .access import Refused, form_of, sender
-from .address import Address, whole_number
+from .address import Address
 from .pages import Pages
 from .tables import Tables
 

@@ -19,6 +19,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
 from schemas.capture import UPLOADING
 from schemas.intake import phone_recordings
 from schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
@@ -29,7 +30,7 @@ from .. import phone_uploads
 from ..process_queue import ProcessQueue
 from . import certificates, texts
 from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
-from .address import FILM, OPEN, Address, number_of, whole_number
+from .address import FILM, OPEN, Address, number_of
 from .computing import Target
 from .computing import begin as compute
 from .pages import Pages, reader_language
@@ -157,6 +158,11 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
             raise phone_recordings.upload_refused("a part of another length than it states")
         sha256 = request.headers.get("x-sha256", "")
         await _on_disk(phone_uploads.keep_part, request.state.phone, sent, number, body, sha256)
+        try:
+            await recording(request)
+        except PblError as error:
+            await removed(request, sent, error)
+            raise
         return Response(status_code=204)
 
     async def finish(request: Request) -> Response:
@@ -170,6 +176,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
                     await tables.ask(phone_uploads.register, phone, sent, copies)
                 except PblError as error:
                     if not error.code.startswith(("VIDEO_", "PHONE_LOG")):
+                        await removed(request, sent, error)
                         raise
                     await tables.ask(phone_recordings.refused, sent.number, error)
                     await asyncio.to_thread(phone_uploads.discard, phone, sent)
@@ -180,6 +187,11 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def recording(request: Request) -> Sent:
         return await tables.ask(phone_recordings.recording, request.state.phone, number_of(request))
+
+    async def removed(request: Request, sent: Sent, error: PblError) -> None:
+        """Remove the parts of a recording whose visit was removed while they came."""
+        if error.code == "DB_NOT_FOUND":
+            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
 
     async def told(request: Request, sent: Sent) -> Response:
         missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)

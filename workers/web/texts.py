@@ -19,6 +19,8 @@ _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
 _LEAST = 12
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
+#: Between the words of a list.
+_LIST = re.compile(r"(, |; )")
 _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 #: A command or its option, and one in brackets behind what it does.
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
@@ -45,11 +47,14 @@ def library_words(language: str, english: str) -> str:
 
 @functools.lru_cache(4096)
 def _library_words(language: str, english: str) -> str | None:
-    if language == "en" or english in CODES:
+    if english in CODES:
         return english
     own = catalogue().get(f"library.{english}", {}).get(language)
     if own is not None:
         return own
+    if language == "en":
+        found = ((pattern.fullmatch(english), said) for pattern, said in _patterns(language))
+        return next((_filled(language, match, said) for match, said in found if match), english)
     for joint in (": ", "; "):
         for at in (m.start() for m in re.finditer(joint, english)):
             first, rest = english[:at], _library_words(language, english[at + len(joint) :])
@@ -63,7 +68,7 @@ def _library_words(language: str, english: str) -> str | None:
         if (match := pattern.fullmatch(english)) is None:
             continue
         places = match.groupdict()
-        made = own.format(**{k: library_words(language, v) for k, v in places.items()})
+        made = _filled(language, match, own)
         # A place that is neither known nor a single word may be a wrong division of the text: another pattern may fit.
         if all(" " not in v or _library_words(language, v) is not None for v in places.values()):
             return made
@@ -73,10 +78,24 @@ def _library_words(language: str, english: str) -> str | None:
     return decimals(language, english) if _NUMBER.fullmatch(english) else None
 
 
+def _filled(language: str, places: re.Match[str], own: str) -> str:
+    """Return a text with its places filled in; in a list whose words are all known, each is in the language."""
+    filled = {}
+    for name, value in places.groupdict().items():
+        parts = _LIST.split(value)
+        words = [_library_words(language, part) for part in parts[::2]]
+        filled[name] = library_words(language, value)
+        if filled[name] == value and None not in words:
+            parts[::2] = words
+            filled[name] = "".join(map(str, parts))
+    return own.format(**filled)
+
+
 @functools.cache
 def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
     """The library's texts with places, those with most words of their own first."""
-    names = (n.removeprefix("library.") for n in catalogue() if n.startswith("library.") and "{" in n)
+    texts = catalogue().items()
+    names = (n.removeprefix("library.") for n, said in texts if "library." in n[:8] and "{" in n and language in said)
     of_words = sorted(names, key=lambda n: -len(re.sub(r"\{\w+\}", "", n)))
     made = [(re.sub(r"\\\{(\w+)\\\}", r"(?P<\1>.+?)", re.escape(n)), n) for n in of_words]
     return tuple((re.compile(p, re.DOTALL), catalogue()[f"library.{n}"][language]) for p, n in made)

@@ -25,6 +25,7 @@ from pbl_pipeline.gait import (
     normal_bands,
 )
 from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.names import whole_number
 from pbl_pipeline.report.curves import CycleCurve, Ranges, cycle_curves
 from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
@@ -34,7 +35,7 @@ from schemas.reading.shown import ShownVisit
 
 from . import texts
 from .access import Session, form_of
-from .address import Address, interval, number_of, page, shown_of, whole_number
+from .address import Address, interval, number_of, page, shown_of
 from .computing import told as told_of
 from .pages import Pages, as_json, plain, reader_language
 from .phone import verdict
