@@ -23,7 +23,7 @@ CODES: dict[str, str] = {
     "VIDEO_SCREEN": "the video is the recording of a screen, or a copy with borders around the picture",
     "VIDEO_UPSIDE_DOWN": "the people in the video are upside down",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
-    "VIDEO_DUPLICATE": "the same bytes are registered for another person",
+    "VIDEO_DUPLICATE": "the same bytes are registered for another person, or, from a phone, in another visit",
     "UPLOAD_REFUSED": "what was uploaded is not a recording that may be taken over",
     "PHONE_LINK": "a link for filming is unknown, ended, or belongs to another phone",
     "TRACK_NO_PERSON": "no person was found in the video",

@@ -122,7 +122,7 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     """Register a recording that was put together, have it computed first, and remove its parts; return its video_id.
 
     Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND where the
-    visit is gone; what is wrong with the recording.
+    visit is gone; VIDEO_DUPLICATE where another visit has the recording; what is wrong with it.
     """
     stated = {name: sent.about[name] for name in ("activity", "pace") if name in sent.about}
     visit = VisitRecord(phone.subject, phone.label, **stated)
@@ -135,6 +135,14 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
                 next_step="the page tries again",
             )
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
+        if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
+            # Without whose: the phone is told, and has the right to its own visit alone.
+            raise PblError(
+                "VIDEO_DUPLICATE",
+                found="this recording is registered in another visit",
+                expected="a recording of this visit",
+                next_step="film again; who runs the server can find and move it (`pbl move`)",
+            )
         result = take_in(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
     phone_recordings.received(sent.number, result.video_id)

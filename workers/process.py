@@ -51,9 +51,9 @@ SELFTEST_FAILED = 3
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
-    time limits of the tables. gpus: dealt to the processes in turn, one to each. phones: one process more takes only
-    recordings of phones, and has precedence on the cores. Of one process: short: takes no job of a long recording;
-    phone: is that process."""
+    time limits of the tables. gpus: dealt to the processes in turn, one to each; where all stages are served, one
+    process for each GPU fits, and the others do the rest. phones: one process more takes only recordings of phones, and
+    has precedence on the cores. Of one process: short: takes no job of a long recording; phone: is that process."""
 
     resource: str = "all"
     processes: int = 1
@@ -74,16 +74,19 @@ class Options:
         return self.processes + self.phones
 
     def of_process(self, number: int) -> Options:
-        """The options of one of the processes: its GPU, and how many processes share that; the first of several is for
+        """The options of one of the processes: its GPU, and how many processes share that; the last of several is for
         short recordings, so that long ones never hold them all. The one for phones uses no GPU: its memory is for the
         others."""
         if number == self.processes:
             return dataclasses.replace(self, phone=True, processes=1, batch=1, gpus=(), max_jobs=None)
-        one = dataclasses.replace(self, short=number == 0 and self.processes > 1)
+        one = dataclasses.replace(self, short=0 < number == self.processes - 1)
         if not self.gpus:
             return one
         n = len(self.gpus)
-        return dataclasses.replace(one, gpus=(self.gpus[number % n],), processes=math.ceil(self.processes / n))
+        # A fit takes gigabytes of a GPU, and one process fits more sessions than many can detect.
+        resource = "cpu" if self.resource == "all" and number >= n else self.resource
+        gpus, sharing = (self.gpus[number % n],), math.ceil(self.processes / n)
+        return dataclasses.replace(one, resource=resource, gpus=gpus, processes=sharing)
 
 
 def work(options: Options, pipe: Connection) -> None:

@@ -208,6 +208,18 @@ def test_the_same_recording_twice_arrives_once(visit: int, tmp_path: Path):
     assert len(video.Video()) == len(PhoneRecording()) == 1
 
 
+@pytest.mark.parametrize("subject", ["P001", "P002"])
+def test_the_recording_of_another_visit_is_refused_without_saying_whose(visit: int, tmp_path: Path, subject: str):
+    whole = film(tmp_path)
+    assert send(phone(visit), whole)["state"] == "received"
+    told = send(phone(new_visit("2026-02-01", subject)), whole)
+    assert told["state"] == "refused"
+    assert told["error"].startswith("VIDEO_DUPLICATE")
+    assert "P001" not in told["error"]
+    assert "2026-01" not in told["error"]
+    assert video.Video().fetch1("session_id") == visit
+
+
 def test_two_phones_at_one_visit_are_both_kept_and_the_page_says_so(visit: int, tmp_path: Path):
     for name in ("walk", "other"):
         assert send(phone(visit), film(tmp_path, name))["state"] == "received"

@@ -111,6 +111,22 @@ def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatc
     assert pbl("worker", "--processes", "many").code == 2
 
 
+def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch):
+    """A process for each core, of which one for each GPU fits; for the fit alone one for each GPU."""
+    groups(tmp_path, monkeypatch, "0::/", {})
+    monkeypatch.setattr("schemas.activate", lambda **_: None)
+    monkeypatch.setattr("workers.process.given_gpus", lambda: ("0", "1"))
+    found: list[Options] = []
+    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+    for asked in ((), ("--resource", "gpu")):
+        assert pbl("worker", "--processes", "auto", *asked).code == 0
+    whole, fit = found
+    each = [whole.of_process(n) for n in range(whole.processes)]
+    assert [(o.resource, o.gpus) for o in each] == [("all" if n < 2 else "cpu", (str(n % 2),)) for n in range(16)]
+    assert {o.processes for o in each} == {8}
+    assert [fit.of_process(n).resource for n in range(fit.processes)] == ["gpu", "gpu"]
+
+
 def test_the_numerical_library_keeps_to_its_share():
     """XLA makes a thread for each core it may use; with a share of one core it makes one."""
     program = (

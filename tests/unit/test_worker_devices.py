@@ -49,8 +49,8 @@ def test_processes_are_dealt_to_the_gpus_evenly():
     assert {options.of_process(i).processes for i in range(5)} == {3}  # that share a device, at most
     alone = Options(processes=2, gpus=("a", "b")).of_process(1)
     assert (alone.gpus, alone.processes) == (("b",), 1)
-    assert Options(processes=2).of_process(1) == Options(processes=2)
-    assert [options.of_process(i).short for i in range(5)] == [True, *[False] * 4]
+    assert Options(processes=2).of_process(0) == Options(processes=2)
+    assert [options.of_process(i).short for i in range(5)] == [*[False] * 4, True]
     phone = Options(processes=2, gpus=("a", "b"), batch=128, max_jobs=9, phones=True).of_process(2)
     assert phone == Options(phones=True, phone=True)  # no GPU, all cores, one session at a time, for as long as others
 

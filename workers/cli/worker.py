@@ -8,9 +8,9 @@ import click
 
 from workers.registry import DETECTOR, FIT, GROUPS
 
-#: Share of a process of `--processes auto`: more cores bring one recording little, and its memory is what a long
-#: recording takes (bytes).
-CORES_EACH, MEMORY_EACH = 2, 4 * 2**30
+#: Share of a process of `--processes auto`: more cores bring one recording little, fewer suffice where a GPU computes
+#: the networks, and the memory is what a long recording takes (bytes).
+CORES_EACH, CORES_WITH_GPU, MEMORY_EACH = 2, 1, 4 * 2**30
 
 
 class Processes(click.ParamType):
@@ -34,7 +34,8 @@ class Processes(click.ParamType):
 @click.option(
     "--processes", type=Processes(),
     help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (2 cores and "
-    "4 GB each; with GPUs one for each). Default: one for each GPU where the fit is served, else 1.",
+    "4 GB each; 1 core with a GPU; of the fit alone one for each GPU). Default: one for each GPU where the fit is "
+    "served, else 1.",
 )  # fmt: skip
 @click.option(
     "--batch",
@@ -92,7 +93,8 @@ def worker(
     to_stderr()
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
-        processes = len(gpus) or max(1, min(cores() // CORES_EACH, memory_bytes() // MEMORY_EACH))
+        room = min(cores() // (CORES_WITH_GPU if gpus else CORES_EACH), memory_bytes() // MEMORY_EACH)
+        processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
     options = Options(
         resource=resource,
         processes=int(processes or len(gpus) or 1),
