@@ -68,7 +68,7 @@ def bids_files(
     origins
         By the name of a trial, how it was made (`provenance.origin_of`).
     root
-        Folder of the data set. What it says of itself and of its participants already is kept.
+        Folder of the data set. Its README, description and participants are kept where they are there already.
     """
     out = {name: data for name, data in _of_data_set().items() if not (root / name).exists()}
     out[_PARTICIPANTS] = _with_participant(root / _PARTICIPANTS, f"sub-{labels.participant}")

@@ -129,7 +129,7 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
 
 
 def _separate(found: Found, slots: list[int]) -> dict[int, Found]:
-    """What each problem found; empties `slots`, the numbers of the problems in these lanes."""
+    """The result of each problem; empties `slots`, the numbers of the problems in these lanes."""
     parts = found.end, found.x, found.variance, found.outcome
     out = {i: Found(*jax.tree.map(lambda a, k=k: a[k], parts)) for k, i in enumerate(slots)}
     slots.clear()

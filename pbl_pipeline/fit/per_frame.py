@@ -112,7 +112,7 @@ def _with_detector(start: State, params: GaussNewtonParams) -> State:
 
 
 def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """`fit_one` with a bar that moves with each iteration; all at once where nobody looks at it."""
+    """`fit_one` with a bar that moves with each iteration; all at once where no bar is shown."""
     if not progress.enabled():
         return fit_one(body, p, w, begin, limits)
     most, at = int(limits.iterations), begin

@@ -1,7 +1,7 @@
 """Where the process that owns the GPU for detection listens, and how it is started: by whoever first needs it.
 
-It ends by itself when no one has been connected for a while. Many processes that decode share one GPU, so it is a
-process of its own.
+It ends by itself when no one has been connected for a while. Many processes that decode share one GPU, so it is
+separate from them.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ LONGEST_STEP = 0.5
 #: Damping of the first step, the least at all and after a step that was refused (less changes no step), and the most.
 DAMPING_START, DAMPING_LEAST, DAMPING_REFUSED, DAMPING_MOST = 1e-2, 1e-7, 1e-3, 1e7
 #: Where no unknown of a frame moves further than `NEAR`, the step is as many Gauss-Newton steps long as a secant says,
-#: within these bounds: weak directions creep, or swing to and fro, by a fixed share of what is left.
+#: within these bounds: weak directions creep, or swing to and fro, by a fixed share of the remaining way.
 NEAR, SHORTEST, LONGEST = 0.2, 0.4, 2.5
 #: Space for the cost of each iteration: the bound on their number.
 MOST_ITERATIONS = 200
