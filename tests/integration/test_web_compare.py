@@ -6,6 +6,7 @@ import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register
 from workers.populate import populate
-from workers.web.compare import charts_of
+from workers.web.compare import charts_of, without
 
 #: What the legs' angles of the second visit are of those of the first.
 LESS = 0.8
@@ -182,6 +183,20 @@ def test_measures_say_that_their_interval_is_the_spread_of_cycles(visits: None):
         > 10
     )
     assert page.count(": not comparable: its error is not known") == len(found.changes) > 0
+
+
+def test_measures_that_no_visit_has_are_named_once_by_their_reason():
+    def side(**measures: tuple[object, str]) -> SimpleNamespace:
+        return SimpleNamespace(about=SimpleNamespace(measures=measures))
+
+    task, known = "no trial of walking", (1.0, "")
+    found = SimpleNamespace(
+        compared=[
+            side(cadence_steps_per_min=(None, task), step_time_s=(None, task), stance_percent=known),
+            side(cadence_steps_per_min=(None, task), step_time_s=(None, "one step"), stance_percent=(None, task)),
+        ]
+    )
+    assert without(found) == {(task,): ["cadence_steps_per_min"], (task, "one step"): ["step_time_s"]}  # pyright: ignore[reportArgumentType]
 
 
 def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits: None):

@@ -64,7 +64,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             found=found,
             names=names,
             keys=[charts.series_key(i) for i in range(len(names))],
-            measures=[n for n in MEASURES if any(n in c.about.measures for c in found.compared)],
+            measures=[n for n in MEASURES if any(_known(c, n) for c in found.compared)],
+            without=without(found),
             of_cycles=[n for n in MEASURES if any(_interval(c, n) is not None for c in found.compared)],
             charts=charts_of(found, names, reader_language(request)),
             plot=charts.CYCLE_PLOT,
@@ -123,6 +124,20 @@ def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
     """The interval of a measure if it is that of the spread of its cycles alone; None where it has none."""
     value, _ = one.about.measures.get(name, (None, ""))
     return None if value is None or value.error_sd is not None else value.interval
+
+
+def _known(one: comparison.Side, name: str) -> bool:
+    return one.about.measures.get(name, (None, ""))[0] is not None
+
+
+def without(found: comparison.Comparison) -> dict[tuple[str, ...], list[str]]:
+    """The measures that no result has, by the reasons that the results give."""
+    out: dict[tuple[str, ...], list[str]] = {}
+    for name in MEASURES:
+        reasons = dict.fromkeys(c.about.measures[name][1] for c in found.compared if name in c.about.measures)
+        if any(reasons) and not any(_known(c, name) for c in found.compared):
+            out.setdefault(tuple(filter(None, reasons)), []).append(name)
+    return out
 
 
 def _name(one: comparison.Side) -> str:
