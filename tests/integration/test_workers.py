@@ -238,12 +238,12 @@ def test_a_long_recording_waits_behind_the_short_ones_of_its_kind(of_lengths: di
 
 
 def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[str, int]):
-    first, second = (Options(processes=2).of_process(number) for number in (0, 1))
+    first, last = (Options(processes=2).of_process(number) for number in (0, 1))
     taken: list[queue.Claim] = []
-    work(report=lambda job, _: taken.append(job), takes=takes(first.short, phones=False, phone=False))
+    work(report=lambda job, _: taken.append(job), takes=takes(last.short, phones=False, phone=False))
     assert order_of("Tracking", taken) == [of_lengths[name] for name in ("filmed", "walk", "again")]
     assert jobs_left() == {"Tracking": {"pending": 2}}
-    work(takes=takes(second.short, phones=False, phone=False))
+    work(takes=takes(first.short, phones=False, phone=False))
     assert jobs_left() == {}
     assert not Options(processes=1).of_process(0).short  # it does everything
 
