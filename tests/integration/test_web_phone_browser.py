@@ -195,6 +195,22 @@ def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     assert (before - start_ms) / 1000 - 0.01 <= moved <= (after - start_ms) / 1000 + 0.01
 
 
+@pytest.mark.long
+def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: int):
+    """30 frames a second for 10 s: at most one of a hundred, on two idle cores."""
+    camera = with_camera(chromium, tmp_path / "camera.mjpeg", numbered_frames(60, 1080, 1920))
+    with camera as browser, filming(browser, visit) as page:
+        film(page, 10.0)
+        page.locator(".keep").click()
+        arrived(page)
+    about = PhoneRecording().fetch1("phone_about")
+    about = about if isinstance(about, dict) else json.loads(about)
+    assert about["frames"] > 285, about
+    assert about["dropped"] <= 0.01 * about["frames"], about
+    info = probe((video.Video & {"session_id": visit}).fetch1("video_path"))
+    assert (info.width_px, info.height_px, info.n_frames) == (1920, 1080, about["frames"])
+
+
 def test_reloads_in_the_middle_of_an_upload(camera: Any, visit: int):
     with filming(camera, visit, torn=True) as page:
         film(page)
