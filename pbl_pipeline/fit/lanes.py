@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -71,8 +70,8 @@ def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F
     diagonal), and the outcome."""
     system = latest.system
     own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
-    # What nothing holds gets a variance that is large, not infinite: each joint on its own scale, so that the pelvis'
-    # curvature does not make the toes look sure.
+    # An unknown that no residual holds gets a variance that is large, not infinite: each joint on its own scale, so
+    # that the pelvis' curvature does not make the toes look sure.
     held = system.diagonal + jnp.diag(1e-6 * jnp.max(own, axis=0))
     corner = system.corner + 1e-6 * jnp.max(jnp.diagonal(system.corner)) * jnp.eye(system.corner.shape[0])
     variance, _ = marginal_variance(dataclasses.replace(system, diagonal=held, corner=corner))
@@ -98,13 +97,20 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
     The result does not depend on which problems are given together beyond rounding.
     """
     n = min(LANES, power_of_2(len(given)), max(1, MOST_FRAMES // given[0][0].weight.shape[0]))
-    waiting = deque(range(len(given)))
-    holds = [waiting.popleft() if waiting else None for _ in range(n)]
+    waiting = iter(range(len(given)))
+    holds = [next(waiting, None) for _ in range(n)]
     # Stacked on the host, so that each array goes to the device once; the last one stands in for those missing.
     p, start = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *[given[-1 if i is None else i] for i in holds]))
     lanes = p, _begin(body, p, w, start)
-    ended, slots = jax.tree.map(jnp.zeros_like, lanes), list[int]()
+    ended, slots = jax.tree.map(jnp.zeros_like, lanes), list[int]()  # which problem each slot of `ended` holds
     found: dict[int, Found] = {}
+
+    def take_ended() -> None:
+        several = fetch(*ended, last=last, several=True)
+        parts = several.end, several.x, several.variance, several.outcome
+        found.update({i: Found(*jax.tree.map(lambda a, k=k: a[k], parts)) for k, i in enumerate(slots)})
+        slots.clear()
+
     most = min(int(limits.iterations), MOST_ITERATIONS)
     while any(i is not None for i in holds):
         lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits)
@@ -114,26 +120,18 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
                 continue
             ended = _move(ended, lanes, len(slots), lane)
             slots.append(i)
-            holds[lane] = waiting.popleft() if waiting else None
-            if holds[lane] is not None:
-                lanes = _put(body, w, lanes, given[holds[lane]], lane)
+            holds[lane] = following = next(waiting, None)
+            if following is not None:
+                lanes = _put(body, w, lanes, given[following], lane)
             if len(slots) == n:
-                found |= _separate(fetch(ended[0], ended[1], last, several=True), slots)
+                take_ended()
         busy = [lane for lane, i in enumerate(holds) if i is not None]
-        if not waiting and 0 < len(busy) <= FEW < len(holds):
+        if 0 < len(busy) <= FEW < len(holds):  # a lane is empty only where none waits
             at = (busy * FEW)[:FEW]
             lanes, holds = _some(lanes, np.asarray(at)), [holds[i] for i in busy] + [None] * (FEW - len(busy))
     if slots:
-        found |= _separate(fetch(ended[0], ended[1], last, several=True), slots)
+        take_ended()
     return [found[i] for i in range(len(given))]
-
-
-def _separate(found: Found, slots: list[int]) -> dict[int, Found]:
-    """The result of each problem; empties `slots`, the numbers of the problems in these lanes."""
-    parts = found.end, found.x, found.variance, found.outcome
-    out = {i: Found(*jax.tree.map(lambda a, k=k: a[k], parts)) for k, i in enumerate(slots)}
-    slots.clear()
-    return out
 
 
 @functools.partial(jax.jit, static_argnames="body")

@@ -171,8 +171,8 @@ def _convolution(options: Any, depthwise: bool) -> Callable[..., Any]:
 
     def compute(x: Array, w: Array, bias: Array) -> Array:
         reach = [(n - 1) * d for n, d in zip(w.shape[1:3], dilation, strict=True)]
-        if options.padding == _SAME:
-            x = jnp.pad(x, [(0, 0), *lax.padtype_to_pads(x.shape[1:3], [r + 1 for r in reach], stride, "SAME"), (0, 0)])
+        around = lax.padtype_to_pads(x.shape[1:3], [r + 1 for r in reach], stride, _padding(options))
+        x = jnp.pad(x, [(0, 0), *around, (0, 0)])
         last = [n - r for n, r in zip(x.shape[1:3], reach, strict=True)]
         places = itertools.product(*(range(0, r + 1, d) for r, d in zip(reach, dilation, strict=True)))
         parts = [x[:, i : i + last[0] : stride[0], j : j + last[1] : stride[1]] for i, j in places]

@@ -269,17 +269,17 @@ def _save_files(paths: list[str], folder: Path) -> int:
         for path in paths:
             target = folder / "store" / safe_path(path)
             target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                store.get_file(path, target)
-                listing.write(f"{sha256_of(target)}  {path}\n")
-                n_bytes += target.stat().st_size
-            except FileNotFoundError:
-                lost.append(path)
-            except OSError:
-                with unwritable(target):
+            with unwritable(target):
+                try:
+                    store.get_file(path, target)
+                    listing.write(f"{sha256_of(target)}  {path}\n")
+                    n_bytes += target.stat().st_size
+                except FileNotFoundError:
+                    lost.append(path)
+                except OSError:
                     raise
-            except Exception as error:
-                raise store_error(error) from error
+                except Exception as error:
+                    raise store_error(error) from error
             update(1)
     if lost:
         raise PblError(

@@ -149,6 +149,12 @@ def arrived(page: Any, n: int = 1) -> None:
     )
 
 
+def about_the_recording() -> dict[str, Any]:
+    """What the page said of the one recording."""
+    about = PhoneRecording().fetch1("phone_about")
+    return about if isinstance(about, dict) else json.loads(about)
+
+
 def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     with filming(camera, visit) as page:
         page.get_by_label("fast").check()
@@ -172,8 +178,7 @@ def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
             page.evaluate("(async () => (await Array.fromAsync((await navigator.storage.getDirectory()).keys())))()")
             == []
         )
-    sent = PhoneRecording().fetch1()
-    about = sent["phone_about"] if isinstance(sent["phone_about"], dict) else json.loads(sent["phone_about"])
+    about = about_the_recording()
     assert about["note"] == "first pass"
     assert about["sensor"] == "RelativeOrientationSensor"
     assert about["dropped"] <= 0.1 * about["frames"], about
@@ -203,8 +208,7 @@ def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: i
         film(page, 10.0)
         page.locator(".keep").click()
         arrived(page)
-    about = PhoneRecording().fetch1("phone_about")
-    about = about if isinstance(about, dict) else json.loads(about)
+    about = about_the_recording()
     assert about["frames"] > 285, about
     assert about["dropped"] <= 0.01 * about["frames"], about
     info = probe((video.Video & {"session_id": visit}).fetch1("video_path"))
