@@ -144,10 +144,10 @@ def _read_json(path: Path, text: str) -> PhoneLog:
     except ValueError as error:
         raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), key=path) from error
     if not isinstance(content, dict):
-        raise log_error("JSON that is no object", "an object with " + ", ".join(_COLUMNS), key=path)
+        raise log_error("JSON that is not an object", "an object with " + ", ".join(_COLUMNS), key=path)
     orientation = content.get("orientation", content)
     if not isinstance(orientation, dict):
-        raise log_error("an orientation that is no object", "an object with " + ", ".join(_COLUMNS), key=path)
+        raise log_error("an orientation that is not an object", "an object with " + ", ".join(_COLUMNS), key=path)
     _check_names(path, list(orientation))
     columns = _lists(path, orientation, _COLUMNS)
     sensors = {}

@@ -131,9 +131,7 @@ def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
     kept = np.concatenate([[True], np.diff(ns) != 0])
     n = int((~kept).sum())
     if n > _MOST_REPEATS * len(ns):
-        raise log_error(
-            f"{n} of {len(ns)} stamps repeat the one before", "a stamp of its own for each sample", key=path
-        )
+        raise log_error(f"{n} of {len(ns)} stamps repeat the one before", "a different stamp for each sample", key=path)
     notes = [f"{n} repeated rows were left out"] if n else []
     rows = [row for row, keep in zip(rows, kept, strict=True) if keep]
     return int(ns[0]), (ns[kept] - ns[0]) / 1e9, rows, notes

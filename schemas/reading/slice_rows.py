@@ -1,4 +1,4 @@
-"""What slices froze, by name: read by `visits` and by `studies.slices`, which itself reads visits."""
+"""Frozen slices by name, for `visits` and for `studies.slices`, which itself reads visits."""
 
 from __future__ import annotations
 
