@@ -306,11 +306,18 @@ def save_tracking(tracking: lib.Tracking, path: Path) -> None:
 
 
 def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> lib.Tracking:
-    """The library's `Tracking` from the npz that `save_tracking` wrote and the row's figures."""
+    """The `Tracking` from the npz that `save_tracking` wrote and the row's figures; ValueError for another file."""
     from pbl_pipeline import tracking as lib
 
     with np.load(path, allow_pickle=False) as f:
-        data = {k: f[k] for k in f.files}
+        data = {k: f[k] for k in ("time_s", "person_id", "box_px", "roi_px", "score", "observed")}
+    (t,), (n,) = data["time_s"].shape, data["person_id"].shape
+    shapes = {"box_px": (n, t, 4), "roi_px": (n, t, 4), "score": (n, t), "observed": (n, t)}
+    if any(
+        a.dtype.kind not in ("iu" if k == "person_id" else "biuf") or a.shape != shapes.get(k, a.shape)
+        for k, a in data.items()
+    ):
+        raise ValueError("arrays of other shapes or kinds")
     people = tuple(
         lib.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
         for i, p in enumerate(data["person_id"])

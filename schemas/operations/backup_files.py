@@ -141,8 +141,9 @@ def safe_path(path: str) -> PurePosixPath:
 
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
-    """Yield SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
-    for line in (folder / f"{part}.sha256").read_text(encoding="utf-8").splitlines():
+    """Yield SHA-256 and path of the files of a part of a backup, where bytes that are no text lie in none of its files.
+    Raises BACKUP_INVALID for a path that leaves it."""
+    for line in (folder / f"{part}.sha256").read_text(encoding="utf-8", errors="replace").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
 
