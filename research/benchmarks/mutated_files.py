@@ -663,9 +663,7 @@ def use_participants(path: Path) -> None:
 
 
 def method(path: Path) -> None:
-    path.write_text(
-        json.dumps({"stage": "tracking", "name": "of-a-lab", "base": "blazepose-tiles", "min_hits": 4})
-    )
+    path.write_text(json.dumps({"stage": "tracking", "name": "of-a-lab", "base": "blazepose-tiles", "min_hits": 4}))
 
 
 def use_method(path: Path) -> None:
