@@ -251,7 +251,7 @@ def file_of_visit(path: Path, again: str = _AGAIN) -> Iterator[None]:
     """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT. `again`: what writes the file."""
     try:
         yield
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",

@@ -70,6 +70,7 @@ def scaled(name: str, by: float) -> Callable[[dict[str, Any]], object]:
         ("walk.truth.npz", put(pelvis_m=np.zeros((90, 2))), "FILE_FORMAT"),
         ("walk.truth.npz", put(outlier=np.asarray(1)), "FILE_FORMAT"),
         ("walk.truth.npz", put(spec=np.asarray('{"a":' * 5000)), "FILE_FORMAT"),
+        ("walk.kinetics.npz", put(cycle_no=np.array([np.inf])), "FILE_FORMAT"),
         ("tracking.npz", put(person_id=np.array([0.0, np.inf])), "FILE_FORMAT"),
         ("tracking.npz", put(box_px=np.zeros(4)), "FILE_FORMAT"),
         ("walk.reference.npz", put(source=np.asarray("\x1b[2J")), "FILE_FORMAT"),
