@@ -173,7 +173,9 @@ def write_template(path: Path, columns: Sequence[str]) -> None:
             book.worksheets[0].append(list(columns))
             book.save(out)
         else:
-            out.write((",".join(columns) + "\n").encode())
+            line = io.StringIO()
+            csv.writer(line, lineterminator="\n").writerow(columns)
+            out.write(line.getvalue().encode())
 
 
 def _csv(path: Path) -> list[list[str]]:
