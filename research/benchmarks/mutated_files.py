@@ -531,7 +531,7 @@ def use_forgotten(path: Path) -> None:
         place = settings.home_dir() / "forgotten" / "P001.json"
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(path.read_bytes())
-        {**forget.read_manifest("P001")}
+        forget.read_manifest("P001")
 
 
 def settings_at(folder: Path) -> Any:
@@ -761,7 +761,7 @@ def form(path: Path) -> None:
 
 
 def use_form(path: Path) -> None:
-    """As the page reads it while it arrives; refused forms are no unforeseen error."""
+    """As the page reads it while it arrives; a form that it refuses has the code USAGE here."""
     import asyncio
 
     from starlette.requests import Request

@@ -142,7 +142,7 @@ def safe_path(path: str) -> PurePosixPath:
 
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
-    """Yield SHA-256 and path of the files of a part of a backup, where bytes that are no text lie in none of its files.
+    """Yield SHA-256 and path of the files of a part of a backup. A path that is not UTF-8 names a file that is missing.
     Raises BACKUP_INVALID for a path that leaves it."""
     for line in (folder / f"{part}.sha256").read_text(encoding="utf-8", errors="replace").splitlines():
         sha, _, path = line.partition("  ")

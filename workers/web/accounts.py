@@ -49,7 +49,7 @@ LOG_N, R, P = 17, 8, 1
 #: Fewest and most characters of a password (NIST SP 800-63B asks for 15 where it is the only factor).
 SHORTEST, LONGEST = 15, 256
 _NAME = re.compile(r"[\w.@-][\w.@ -]{0,62}[\w.@-]|[\w.@-]")
-#: A password as `hashed` stores it: no more memory than 2^19 blocks take.
+#: A password as `hashed` stores it, with a cost of at most 2^19 blocks of memory.
 _HASH = re.compile(rf"scrypt\$([1-9]|1\d)\${R}\${P}\$[\w+/]{{22}}==\$[\w+/]{{43}}=", re.ASCII)
 _refused = functools.partial(PblError, "WEB_ACCOUNT")
 
