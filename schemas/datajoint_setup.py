@@ -110,6 +110,12 @@ class MySQLOrMariaDB(MySQLAdapter):
                 connection.encoders = {**connection.encoders, dict: _json_literal}
         return connection
 
+    def load_foreign_keys_sql(self, schemas_list: str, like_pattern: str) -> str:
+        """DataJoint's query, with the columns of each key in their order: without it MySQL returns them in any, and
+        DataJoint takes the index of a key whose columns are in another order for one that no definition has."""
+        query = super().load_foreign_keys_sql(schemas_list, like_pattern)
+        return f"{query} ORDER BY table_schema, table_name, constraint_name, ordinal_position"
+
     def translate_error(self, error: Exception, query: str = "") -> Exception:
         """DataJoint's error; of a right that is missing one with a code."""
         translated = super().translate_error(error, query)

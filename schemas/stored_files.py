@@ -51,7 +51,10 @@ def _readable(path: Path, ref: Mapping[str, Any]) -> Iterator[None]:
         raise _damaged(ref, f"{size} bytes where its row says {ref['size']}")
     try:
         yield
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        *(ValueError, KeyError, OverflowError, EOFError, OSError, zipfile.BadZipFile, zlib.error),
+        NotImplementedError,  # packed in a way that zipfile does not read
+    ) as error:
         if isinstance(error, OSError) and error.filename not in (None, str(path)):
             raise  # it is about another file, such as one that is written
         raise _damaged(ref, f"{type(error).__name__}: {error}") from error

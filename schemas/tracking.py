@@ -10,6 +10,7 @@ import numpy as np
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.temporary import new_folder
 
 from . import video
@@ -306,11 +307,13 @@ def save_tracking(tracking: lib.Tracking, path: Path) -> None:
 
 
 def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha256: str) -> lib.Tracking:
-    """The library's `Tracking` from the npz that `save_tracking` wrote and the row's figures."""
+    """The `Tracking` from the npz that `save_tracking` wrote and the row's figures. Raises FILE_FORMAT."""
     from pbl_pipeline import tracking as lib
 
-    with np.load(path, allow_pickle=False) as f:
-        data = {k: f[k] for k in f.files}
+    data = load_npz(path, ("time_s", "person_id", "box_px", "roi_px", "score", "observed"))
+    n, t = data["person_id"].size, data["time_s"].size
+    shapes = {"time_s": (t,), "person_id": (n,), "box_px": (n, t, 4), "roi_px": (n, t, 4)}
+    check_numbers(path, data, {**shapes, "score": (n, t), "observed": (n, t)})
     people = tuple(
         lib.PersonTrack(int(p), data["box_px"][i], data["roi_px"][i], data["score"][i], data["observed"][i])
         for i, p in enumerate(data["person_id"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import random
 import threading
 import time
@@ -81,16 +82,19 @@ REFRESH_EVERY_S = 60.0
 PHONE_S = 1.0
 #: The other processes leave a job of a phone's recording to that process for so long (s): longer than its pause.
 LEAVE_S = 3
-#: Conditions on a job: not of a long recording; of a phone's; of none, or one that had waited for `LEAVE_S`.
-_IS_SHORT = f"priority NOT IN ({','.join(map(str, registry.LONG.values()))})"
+#: A lone process looks so often for long recordings, which it leaves to another one (s).
+LONG_EVERY_S = 10.0
+#: Conditions on a job: of a long recording, or not; of a phone's; of none, or one that had waited for `LEAVE_S`.
+_IS_LONG = f"priority IN ({','.join(map(str, registry.LONG.values()))})"
+_IS_SHORT = f"NOT {_IS_LONG}"
 _IS_FIRST = f"priority = {registry.FIRST}"
 _IS_LEFT = f"(priority != {registry.FIRST} OR scheduled_time < CURRENT_TIMESTAMP(3) - INTERVAL {LEAVE_S} SECOND)"
 
 
-def takes(short: bool, phones: bool, phone: bool) -> str | None:
+def takes(short: bool, phones: bool, phone: bool, long: bool = False) -> str | None:
     """Condition on the jobs that a process takes (`process.Options`): None where it takes all."""
-    if phone:
-        return _IS_FIRST
+    if phone or long:
+        return _IS_FIRST if phone else _IS_LONG
     return " AND ".join(([_IS_SHORT] if short else []) + ([_IS_LEFT] if phones else [])) or None
 
 
@@ -102,7 +106,8 @@ class Worker:
     job before it and while it waits for the database (without an outcome), and after it. batch: fits per batch.
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
     job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
-    phone: looks often, and for nothing but jobs that are queued.
+    phone: looks often, and for nothing but jobs that are queued. long_waits: called where no job is more urgent than
+    that of a long recording, which another process takes.
     """
 
     tables: Sequence[Any]
@@ -114,6 +119,7 @@ class Worker:
     only: Callable[[], Scope] | None = None
     takes: str | None = None
     phone: bool = False
+    long_waits: Callable[[], None] | None = None
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -121,6 +127,7 @@ class Worker:
     _refreshed: float = -1e9
     _everything: bool | None = None
     _in_hand: int | None = None  # video_id of the recording that was read last
+    _looked_for_long: float = -1e9
 
     def run(self, once: bool = False, max_jobs: int | None = None) -> None:
         """Work until `stop`; with `once` until nothing is left to do anywhere."""
@@ -163,6 +170,11 @@ class Worker:
             urgent = queue.most_urgent(table, conditions[table])
             if urgent is not None:
                 ranked.append((urgent, -position, table))
+        if self.long_waits is not None and time.monotonic() - self._looked_for_long > LONG_EVERY_S:
+            self._looked_for_long = time.monotonic()
+            longs = [p for table in self.tables if (p := queue.most_urgent(table, _IS_LONG)) is not None]
+            if longs and min(longs) < min((p for p, *_ in ranked), default=math.inf):
+                self.long_waits()
         # What is near its end first: a session that is nearly done should not wait for all others to begin.
         for urgent, _, table in sorted(ranked, key=lambda r: r[:2]):
             stage = registry.stage_of(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 import math
 import os
@@ -53,7 +54,8 @@ class Options:
     """Options of `pbl worker`. grace_s: how long a running job may continue after SIGTERM. limit_factor: multiplies the
     time limits of the tables. gpus: dealt to the processes in turn, one to each; where all stages are served, one
     process for each GPU fits, and the others do the rest. phones: one process more takes only recordings of phones, and
-    has precedence on the cores. Of one process: short: takes no job of a long recording; phone: is that process."""
+    has precedence on the cores. Of one process: short: takes no job of a long recording; long: takes no others, and
+    ends when none is left; phone: is the one for phones."""
 
     resource: str = "all"
     processes: int = 1
@@ -66,7 +68,14 @@ class Options:
     gpus: tuple[str, ...] = ()
     phones: bool = False
     short: bool = False
+    long: bool = False
     phone: bool = False
+
+    @property
+    def lone(self) -> bool:
+        """Whether long recordings get a process for as long as there are any, because one process serves detection."""
+        ends = self.once or self.max_jobs is not None
+        return self.processes == 1 and not ends and registry.DETECTOR in registry.GROUPS[self.resource]
 
     @property
     def all_processes(self) -> int:
@@ -75,17 +84,19 @@ class Options:
 
     def of_process(self, number: int) -> Options:
         """The options of one of the processes: its GPU, and how many processes share that; the last of several is for
-        short recordings, so that long ones never hold them all. The one for phones uses no GPU: its memory is for the
-        others."""
+        short recordings, so that long ones never hold them all; beside a lone one the number after the one for phones
+        is for long recordings. The one for phones uses no GPU: its memory is for the others."""
         if number == self.processes:
             return dataclasses.replace(self, phone=True, processes=1, batch=1, gpus=(), max_jobs=None)
-        one = dataclasses.replace(self, short=0 < number == self.processes - 1)
+        one = dataclasses.replace(self, short=self.lone or 0 < number == self.processes - 1)
+        if number > self.processes:
+            one = dataclasses.replace(self, long=True, once=True, batch=1, selftest=False)
         if not self.gpus:
             return one
         n = len(self.gpus)
         # A fit takes gigabytes of a GPU, and one process fits more sessions than many can detect.
-        resource = "cpu" if self.resource == "all" and number >= n else self.resource
-        gpus, sharing = (self.gpus[number % n],), math.ceil(self.processes / n)
+        resource = "cpu" if self.resource == "all" and n <= number < self.processes else self.resource
+        gpus, sharing = (self.gpus[number % n],), 2 if self.lone else math.ceil(self.processes / n)
         return dataclasses.replace(one, resource=resource, gpus=gpus, processes=sharing)
 
 
@@ -131,15 +142,19 @@ def work(options: Options, pipe: Connection) -> None:
             event(log, logging.CRITICAL, "self-test failed", error=str(error))
             raise SystemExit(SELFTEST_FAILED) from error
 
-    def report(job: Claim, outcome: Outcome | None) -> None:
+    def report(job: Claim | None, outcome: Outcome | None) -> None:
         try:
             pipe.send((job, outcome))
         except OSError:  # the supervisor has ended: end, too
             stop.set()
 
     with heartbeat.Heartbeat(options.resource) as beats:
-        takes = loop.takes(options.short, options.phones, options.phone)
-        worker = loop.Worker(tables, beats, stop, report, options.batch, takes=takes, phone=options.phone)
+        takes = loop.takes(options.short, options.phones, options.phone, options.long)
+        worker = loop.Worker(
+            tables, beats, stop, report, options.batch, takes=takes, phone=options.phone or options.long
+        )
+        if options.short:
+            worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
             with frames_kept():

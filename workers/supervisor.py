@@ -80,6 +80,7 @@ class Supervisor:
         self._pause = RESTART_S[0]
         self._stillborn = 0
         self._stopping = False
+        self._long_waits = False  # as a process for short recordings said
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
         self._unsettled: list[Callable[[], Any]] = []  # what is to become of jobs of processes that died
         self._settle_at = 0.0
@@ -103,8 +104,10 @@ class Supervisor:
                 self._send_due()
                 self._end_overdue()
                 code = max(code, self._reap())
-                if not self._stopping and {c.number for c in self._children} == {self.options.processes}:
-                    self.stop()  # the process for phones does not outlive the others
+                numbers = {c.number for c in self._children}
+                if numbers and min(numbers) >= self.options.processes and not self._stopping:
+                    self.stop()  # the processes for phones and long recordings do not outlive the others
+                self._serve_long()
                 self._settle()
             return code
         finally:
@@ -116,7 +119,7 @@ class Supervisor:
         here, there = self._start.Pipe(duplex=False)
         options = self.options.of_process(number)
         process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
-        with shared_cores(1 if options.phone else self.options.processes):
+        with shared_cores(1 if options.phone else self.options.processes + options.long):
             process.start()
         if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
             # From here, before its libraries start threads, which keep the priority they began with.
@@ -124,6 +127,13 @@ class Supervisor:
                 os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + BATCH_NICE)
         there.close()
         return _Child(process, here, time.monotonic(), number=number)
+
+    def _serve_long(self) -> None:
+        """Start the process for long recordings that a lone process asked for, where there is none."""
+        number, asked = self.options.processes + 1, self._long_waits and self.options.lone and not self._stopping
+        if asked and all(c.number != number for c in self._children):
+            self._children.append(self._launch(number))
+        self._long_waits = False
 
     def _send_due(self) -> None:
         """Ask the processes to end after their job (SIGTERM), then to put it back (SIGUSR1), then kill them."""
@@ -143,6 +153,9 @@ class Supervisor:
             try:
                 while child.pipe.poll():
                     job, outcome = child.pipe.recv()
+                    if job is None:
+                        self._long_waits = True
+                        continue
                     child.heard(job, outcome, self.options.limit_factor)
                     self.metrics.heard(job, outcome)
             except (EOFError, OSError):

@@ -17,6 +17,7 @@ from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, MEASURES, GaitParams, 
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
+from pbl_pipeline.visit.files import file_of_visit
 
 from .write import Cell, Table
 
@@ -90,10 +91,11 @@ def folder_values(folder: Path) -> pd.DataFrame:
     """
     rows = []
     for path in sorted(folder.rglob("metrics.json")):
-        session = read_json(path)["session"]
         name = path.parent.relative_to(folder).as_posix()
-        found = {m: session.get(m) for m in (INDEX, *MEASURES)}
-        rows += [("", name, m, float(v["mean"])) for m, v in found.items() if v and v.get("mean") is not None]
+        with file_of_visit(path):
+            session = read_json(path)["session"]
+            found = {m: session.get(m) for m in (INDEX, *MEASURES)}
+            rows += [("", name, m, float(v["mean"])) for m, v in found.items() if v and v.get("mean") is not None]
     if not rows:
         raise PblError(
             "FILE_MISSING",

@@ -123,7 +123,7 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
     path = folder / SESSION
     found = [] if path.is_file() else [name_of_fit(fit) for fit in sorted(folder.glob(f"*.{FIT}"))]
     content = {"trials": found, "qc": []} if found else _read(path)
-    with _coded(path):
+    with file_of_visit(path):
         names, told = [str(n) for n in content["trials"]], content.get("visit", {})
         facts = {str(r["name"]): r for r in told.get("recordings", ())}
         fits = [folder / f"{name}.{FIT}" for name in names]
@@ -247,11 +247,11 @@ def _known(value: float) -> float | None:
 
 # ------------------------------------------------------------------------------------------------------------- reading
 @contextlib.contextmanager
-def _coded(path: Path, again: str = _AGAIN) -> Iterator[None]:
+def file_of_visit(path: Path, again: str = _AGAIN) -> Iterator[None]:
     """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT. `again`: what writes the file."""
     try:
         yield
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
@@ -271,7 +271,7 @@ def _read(path: Path, again: str = _AGAIN) -> dict[str, Any]:
             next_step=again,
             key=str(path),
         )
-    with _coded(path, again):
+    with file_of_visit(path, again):
         content = read_json(path)
         if not isinstance(content, dict):
             raise TypeError("not a JSON object")
@@ -364,7 +364,7 @@ def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
             else:
                 curves[recording.name] = load_curves(file)
     content = _read(path, _MEASURE)
-    with _coded(path, _MEASURE):
+    with file_of_visit(path, _MEASURE):
         measures = metrics_of(content, events, curves)
         by_name = {t.name: t for t in measures.trials}
         if not set(by_name) >= {r.name for r in visit.fitted}:
@@ -385,7 +385,7 @@ def load_kinetics(folder: Path, names: Sequence[str]) -> Kinetics | None:
         return None
     files = {name: _file(folder, name, FORCES) for name in names}
     content = _read(folder / KINETICS, _MEASURE)
-    with _coded(folder / KINETICS, _MEASURE):
+    with file_of_visit(folder / KINETICS, _MEASURE):
         found = kinetics_of(content, {n: load_arrays(f) for n, f in files.items() if f.is_file()})
         by_name = {t.name: t for t in found.trials}
         if not set(by_name) >= set(names):

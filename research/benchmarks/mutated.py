@@ -311,6 +311,22 @@ def kinds() -> list[Kind]:
         Kind("manifest.json", m.manifest, m.use_manifest, _json),
         Kind("session.json", m.session, m.use_session, _json),
         Kind("model.json", m.model, m.use_model, _json),
+        Kind("model.onnx", m.graph, m.use_graph, _nothing),
+        Kind("model.zip", m.archive, m.use_archive, _zip(of_bytes, 0.5)),
+        Kind("model.tar.gz", m.archive, m.use_archive, _gz(of_bytes)),
+        Kind("method.json", m.method, m.use_method, _json),
+        Kind("store.sha256", m.listing, m.use_listing, _text("  ")),
+        Kind("forgotten.json", m.forgotten, m.use_forgotten, _json),
+        Kind("server.json", m.server, m.use_server, _json),
+        Kind("accounts.json", m.accounts, m.use_accounts, _json),
+        Kind("metrics.json", m.metrics, m.use_metrics, _json),
+        Kind("kinetics.json", m.kinetics, m.use_kinetics, _json),
+        Kind("walk.kinetics.npz", m.kinetics, m.use_kinetics, _npz),
+        Kind("tracking.npz", m.tracking, m.use_tracking, _npz),
+        Kind("participants.tsv", m.participants, m.use_participants, _text("\t")),
+        Kind("board.mp4", m.board, m.use_board, _nothing),
+        Kind("covered.mov", m.phone_video, m.use_deidentified, _nothing),
+        Kind("form.bin", m.form, m.use_form, _nothing),
     ]
 
 

@@ -492,3 +492,296 @@ def use_manifest(path: Path) -> None:
     folder.mkdir(exist_ok=True)
     (folder / "manifest.json").write_bytes(path.read_bytes())
     backup.check(folder)
+
+
+def listing(path: Path) -> None:
+    path.write_text("".join(f"{'0' * 63}{i}  pbl/walk_{i}.npz\n" for i in range(9)))
+
+
+def use_listing(path: Path) -> None:
+    """The files of a backup by their checksums; none of them is there."""
+    from pbl_pipeline.errors import PblError
+    from schemas.operations import backup
+    from schemas.operations.backup_files import sha256_of
+
+    folder = path.parent / "listed"
+    folder.mkdir(exist_ok=True)
+    (folder / "store.sha256").write_bytes(path.read_bytes())
+    manifest(folder / "manifest.json")
+    about = json.loads((folder / "manifest.json").read_text())
+    about["sha256"] = {"store.sha256": sha256_of(folder / "store.sha256")}
+    (folder / "manifest.json").write_text(json.dumps(about))
+    try:
+        backup.check(folder)
+    except PblError as error:
+        if "9 files are missing" not in error.found:
+            raise
+
+
+def forgotten(path: Path) -> None:
+    ids = {"videos": [1, 2], "sessions": [1], "sha256": ["0" * 64]}
+    path.write_text(json.dumps({"subject": "P001", "ids": ids, "state": "begun", "files": ["a/b.npz"], "videos": []}))
+
+
+def use_forgotten(path: Path) -> None:
+    from pbl_pipeline import settings
+    from schemas.operations import forget
+
+    with settings_at(path.parent):
+        place = settings.home_dir() / "forgotten" / "P001.json"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(path.read_bytes())
+        forget.read_manifest("P001")
+
+
+def settings_at(folder: Path) -> Any:
+    """PBL_HOME and PBL_MODELS in a folder."""
+    from unittest import mock
+
+    return mock.patch.dict("os.environ", PBL_HOME=str(folder / "home"), PBL_MODELS=str(folder / "models"))
+
+
+def server(path: Path) -> None:
+    path.write_text(json.dumps({"port": 3307, "pid": 1, "version": "10.11.6", "prefixes": ["pbl"], "on_demand": False}))
+
+
+def use_server(path: Path) -> None:
+    from schemas.operations import embedded
+    from schemas.operations.embedded.folder import Credentials
+
+    folder = embedded.Folder(path.parent / "db")
+    folder.data.mkdir(parents=True, exist_ok=True)
+    folder.write_credentials(Credentials("a" * 20, "b" * 20))
+    folder.state_file.write_bytes(path.read_bytes())
+    embedded.status(folder)
+    folder.write_state(port=3308)
+
+
+def accounts(path: Path) -> None:
+    from workers.web.accounts import Accounts
+
+    Accounts(path).add("a.first", ["reader"], "correct horse battery")
+
+
+def use_accounts(path: Path) -> None:
+    from workers.web.accounts import Accounts
+
+    path.chmod(0o600)
+    found = Accounts(path)
+    for account in found.all().values():
+        found.check(account.name, "wrong horse battery")
+
+
+# ------------------------------------------------------------------------- what is made of results, and made of a video
+def metrics(path: Path) -> None:
+    from pbl_pipeline.gait import gait_metrics
+
+    gait_metrics([_fit()]).save(path)
+
+
+def use_metrics(path: Path) -> None:
+    from pbl_pipeline.validation.bridge import folder_values
+
+    folder = path.parent / "visits" / "one"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "metrics.json").write_bytes(path.read_bytes())
+    folder_values(folder.parent)
+
+
+@functools.cache
+def _kinetics():
+    """With forces: of a walk whose vertical is measured."""
+    import dataclasses
+
+    from pbl_pipeline.gait import gait_metrics
+    from pbl_pipeline.kinetics import METHODS, visit_kinetics
+
+    body = load_body()
+    fit = walking_fit(body.joint_names, body.sha256, n_frames=240, start_m=(6.0, -4.5, -0.2))
+    sd = np.full_like(fit.qpos, 0.01)
+    fit = dataclasses.replace(fit, orientation_source="measured: phone", qpos_sd=sd, height_m=1.8)
+    return visit_kinetics([fit], gait_metrics([fit]).trials, METHODS.find(), mass_kg=70.0)
+
+
+def kinetics(path: Path) -> None:
+    from pbl_pipeline.visit import save_kinetics
+
+    folder = path.parent / "sound-kinetics"
+    folder.mkdir(exist_ok=True)
+    written = save_kinetics(_kinetics(), folder)
+    path.write_bytes(next(p for p in written if p.suffix == path.suffix).read_bytes())
+
+
+def use_kinetics(path: Path) -> None:
+    import shutil
+
+    from pbl_pipeline.visit import load_kinetics
+
+    folder = path.parent / "kinetics"
+    shutil.copytree(path.parent / "sound-kinetics", folder, dirs_exist_ok=True)
+    next(folder.glob(f"*kinetics{path.suffix}")).write_bytes(path.read_bytes())
+    load_kinetics(folder, [_fit().name])
+
+
+def tracking(path: Path) -> None:
+    from pbl_pipeline.tracking import PersonTrack, Tracking
+    from schemas.tracking import save_tracking
+
+    box = np.tile([10.0, 10.0, 90.0, 200.0], (N, 1))
+    people = tuple(PersonTrack(i, box, box, np.ones(N), np.ones(N, bool)) for i in range(2))
+    save_tracking(Tracking(np.arange(N) / FPS, SIZE_PX, people, "blazepose", "0" * 64), path)
+
+
+def use_tracking(path: Path) -> None:
+    """As a file of the store."""
+    from types import SimpleNamespace
+    from unittest import mock
+
+    from schemas import stored_files
+    from schemas.tracking import load_tracking
+
+    local = SimpleNamespace(protocol="file")
+    with (
+        mock.patch.object(stored_files, "backend_of", return_value=local),
+        mock.patch.object(stored_files, "full_path", lambda _, name: str(path.parent / name)),
+        stored_files.stored_file({"path": path.name, "store": "pbl"}) as file,
+    ):
+        load_tracking(file, SIZE_PX, "blazepose", "0" * 64)
+
+
+def participants(path: Path) -> None:
+    path.write_text("participant_id\tage\tsex\n" + "".join(f"sub-P{i:03}\t{40 + i}\tF\n" for i in range(9)))
+
+
+def use_participants(path: Path) -> None:
+    from pbl_pipeline.export.bids import Labels, bids_files
+
+    folder = path.parent / "dataset"
+    folder.mkdir(exist_ok=True)
+    (folder / "participants.tsv").write_bytes(path.read_bytes())
+    bids_files([], {}, Labels("P100", "1"), folder)
+
+
+def method(path: Path) -> None:
+    path.write_text(json.dumps({"stage": "tracking", "name": "of-a-lab", "base": "blazepose-tiles", "min_hits": 4}))
+
+
+def use_method(path: Path) -> None:
+    from pbl_pipeline.method_file import read_method
+
+    assert read_method(path).hash
+
+
+def board(path: Path) -> None:
+    from pbl_pipeline.video import Board
+    from tests.board_video import film, varied_poses
+    from tests.videos import constant_rate, write_video
+
+    size, matrix = (320, 180), np.array([[236.0, 0, 158], [0, 237, 92], [0, 0, 1]])
+    lens = np.array([0.12, -0.3, 0.001, -0.0008, 0.2])
+    chart = Board("checkerboard", (9, 6), 30.0)
+    frames = [f for f in film(chart, matrix, lens, size, varied_poses(chart, matrix, size, 24)) for _ in range(2)]
+    write_video(path, frames, constant_rate(len(frames), 10), crf=22)
+
+
+def use_board(path: Path) -> None:
+    from pbl_pipeline.errors import PblError
+    from pbl_pipeline.video import Board, calibrate_video
+
+    try:
+        calibrate_video(path, Board("checkerboard", (9, 6), 30.0))
+    except PblError as error:
+        if not (path.name.startswith("sound-") and error.code.startswith("CALIBRATION_")):  # of a small picture
+            raise
+
+
+def use_deidentified(path: Path) -> None:
+    from pbl_pipeline.deidentify import Heads, deidentify
+    from pbl_pipeline.deidentify.types import Head
+    from pbl_pipeline.video import probe
+
+    info = probe(path)
+    n, size = info.n_frames, (info.width_px, info.height_px)
+    box = np.tile([0.0, 0.0, 50.0, 60.0], (n, 1))
+    head = Head(np.tile([40.0, 30.0, 10.0], (n, 1)), np.ones(n, np.uint8), box)
+    heads = Heads(info.time_s, size, (head,))
+    deidentify(path, path.with_name("covered.mp4"), heads=heads, keep=["device", "time", "place"], overwrite=True)
+
+
+def graph(path: Path) -> None:
+    path.write_bytes(_graph().SerializeToString())
+
+
+def use_graph(path: Path) -> None:
+    """With the checksum of what it is: a model whose publisher made it so."""
+    import hashlib
+
+    from pbl_pipeline.models import registry
+    from tests import dot_models
+
+    folder = path.parent / "graph"
+    data = path.read_bytes()
+    fields = {**dot_models.spec("crop3d", (64, 64)), "sha256": hashlib.sha256(data).hexdigest()}
+    dot_models.write(folder, _graph(), fields)
+    (folder / "model.onnx").write_bytes(data)
+    with settings_at(path.parent):
+        registry.add(folder, replace=True)
+
+
+def archive(path: Path) -> None:
+    import tarfile
+    import zipfile
+
+    from tests import dot_models
+
+    folder = dot_models.write(path.parent / "dots", _graph(), dot_models.spec("crop3d", (64, 64)))
+    files = sorted(folder.iterdir())
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+            for file in files:
+                packed.write(file, f"dots/{file.name}")
+    else:
+        with tarfile.open(path, "w:gz") as packed:
+            for file in files:
+                packed.add(file, f"dots/{file.name}")
+
+
+def use_archive(path: Path) -> None:
+    from pbl_pipeline.models import registry
+
+    with settings_at(path.parent):
+        registry.add(path, replace=True)
+
+
+def form(path: Path) -> None:
+    head = 'Content-Disposition: form-data; name="{}"{}\r\n\r\n{}\r\n'
+    fields = [head.format(n, "", v) for n, v in (("subject", "P001"), ("session", "2026-01-01"), ("seen", "1"))]
+    fields.append(head.format("video", '; filename="walk.mp4"\r\nContent-Type: video/mp4', "x" * 5000))
+    path.write_bytes("".join(f"--line\r\n{f}" for f in fields).encode() + b"--line--\r\n")
+
+
+def use_form(path: Path) -> None:
+    """As the page reads it while it arrives; a form that it refuses has the code USAGE here."""
+    import asyncio
+
+    from starlette.requests import Request
+
+    from pbl_pipeline.errors import PblError
+    from workers.web.access import Refused
+    from workers.web.multipart import parts
+
+    data = path.read_bytes()
+    pieces = [data[i : i + 700] for i in range(0, len(data), 700)] or [b""]
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": pieces.pop(0), "more_body": bool(pieces)}
+
+    async def read() -> int:
+        headers = [(b"content-type", b"multipart/form-data; boundary=line")]
+        request = Request({"type": "http", "method": "POST", "headers": headers}, receive)
+        return sum([len(p) if isinstance(p, bytes) else 1 async for p in parts(request)])
+
+    try:
+        asyncio.run(read())
+    except Refused as error:
+        raise PblError("USAGE", found=str(error), expected="a form", next_step="send it again") from error

@@ -5,6 +5,7 @@
     python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
     python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
     python -m research.benchmarks.workers long               # 300 videos with one of two hours among them
+    python -m research.benchmarks.workers kills              # kill -9 ten times in every stage
 
 Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
 folder and removes it.
@@ -17,6 +18,8 @@ import hashlib
 import itertools
 import math
 import os
+import random
+import signal
 import subprocess
 import sys
 import time
@@ -481,6 +484,94 @@ def long(videos: int, minutes: float, late: int, processes: int, faster: float) 
     for name, group in (("phone", phones), ("other", {*others} - phones)):
         times = sorted(faster * (detected[one] - registered[one]) / 60 for one in group)
         say(f"one that came meanwhile, by {name}: keypoints after, median", times[len(times) // 2], "min")
+
+
+# --------------------------------------------------------------------------------------------------------------- kills
+#: Folder in which each kill of `kills` has a file, named by its table, moment and key; and how many a table gets.
+_KILLS, _EACH = "PBL_BENCH_KILLS", "PBL_BENCH_KILLS_EACH"
+#: While it computes; before its insert; after its last statement and file; after the commit, before the job ends.
+_MOMENTS = ("computing", "before the insert", "before the commit", "after the commit")
+
+
+def killed(options: Any, pipe: Any) -> None:
+    """A working process that kills itself, at a random moment of a job; twice a job, which gets three attempts."""
+    from schemas import computed_tables
+    from workers import queue, run_job
+
+    folder, draw = Path(os.environ[_KILLS]), random.Random(os.getpid())
+    moments: dict[str, str] = {}
+
+    def at(name: str, moment: str, key: dict[str, Any]) -> None:
+        job = queue.key_hash(key)
+        drawn = moments.setdefault(name + job, draw.choice(_MOMENTS))
+        before = [f.name for f in folder.glob(f"{name}.*")]
+        if drawn == moment and len(before) < int(os.environ[_EACH]) and sum(job in b for b in before) < 2:
+            (folder / f"{name}.{moment}.{job}.{os.getpid()}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def watched(table: Any, compute: Any, insert: Any) -> None:
+        def make_compute(self: Any, key: dict[str, Any], *fetched: Any) -> Any:
+            at(table.__name__, _MOMENTS[0], key)
+            return compute(self, key, *fetched)
+
+        def make_insert(self: Any, key: dict[str, Any], *computed: Any) -> None:
+            at(table.__name__, _MOMENTS[1], key)
+            insert(self, key, *computed)
+            at(table.__name__, _MOMENTS[2], key)
+
+        table.make_compute, table.make_insert = make_compute, make_insert
+
+    for table in computed_tables():
+        watched(table, table.make_compute, table.make_insert)
+    finish = queue.finish
+
+    def finished(job: Claim) -> None:
+        at(job.table.__name__, _MOMENTS[3], job.key)
+        finish(job)
+
+    run_job.queue.finish = finished
+    worker_standins.work(options, pipe)
+
+
+@main.command()
+@click.option("--each", default=10, show_default=True, help="Kills in each stage.")
+def kills(each: int) -> None:
+    """Kill the working process in every stage, at four moments of a job: every row is there once, nothing is left."""
+    from research.benchmarks.many_recordings import register_many
+    from schemas import chain as tables_chain
+    from schemas import computed_tables
+    from schemas.operations.orphans import orphans
+    from schemas.reading.status import queue_counts
+    from schemas.video import Video
+    from workers import refresh, supervisor
+    from workers.process import Options
+
+    with installation() as home, pytest.MonkeyPatch.context() as patch:
+        (home / "kills").mkdir()
+        patch.setenv(_KILLS, str(home / "kills"))
+        patch.setenv(_EACH, str(each))
+        patch.setattr(supervisor, "RESTART_S", (0.1, 0.1))
+        visits = each // 2 + 3
+        for i in range(visits):  # each a visit
+            register_many(recordings(i * EACH, 1))
+        while True:
+            refresh.refresh(True)
+            counts = queue_counts(Video.connection)
+            if not sum(c["pending"] + c["reserved"] for c in counts.values()):
+                break
+            options = Options(once=True, selftest=False, processes=2)
+            assert supervisor.Supervisor(options, target=killed).run() == 0
+        errors = {t: c["error"] for t, c in counts.items() if c["error"]}
+        found, wrong = orphans(young_s=0.0), bool(errors)
+        for table in computed_tables():
+            if table.__name__ not in tables_chain.ON_REQUEST or len(table()):
+                names = [f.name.split(".")[1] for f in (home / "kills").glob(f"{table.__name__}.*")]
+                by = ", ".join(f"{names.count(m)} {m}" for m in _MOMENTS)
+                click.echo(f"{table.__name__:16} {len(names):3} kills ({by}): {len(table())} of {visits} rows")
+                wrong |= len(table()) != visits or len(names) < each
+        click.echo(f"error rows {errors}; {found.n_files} files, without a row {found.orphans}, lost {found.lost}")
+        if wrong or found.orphans or found.lost:
+            raise SystemExit(1)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.bounded import MAX_TEXT, count_cells, count_rows, read_bytes
+from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.workbook import READ_BYTES, READ_S, read_workbook
@@ -173,7 +174,9 @@ def write_template(path: Path, columns: Sequence[str]) -> None:
             book.worksheets[0].append(list(columns))
             book.save(out)
         else:
-            out.write((",".join(columns) + "\n").encode())
+            import pandas as pd
+
+            out.write(frame_to_csv(pd.DataFrame(columns=list(columns))).encode())
 
 
 def _csv(path: Path) -> list[list[str]]:

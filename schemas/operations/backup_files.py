@@ -127,22 +127,24 @@ PARTS = ("store", RECORDINGS)
 
 
 def safe_path(path: str) -> PurePosixPath:
-    """Return a path of the store, checked not to leave it. Raises BACKUP_INVALID."""
+    """Return a path of the store, checked not to leave it and to be one that a disk takes. Raises BACKUP_INVALID."""
     parts = PurePosixPath(path)
-    if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path:
+    too_long = len(path) > 3000 or any(len(os.fsencode(part)) > 255 for part in parts.parts)
+    if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path or too_long:
         raise PblError(
             "BACKUP_INVALID",
             key=repr(path)[:200],
-            found="a path that leaves the store",
-            expected="a relative path without ..",
+            found="a path that leaves the store or is too long",
+            expected="a relative path without .., of names of up to 255 bytes",
             next_step="the row was not written by this pipeline: find it and delete it",
         )
     return parts
 
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
-    """Yield SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it."""
-    for line in (folder / f"{part}.sha256").read_text(encoding="utf-8").splitlines():
+    """Yield SHA-256 and path of the files of a part of a backup. A path that is not UTF-8 names a file that is missing.
+    Raises BACKUP_INVALID for a path that leaves it."""
+    for line in (folder / f"{part}.sha256").read_text(encoding="utf-8", errors="replace").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
 

@@ -409,10 +409,14 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
 def read_manifest(subject: str) -> dict[str, Any]:
     """Return the list that an earlier run wrote; empty where there is none."""
     try:
-        return json.loads(manifest_path(subject).read_text(encoding="utf-8"))
+        found = json.loads(manifest_path(subject).read_text(encoding="utf-8"))
+        kinds = {"ids": dict, "files": list, "videos": list, "rows": dict}
+        if not isinstance(found, dict) or not all(isinstance(found.get(n, k()), k) for n, k in kinds.items()):
+            raise TypeError("no list of a person's rows and files")
+        return found
     except FileNotFoundError:
         return {}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise PblError(
             "FILE_FORMAT",
             key=manifest_path(subject),

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
@@ -102,6 +103,8 @@ def _value(row: Row, field: str) -> Any:
         taken |= {str(name).lower() for name in study.ClinicalInstrument().to_arrays("instrument")}
         if text.lower() in taken or text.lower().replace(" ", "_") in taken:
             raise refused(repr(text), "a name that no instrument and no column of a sheet has", "choose another", field)
+        if quoted(text) != text:
+            raise refused(repr(text), "a name that no spreadsheet computes", "choose another", field)
     if field == "instrument_unit" and text.lower() == "punkte":
         return "points"  # the word by which whole numbers are asked for (`study.check_score`)
     return text

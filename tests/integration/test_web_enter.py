@@ -154,6 +154,8 @@ def test_an_instrument_of_ones_own_is_added_and_entered(own: None):
     assert [(r["decision_by"], r["decision_after"]["instrument_high"]) for r in added] == [("A. First", 5)]
     again = web.post(browser, "/instruments", **{**OWN, "instrument": "fac"}).text
     assert "a name that no instrument and no column of a sheet has" in again
+    computed = web.post(browser, "/instruments", **{**OWN, "instrument": "=HYPERLINK(A1)"}).text
+    assert "a name that no spreadsheet computes" in computed
 
 
 def test_every_wrong_field_of_an_instrument_is_said_and_nothing_is_added(own: None):

@@ -245,7 +245,34 @@ def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[s
     assert jobs_left() == {"Tracking": {"pending": 2}}
     work(takes=takes(first.short, phones=False, phone=False))
     assert jobs_left() == {}
-    assert not Options(processes=1).of_process(0).short  # it does everything
+    assert not Options(processes=1, once=True).of_process(0).short  # it does everything
+
+
+def test_nothing_waits_behind_a_long_recording_for_a_lone_process(of_lengths: dict[str, int], tmp_path: Path):
+    Worker(registry.tables_of("decode"), Silent()).run(once=True)
+    boss = Supervisor(Options("cpu", selftest=False, grace_s=0.0), target=worker_target.work)
+    of_hours = tracking.Tracking.jobs & [{"video_id": of_lengths[name]} for name in ("hour", "hour_filmed")]
+    seen: list[int] = []
+
+    def come() -> None:
+        try:
+            until(lambda: len(keypoints.Keypoints()) == 3 and len(of_hours & "status = 'reserved'") == 1, 120)
+            register(*videos(tmp_path, "late"), session_label="late")
+            refresh.refresh()
+            until(lambda: len(keypoints.Keypoints()) == 4, 120)
+            seen.extend([len(of_hours), len(live_workers())])
+            for name in ("hour", "hour_filmed"):
+                (tmp_path / f"{name}.mp4.go").touch()
+            until(lambda: jobs_left() == {"SessionFit": {"pending": 2}} and len(live_workers()) == 1, 120)
+            seen.append(len(keypoints.Keypoints()))
+        finally:
+            boss.stop()
+
+    coming = threading.Thread(target=come)
+    coming.start()
+    assert boss.run() == 0
+    coming.join()
+    assert seen == [2, 2, 6]  # neither long one was done; their process ended after them
 
 
 def test_one_process_takes_recordings_of_phones_alone_and_the_others_leave_them_to_it(of_lengths: dict[str, int]):

@@ -1,7 +1,7 @@
 """What the processes of a worker run in tests: the real one, behind stand-ins for the slow stages.
 
 A recording's name says what it does to the process that probes it: `kills` ends it at once, `hangs` never returns,
-`slow` takes seconds.
+`slow` takes seconds. Tracking of an `hour` ends when there is a file of its name and `.go`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,11 @@ import signal
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import pbl_pipeline.tracking
 import pbl_pipeline.video
 from workers import heartbeat, process
 from workers.process import Options
@@ -38,7 +40,13 @@ def work(options: Options, pipe: Connection) -> None:
             time.sleep(3.0)
         return real(path)
 
+    def track_people(path: Path, *more: Any, **named: Any) -> Any:
+        while "hour" in Path(path).stem and not Path(f"{path}.go").exists():
+            time.sleep(0.1)
+        return chain.track_people(path, *more, **named)
+
     patch.setattr(pbl_pipeline.video, "probe", probe)
+    patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     patch.setattr(heartbeat, "PERIOD_S", 0.2)
     process.work(options, pipe)
 

@@ -114,3 +114,9 @@ def test_the_public_names_that_carry_most_are_there():
     assert isinstance(inspect.getattr_static(connection.Connection, "transaction"), property)
     for name in ("reserve", "error", "pending", "reserved", "errors"):
         assert hasattr(jobs.Job, name)
+
+
+def test_the_columns_of_foreign_keys_are_read_in_their_order():
+    """MySQL returns them in any order otherwise; `tests/integration/test_mysql.py` compares the tables there."""
+    query = MySQLOrMariaDB().load_foreign_keys_sql("'pbl_fit'", "'~%%'")
+    assert query.endswith("ORDER BY table_schema, table_name, constraint_name, ordinal_position")

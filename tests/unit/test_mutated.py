@@ -20,7 +20,7 @@ KINDS = {kind.name: kind for kind in kinds()}
 
 @pytest.mark.parametrize("name", KINDS)
 def test_mutated_files_have_a_result_or_a_code(tmp_path: Path, name: str):
-    n = 2 if name in ("walk.fit.npz", "session.json", "norm.json") else 5
+    n = 2 if name in ("walk.fit.npz", "session.json", "norm.json", "board.mp4") else 5
     found = list(outcomes(KINDS[name], range(n), tmp_path))
     assert not [o for o in found if o.what.startswith("!")]
 
@@ -70,6 +70,9 @@ def scaled(name: str, by: float) -> Callable[[dict[str, Any]], object]:
         ("walk.truth.npz", put(pelvis_m=np.zeros((90, 2))), "FILE_FORMAT"),
         ("walk.truth.npz", put(outlier=np.asarray(1)), "FILE_FORMAT"),
         ("walk.truth.npz", put(spec=np.asarray('{"a":' * 5000)), "FILE_FORMAT"),
+        ("walk.kinetics.npz", put(cycle_no=np.array([np.inf])), "FILE_FORMAT"),
+        ("tracking.npz", put(person_id=np.array([0.0, np.inf])), "FILE_FORMAT"),
+        ("tracking.npz", put(box_px=np.zeros(4)), "FILE_FORMAT"),
         ("walk.reference.npz", put(source=np.asarray("\x1b[2J")), "FILE_FORMAT"),
         ("walk.reference.npz", put(names=np.asarray([["a", "b"], ["c", "d"]])), "FILE_FORMAT"),
     ],
@@ -81,6 +84,25 @@ def test_faults_in_arrays(tmp_path: Path, kind: str, change: Callable[[dict[str,
         KINDS[kind].use(path)
     assert error.value.code == code
     assert peak.grown_mib < 256
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "code"),
+    [
+        ("metrics.json", '{"session": 3}', "FILE_FORMAT"),
+        ("metrics.json", '{"session": {"gdi": {"mean": "x"}}}', "FILE_FORMAT"),
+        ("store.sha256", "\udcff  a.npz", "BACKUP_INVALID"),
+        ("store.sha256", f"{0:064}  {'a' * 256}", "BACKUP_INVALID"),
+        ("server.json", "\udcff", "FILE_FORMAT"),
+        ("server.json", '{"pid": {}}', "FILE_FORMAT"),
+        ("forgotten.json", '["files"]', "FILE_FORMAT"),
+        ("accounts.json", '{"accounts": {"a": {"roles": [], "password": "x", "changed": ""}}}', "WEB_ACCOUNT"),
+    ],
+)
+def test_files_of_an_installation_that_make_no_sense(tmp_path: Path, kind: str, content: str, code: str):
+    (tmp_path / kind).write_bytes(content.encode("utf-8", "surrogateescape"))
+    with pytest.raises(PblError, match=f"^{code}: "):
+        KINDS[kind].use(tmp_path / kind)
 
 
 def test_of_an_hour_the_legs_on_an_even_grid_stay_small(tmp_path: Path):

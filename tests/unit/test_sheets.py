@@ -15,7 +15,7 @@ from openpyxl import Workbook
 from pbl_pipeline import name_pattern
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.workbook import read_workbook
-from schemas.intake.sheets import read_sheets
+from schemas.intake.sheets import read_sheets, write_template
 from tests.guard import guarded
 
 SHEET = "xl/worksheets/sheet1.xml"
@@ -177,6 +177,13 @@ def test_a_pattern_that_takes_too_much(monkeypatch: pytest.MonkeyPatch, pattern:
         name_pattern.read_names(pattern, [Path("a" * 60 + "!.mp4")])
     assert any(w in error.value.found for w in words.split("|"))
     assert time.monotonic() - start < 30.0
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.xlsx"])
+def test_a_template_has_the_columns_that_were_asked_for(tmp_path: Path, name: str):
+    columns = ["subject", "TUG, fast", 'FAC "own"']
+    write_template(tmp_path / name, columns)
+    assert [*read_sheets(tmp_path / name)[0].columns] == columns
 
 
 def test_statements_of_names():

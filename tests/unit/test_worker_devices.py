@@ -51,6 +51,10 @@ def test_processes_are_dealt_to_the_gpus_evenly():
     assert (alone.gpus, alone.processes) == (("b",), 1)
     assert Options(processes=2).of_process(0) == Options(processes=2)
     assert [options.of_process(i).short for i in range(5)] == [*[False] * 4, True]
+    lone = Options(gpus=("a", "b"), phones=True)
+    here, beside = lone.of_process(0), lone.of_process(2)
+    assert (here.short, beside.long, beside.once, beside.resource) == (True, True, True, "all")
+    assert (here.gpus, beside.gpus, here.processes, beside.processes) == (("a",), ("a",), 2, 2)
     phone = Options(processes=2, gpus=("a", "b"), batch=128, max_jobs=9, phones=True).of_process(2)
     assert phone == Options(phones=True, phone=True)  # no GPU, all cores, one session at a time, for as long as others
 

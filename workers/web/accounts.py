@@ -49,6 +49,8 @@ LOG_N, R, P = 17, 8, 1
 #: Fewest and most characters of a password (NIST SP 800-63B asks for 15 where it is the only factor).
 SHORTEST, LONGEST = 15, 256
 _NAME = re.compile(r"[\w.@-][\w.@ -]{0,62}[\w.@-]|[\w.@-]")
+#: A password as `hashed` stores it, with a cost of at most 2^19 blocks of memory.
+_HASH = re.compile(rf"scrypt\$([1-9]|1\d)\${R}\${P}\$[\w+/]{{22}}==\$[\w+/]{{43}}=", re.ASCII)
 _refused = functools.partial(PblError, "WEB_ACCOUNT")
 
 
@@ -84,6 +86,11 @@ class Accounts:
             try:
                 found = json.loads(self.path.read_text("utf-8"))["accounts"]
                 known = {n: Account(n, tuple(a["roles"]), a["password"], a["changed"]) for n, a in found.items()}
+                for one in known.values():
+                    if not (
+                        set(one.roles) <= set(RIGHTS) and _HASH.fullmatch(one.password) and one.changed.isprintable()
+                    ):
+                        raise ValueError("another content")
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 next_step = "restore the file, or remove it and add the accounts again"
                 raise self._bad("accounts as `pbl web account` writes them", next_step, type(error).__name__) from error

@@ -52,6 +52,15 @@ def free_port() -> int:
     )
 
 
+#: Kinds of the entries of `server.json`.
+_STATE = {
+    "port": int | None,
+    "pid": int | None,
+    "version": str | None,
+    "prefixes": list | None,
+    "on_demand": bool | None,
+}
+
 #: Accounts root drops to, in this order. `nobody` exists on every Debian; `mysql` only where its packages made it.
 UNPRIVILEGED = ("mysql", "nobody")
 
@@ -253,10 +262,14 @@ class Folder:
     def credentials(self) -> Credentials:
         """The stored passwords.
 
-        Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read.
+        Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read;
+        FILE_FORMAT for one that is damaged.
         """
         try:
-            return Credentials(**json.loads(self.credentials_file.read_text(encoding="utf-8")))
+            with _undamaged(
+                self.credentials_file, "restore it from a copy of the folder: nothing else has the passwords"
+            ):
+                return Credentials(**json.loads(self.credentials_file.read_text(encoding="utf-8")))
         except FileNotFoundError as error:
             raise PblError(
                 "DB_NOT_RUNNING",
@@ -281,9 +294,15 @@ class Folder:
         _write(self.credentials_file, asdict(credentials), 0o600)
 
     def state(self) -> dict[str, Any]:
-        """`port`, `pid`, `version` and the schema prefixes the application may use; empty before the first start."""
+        """`port`, `pid`, `version` and the schema prefixes the application may use; empty before the first start.
+        Raises `PblError` FILE_FORMAT for a file that is damaged."""
+        again = "end the server of this folder if it runs (its number is in run/pid), move the file away, pbl db start"
         try:
-            return json.loads(self.state_file.read_text(encoding="utf-8"))
+            with _undamaged(self.state_file, again):
+                found = json.loads(self.state_file.read_text(encoding="utf-8"))
+                if not isinstance(found, dict) or not all(isinstance(found.get(n), k) for n, k in _STATE.items()):
+                    raise TypeError("another content")
+                return found
         except FileNotFoundError:
             return {}
         except NotADirectoryError as error:
@@ -301,6 +320,16 @@ class Folder:
             return "\n".join(self.log.read_text(errors="replace", encoding="utf-8").splitlines()[-lines:])
         except OSError as error:
             return f"(no log: {error})"
+
+
+@contextmanager
+def _undamaged(path: Path, next_step: str) -> Iterator[None]:
+    """Turn what reading a damaged file raises into FILE_FORMAT. The content, which may be secret, is not repeated."""
+    try:
+        yield
+    except (ValueError, TypeError, RecursionError) as error:
+        found = f"the file is damaged ({type(error).__name__})"
+        raise PblError("FILE_FORMAT", found, "the file as `pbl db` wrote it", next_step, str(path)) from error
 
 
 def folder_error(path: Path, error: OSError) -> PblError:
