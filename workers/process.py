@@ -139,7 +139,8 @@ def work(options: Options, pipe: Connection) -> None:
 
     with heartbeat.Heartbeat(options.resource) as beats:
         takes = loop.takes(options.short, options.phones, options.phone)
-        worker = loop.Worker(tables, beats, stop, report, options.batch, takes=takes, phone=options.phone)
+        kind = {"takes": takes, "phone": options.phone, "siblings": options.processes > 1}
+        worker = loop.Worker(tables, beats, stop, report, options.batch, **kind)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
             with frames_kept():
