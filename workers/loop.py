@@ -78,7 +78,7 @@ log = logging.getLogger("pbl.worker")
 IDLE_S = (0.5, 20.0)
 #: An idle worker looks at all tables when no worker has done so for as long.
 REFRESH_EVERY_S = 60.0
-#: Pause of the process for phones between two looks: it is never longer, and of milliseconds where nothing waits.
+#: Longest pause of the process for phones between two looks, and of one that ends when nothing is left.
 PHONE_S = 1.0
 #: The other processes leave a job of a phone's recording to that process for so long (s): longer than its pause.
 LEAVE_S = 3
@@ -107,7 +107,7 @@ class Worker:
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
     job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
     phone: looks often, and for nothing but jobs that are queued. long_waits: called where no job is more urgent than
-    that of a long recording, which another process takes.
+    that of a long recording, which another process takes. siblings: other processes of this machine work, too.
     """
 
     tables: Sequence[Any]
@@ -120,6 +120,7 @@ class Worker:
     takes: str | None = None
     phone: bool = False
     long_waits: Callable[[], None] | None = None
+    siblings: bool = False
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
@@ -130,9 +131,9 @@ class Worker:
     _looked_for_long: float = -1e9
 
     def run(self, once: bool = False, max_jobs: int | None = None) -> None:
-        """Work until `stop`; with `once` until nothing is left to do anywhere."""
+        """Work until `stop`; with `once` until nothing is left to do anywhere, nor in hand on this machine."""
         self._everything = True if once else None
-        idle, troubled = IDLE_S[0], 0
+        idle, troubled, quiet = IDLE_S[0], 0, 0
         while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
             try:
                 n = self.step()
@@ -149,17 +150,20 @@ class Worker:
                 continue
             troubled = 0
             if n:
-                idle = IDLE_S[0]
+                idle, quiet = IDLE_S[0], 0
                 continue
             if found:
                 continue
             if once and found is not None:
-                return
+                # A job of another process of this machine may make more computable, and has not yet when it ends.
+                quiet = 0 if self.siblings and queue.anything_reserved_here() else quiet + 1
+                if quiet > self.siblings:
+                    return
             self._let_go()
             self.heartbeat.doing("waits for a recording of a phone" if self.phone else "idle")
             # Not all at the same moment: workers that were started together would go on asking together.
             self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
-            idle = min(2 * idle, PHONE_S if self.phone else IDLE_S[1])
+            idle = min(2 * idle, PHONE_S if self.phone or once else IDLE_S[1])
 
     def step(self) -> int:
         """Take jobs of the table that is most urgent, and do them; returns how many."""
@@ -273,5 +277,5 @@ class Worker:
         self.found.add(found)
         if found.queued or found.freed:
             event(log, logging.INFO, "refreshed", queued=found.queued, freed=found.freed, planned=found.planned)
-        mine = {t.__name__ for t in self.tables}
-        return any(name in mine for name in found.queued) or bool(found.freed)
+        mine, queued = {t.__name__ for t in self.tables}, [*found.queued, *(["SessionFit"] if found.planned else [])]
+        return any(name in mine for name in queued) or bool(found.freed)

@@ -153,6 +153,7 @@ def work(options: Options, pipe: Connection) -> None:
         worker = loop.Worker(
             tables, beats, stop, report, options.batch, takes=takes, phone=options.phone or options.long
         )
+        worker.siblings = options.processes > 1 and not options.long
         if options.short:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)

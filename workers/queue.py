@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from schemas import chain, fit, video
+from schemas import chain, computed_tables, fit, video
 from schemas.connection import dj
 from schemas.jobs import COUNTS, jobs_of, keys_of
 from schemas.transactions import repeated
@@ -151,6 +151,12 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
             if len(claims) == n:
                 break
     return claims
+
+
+def anything_reserved_here() -> bool:
+    """Whether a process of this machine has a job in hand."""
+    here = {"host": platform.node()}
+    return any(len(jobs_of(table).reserved & here) for table in computed_tables())
 
 
 def finish(job: Claim) -> None:

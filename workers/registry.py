@@ -43,7 +43,7 @@ class Stage:
 
 #: By the name of the table. Their order is not said here: `schemas.chain` reads it from the foreign keys.
 STAGES: dict[str, Stage] = {
-    "VideoInfo": Stage(DECODE, 1800.0, 4),
+    "VideoInfo": Stage(DECODE, 1800.0, 1),  # its pictures are in memory for the stages that follow
     "Tracking": Stage(DETECTOR, 4 * 3600.0, 1),
     "SubjectChoice": Stage(LIGHT, 300.0, 16),
     "Keypoints": Stage(DETECTOR, 4 * 3600.0, 1),

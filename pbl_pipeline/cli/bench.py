@@ -11,6 +11,8 @@ import click
 
 from pbl_pipeline.bench import METHOD, Row
 
+from .command_line import Commands
+
 
 class Numbers(click.ParamType):
     """Whole numbers with commas between them."""
@@ -29,7 +31,11 @@ class Numbers(click.ParamType):
         return numbers
 
 
-@click.group(epilog="Example: pbl bench fit --quick")
+class _BenchCommands(Commands):
+    entries = "pbl.bench"
+
+
+@click.group(cls=_BenchCommands, epilog="Example: pbl bench fit --quick")
 def bench() -> None:
     """Measure time, memory and error of the pipeline on this machine.
 

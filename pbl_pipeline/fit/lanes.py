@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
-from .problem import Problem, State, power_of_2
+from .problem import Problem, State
 from .solution import Outcome, outcome
 from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
@@ -27,7 +27,7 @@ from .solvers.result import Result
 from .weights import Weights
 
 #: Lanes of a program: enough to fill a GPU, where an iteration takes longer with each lane from 16 on; and of the one
-#: that the last problems move to.
+#: for few problems, which the last ones move to. No others: each takes most of a minute to compile.
 LANES, FEW = 32, 8
 #: Most frames of all lanes together, which bounds the memory.
 MOST_FRAMES = 32768
@@ -96,7 +96,7 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
 
     The result does not depend on which problems are given together beyond rounding.
     """
-    n = min(LANES, power_of_2(len(given)), max(1, MOST_FRAMES // given[0][0].weight.shape[0]))
+    n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // given[0][0].weight.shape[0]))
     waiting = iter(range(len(given)))
     holds = [next(waiting, None) for _ in range(n)]
     # Stacked on the host, so that each array goes to the device once; the last one stands in for those missing.

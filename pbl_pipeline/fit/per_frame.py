@@ -52,13 +52,15 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     """
     begin, compiled = time.perf_counter(), compile_seconds()
     twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
-    solve = functools.partial(_solve, params=params, last=not twice)
+    several = len(sessions) > 1  # then in lanes, also a part of them: each way has programs of its own to compile
+    solve = functools.partial(_solve, params=params, several=several)
     starts = [_with_detector(s, params) for s in starts]
-    found = solve(sessions, [s.problem for s in sessions], starts)
+    found = solve(sessions, [s.problem for s in sessions], starts, last=not twice)
     again = [i for i, f in enumerate(found) if suspicious(sessions[i], f.end.state.qpos)]
     if again:
         part = [sessions[i] for i in again]
-        turned = solve(part, [s.problem for s in part], [_with_detector(start_of(s, flip=True), params) for s in part])
+        turned_starts = [_with_detector(start_of(s, flip=True), params) for s in part]
+        turned = solve(part, [s.problem for s in part], turned_starts, last=not twice)
         for i, other in zip(again, turned, strict=True):
             found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
     traces, told = [f.trace for f in found], [None] * len(found)
@@ -69,7 +71,7 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
             each = zip(sessions, problems, [f.end.state.qpos for f in found], np.asarray(scales), strict=True)
             problems = [with_augmented_pelvis(*e) for e in each]
             told = [np.asarray(p.c_pelvis) for p in problems]
-        found = _solve(sessions, problems, starts, params, last=True)
+        found = solve(sessions, problems, starts, last=True)
         # The cost of the second one has a term more.
         traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]
     n = len(sessions)
@@ -130,13 +132,14 @@ def _solve(
     problems: Sequence[Problem],
     starts: Sequence[State],
     params: GaussNewtonParams,
+    several: bool,
     last: bool,
 ) -> list[Found]:
     body = sessions[0].body
     w = Weights.of(body, params, size_unseen=pixels_alone(sessions[0].problem))
     limits = limits_of(params)
     with one_blas_thread():
-        if len(sessions) > 1:
+        if several:
             return fit_many(body, list(zip(problems, starts, strict=True)), w, limits, last)
         p, start = jax.device_put((problems[0], starts[0]))
         return [fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), last)]

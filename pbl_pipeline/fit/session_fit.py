@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,8 @@ from .vertical import upright
 #: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
 #: packed meanwhile.
 BATCH = 128
+#: Batches that are solved at a time on a GPU: while the host works for one, the device iterates the other.
+SOLVERS = 2
 #: Threads that pack them and make their results: numpy's larger steps run beside each other.
 PACKERS = 4
 
@@ -100,8 +103,8 @@ def fit_sessions(
     Raises `PblError` SOLVER_UNKNOWN.
     """
     method = METHODS.find(paramset)
-    if batch is None:
-        batch = 1 if jax.default_backend() == "cpu" else BATCH
+    solvers, most = (1, 1) if jax.default_backend() == "cpu" else (SOLVERS, BATCH)
+    batch, taking = batch or most, threading.Lock()
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
 
     def finish(packed: _Packed, solution: Solution | PblError) -> None:
@@ -112,14 +115,21 @@ def fit_sessions(
         except PblError as error:
             out[packed.index] = error
 
-    # While a batch is solved, the results of the one before are made and the next one is packed.
+    def solve(parts: Iterator[list[_Packed]]) -> None:
+        while True:
+            with taking:
+                part = next(parts, None)
+            if part is None:
+                return
+            list(threads.map(finish, part, _solve(part, method)))  # raises what was raised there
+
+    # While batches are solved, the results of those before are made and the next one is packed.
     with (
         ThreadPoolExecutor(PACKERS) as threads,
         contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
+        ThreadPoolExecutor(solvers) as pool,
     ):
-        finished = [threads.map(finish, part, _solve(part, method)) for part in parts]
-        for results in finished:
-            list(results)  # raises what was raised there
+        list(pool.map(solve, [parts] * solvers))
     return [r for r in out if r is not None]
 
 

@@ -42,7 +42,7 @@ class Noise(NamedTuple):
     widening: float
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)  # a model is itself alone, so that results of one can be kept
 class VerticalModel:
     """How the vertical force varies; forces in body weights.
 
@@ -100,12 +100,13 @@ class VerticalForce:
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """A stretch of known phase: its frames, the components of persons in each, the covariance of the prior, and the
-    factor of the observed frames' covariance."""
+    """A stretch of known phase: its frames, in each the weights of the model's knots and the components of persons, the
+    covariance of the prior, and the factor of the observed frames' covariance."""
 
     at: slice
     model: VerticalModel
     noise: Noise
+    knots: np.ndarray
     person: np.ndarray
     prior: np.ndarray
     factor: Any
@@ -176,26 +177,31 @@ def vertical_force(
     model, noise
         How forces vary, and how `needed_bw` errs. Without noise the result is `needed_bw`.
     """
-    phase = support_phase(stands)
-    mean = np.array(needed_bw, float)
-    parts = []
+    mean, parts = np.array(needed_bw, float), _parts(np.asarray(stands, bool).tobytes(), model, noise)
+    for part in parts:
+        expected = part.knots @ model.expected(speed)
+        mean[part.at] = expected + part.update((needed_bw[part.at] - 1.0 - noise.gain * (expected - 1.0))[::_EVERY])
+    return VerticalForce(mean, parts)
+
+
+@functools.lru_cache(maxsize=4)  # what is drawn of a recording has the same steps
+def _parts(stands: bytes, model: VerticalModel, noise: Noise) -> tuple[_Part, ...]:
+    """Return the stretches of known phase of `stands` (N, 2), as bytes."""
+    phase, parts = support_phase(np.frombuffer(stands, bool).reshape(-1, 2)), []
     for run in runs(np.isfinite(phase)):
         for frames in np.array_split(np.arange(run.start, run.stop), -(-(run.stop - run.start) // _PART)):
             at = slice(int(frames[0]), int(frames[-1]) + 1)
-            part = _part(at, phase[at], model, noise)
-            expected = _rows(phase[at], model.phase) @ model.expected(speed)
-            mean[at] = expected + part.update((needed_bw[at] - 1.0 - noise.gain * (expected - 1.0))[::_EVERY])
-            parts.append(part)
-    return VerticalForce(mean, tuple(parts))
+            parts.append(_part(at, phase[at], model, noise))
+    return tuple(parts)
 
 
 def _part(at: slice, phase: np.ndarray, model: VerticalModel, noise: Noise) -> _Part:
-    n = len(phase)
-    person = _rows(phase, model.phase) @ model.person
+    n, knots = len(phase), _rows(phase, model.phase)
+    person = knots @ model.person
     prior = person @ person.T + model.step_sd**2 * _kernel(n, model.step_memory_s)
     own = noise.sd**2 * _kernel(n, model.noise_memory_s) + 1e-9 * np.eye(n)
     factor = cho_factor((noise.gain**2 * prior + own)[::_EVERY, ::_EVERY])
-    return _Part(at, model, noise, person, prior, factor)
+    return _Part(at, model, noise, knots, person, prior, factor)
 
 
 def _rows(phase: np.ndarray, knots: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime
 import errno
 import json
@@ -124,8 +125,9 @@ def test_a_batch_that_fails_is_computed_one_by_one(tables: None, tmp_path: Path,
     assert len(fit.SessionFit()) == 2
 
 
-def test_a_job_asks_the_database_for_rows_only_and_for_few(tables: None, tmp_path: Path):
+def test_a_job_asks_the_database_for_rows_only_and_for_few(tables: None, tmp_path: Path, monkeypatch):
     """Not for columns of tables, which do not change while a worker runs."""
+    monkeypatch.setitem(registry.STAGES, "VideoInfo", dataclasses.replace(registry.STAGES["VideoInfo"], batch=4))
     register(*videos(tmp_path, *(f"walk{i}" for i in range(8))))
     refresh.refresh()
     _, *steps = worker_replay.record([video.VideoInfo])
@@ -392,18 +394,17 @@ def test_a_result_of_other_inputs_is_not_used(tables: None, tmp_path: Path):
 
 
 # ----------------------------------------------------------------------------------------------- processes that go away
-@pytest.mark.parametrize("table", [video.VideoInfo, fit.SessionFit])
+@pytest.mark.parametrize("table", [tracking.SubjectChoice, fit.SessionFit])
 def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp_path: Path, monkeypatch, table):
     """The job in hand and those that were taken with it, one after the other or in batches."""
     for i in range(3):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
-    if table is fit.SessionFit:
-        monkeypatch.setattr(
-            pbl_pipeline.fit,
-            "fit_sessions",
-            lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions],
-        )
-        Worker([t for t in schemas.computed_tables() if t is not table], Silent()).run(once=True)
+    monkeypatch.setattr(
+        pbl_pipeline.fit,
+        "fit_sessions",
+        lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions],
+    )
+    Worker([t for t in schemas.computed_tables() if t is not table], Silent()).run(once=True)
     refresh.refresh()
 
     def ends(*_: object) -> None:

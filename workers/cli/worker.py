@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from workers.registry import DETECTOR, FIT, GROUPS
+
+if TYPE_CHECKING:
+    from workers.process import Options
 
 #: Share of a process of `--processes auto`: more cores bring one recording little, fewer suffice where a GPU computes
 #: the networks, and the memory is what a long recording takes (bytes).
@@ -83,24 +86,16 @@ def worker(
     Example: pbl worker --resource gpu --batch 32 --metrics-port 9108
     """
     import schemas
-    from pbl_pipeline.resources import cores, memory_bytes
     from schemas import connection
     from workers.log import to_stderr
-    from workers.process import Options, given_gpus
     from workers.supervisor import Supervisor
 
     schemas.activate(methods=False)  # a wrong address or login is reported here, not by a process that is started again
     to_stderr()
-    gpus = given_gpus() if FIT in GROUPS[resource] else ()
-    if processes == "auto":
-        room = min(cores() // (CORES_WITH_GPU if gpus else CORES_EACH), memory_bytes() // MEMORY_EACH)
-        processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
-    options = Options(
-        resource=resource,
-        processes=int(processes or len(gpus) or 1),
-        # Among so many sessions are enough of one size to be solved together.
-        batch=batch or (128 if gpus else 1),
-        gpus=gpus,
+    options = options_of(
+        resource,
+        processes,
+        batch,
         once=once,
         max_jobs=max_jobs,
         grace_s=grace_s,
@@ -112,3 +107,22 @@ def worker(
     if metrics_port is not None:
         supervisor.metrics.serve(metrics_port, metrics_host, connection.another)
     raise click.exceptions.Exit(supervisor.run())
+
+
+def options_of(resource: str, processes: int | str | None, batch: int | None = None, **others: Any) -> Options:
+    """Options of a worker on this machine. processes, batch: as given on the command line."""
+    from pbl_pipeline.resources import cores, memory_bytes
+    from workers.process import Options, given_gpus
+
+    gpus = given_gpus() if FIT in GROUPS[resource] else ()
+    if processes == "auto":
+        room = min(cores() // (CORES_WITH_GPU if gpus else CORES_EACH), memory_bytes() // MEMORY_EACH)
+        processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
+    return Options(
+        resource=resource,
+        processes=int(processes or len(gpus) or 1),
+        # Among so many sessions are enough of one size to be solved together.
+        batch=batch or (128 if gpus else 1),
+        gpus=gpus,
+        **others,
+    )
