@@ -126,6 +126,8 @@ def on_page(language: str, english: str) -> Markup:
         return shown
     parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )|, (?=then `?pbl )", english)
     kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
+    if not kept:
+        return escape(text(language, "error.click"))
     stop = "" if kept.endswith((".", "!", "?")) else "."
     return Markup("{}{} {}").format(library(language, kept), stop, text(language, "error.click"))
 

@@ -28,7 +28,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         language = reader_language(request)
         activity, _, name = found.measure.rpartition(".")
         words, unit, decimals = ("", "", 1) if found.measure == INDEX else (MEASURES | TASKS)[name]
-        title = ", ".join(texts.library_words(language, w) for w in (activity, words) if w)
+        title = ": ".join(texts.library_words(language, w) for w in (activity, words) if w)
         title = title or texts.text(language, "visit.gdi")
         label = texts.text(language, "trend.chart", name=title, n=len(found.points))
         picture = _chart(label, found.points, found.measure == INDEX)
