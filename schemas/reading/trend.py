@@ -70,8 +70,8 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
     if measure not in known:
         raise PblError(
             "USAGE",
-            found=f"the measure {measure[:40]!r}",
-            expected=f"one of {', '.join(known)}",
+            found=f"the measure '{measure[:40]}'" if measure else "no measure",
+            expected=f"a measure: {', '.join(known)}",
             next_step="choose one on the page",
         )
     rows = sorted(visits_of(subject), key=lambda v: (v.day or datetime.date.min, v.session_id))

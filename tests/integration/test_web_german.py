@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -292,7 +293,7 @@ def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, engl
             continue
         sent = {**form.fields, name: values}
         files = [("files", ("neu.txt", b"x"))] if form.of_files else None
-        how = {"params": sent} if form.method == "get" else {"data": sent, "files": files}
+        how: Any = {"params": sent} if form.method == "get" else {"data": sent, "files": files}
         answer = browser.request(form.method, action, **how, follow_redirects=False)
         about = (action, name, [v[:12] for v in values])
         if answer.status_code == 303:
@@ -304,7 +305,7 @@ def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, engl
         if answer.status_code == 200 and form.method == "post" and action != "/visits":
             at = answer.text.find(f'name="{name}"')
             beside = answer.text[at : answer.text.find("</div>", at)]
-            # What else is right may miss another field that is needed; nothing has 300 letters.
+            # A right value may leave another field wrong; 300 letters are too many for each.
             assert 'class="problem"' in (beside if values == bad[1] and not form.of_files else answer.text), about
 
 
