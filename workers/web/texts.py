@@ -11,6 +11,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from pbl_pipeline.errors import CODES
+from schemas.intake.sheets import with_point
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
@@ -104,6 +105,12 @@ def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
 def decimals(language: str, text: str) -> str:
     """Return a text with its decimal points as the language has them."""
     return _POINT.sub(",", text) if language == "de" else text
+
+
+def in_field(language: str, number: str) -> str:
+    """Return a stored number as a field shows it: with the decimals of a language, where that is read as the same."""
+    own = decimals(language, number)
+    return own if with_point(own) == number else number
 
 
 def in_chart(language: str, chart: Markup) -> Markup:
