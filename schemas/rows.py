@@ -181,6 +181,8 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
             # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
                 raise
+            if target.connection.in_transaction:  # it goes on seeing the tables as they were
+                raise pymysql.err.OperationalError(REPEAT[0], str(error)) from error
     return counts
 
 

@@ -80,7 +80,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
-from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measures, task_motion
+from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measure, task_measures, task_motion
 from .types import (
     ACTIVITIES,
     ANY_PACE,

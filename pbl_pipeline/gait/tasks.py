@@ -142,7 +142,7 @@ def task_measures(
         if reason or not values:
             reasons[name] = reason
         else:
-            measures[name] = _measure(values)
+            measures[name] = task_measure(values)
     return measures, reasons
 
 
@@ -321,7 +321,8 @@ def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def _measure(values: Sequence[float]) -> Measure:
+def task_measure(values: Sequence[float]) -> Measure:
+    """Return the measure of repetitions of a task."""
     mean = float(np.mean(values))
     sd = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return Measure(None, None, mean, sd, len(values), sd, None if sd is None or mean == 0 else 100.0 * sd / abs(mean))

@@ -80,11 +80,11 @@ class Figure:
         legend = [(f"\N{BLACK CIRCLE} {text}", colour) for text, colour in self.colours.items()]
         width = int(self.drawing.get_figwidth() * 17)
         below = [*legend, *((line, _INK) for text in words for line in textwrap.wrap(text, width))] if words else []
-        box, inches = self.drawing.get_tightbbox(), self.drawing.dpi_scale_trans
+        box, (width_in, height_in) = self.drawing.get_tightbbox(), self.drawing.get_size_inches()
         out = io.BytesIO()
         with mpl.rc_context(_STYLE):
-            texts = [
-                self.drawing.text(box.x0, box.y0 - i / 6, text, color=colour, fontsize=7.5, transform=inches)
+            texts = [  # at fractions of the figure, which a tight box moves along
+                self.drawing.text(box.x0 / width_in, (box.y0 - i / 6) / height_in, text, color=colour, fontsize=7.5)
                 for i, (text, colour) in enumerate(below, 1)
             ]
             undated = {"Date" if kind == "svg" else "CreationDate": None}

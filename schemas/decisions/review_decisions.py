@@ -136,7 +136,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
         raise PblError(
             "USAGE",
             found="the reason 'other' without words" if reason == "other" else f"the reason {reason!r}",
-            expected="one of " + ", ".join(UNUSABLE) + "; with 'other' also words of your own",
+            expected=f"a reason of the list ({', '.join(UNUSABLE)}); with 'other' also words of your own",
             next_step="choose a reason, and say more in the note; nothing was changed",
             key=f"video_id={video_id}",
         )
@@ -219,7 +219,7 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
         if not may_be_accepted(check, outcome):
             raise PblError(
                 "USAGE",
-                found=f"{check} is {outcome}",
+                found=f"the check {check} is {outcome}",
                 expected="a check that asks for attention (WARN)",
                 next_step="what failed is not accepted: it is recorded or computed again",
                 key=f"session_id={session_id}",

@@ -121,7 +121,7 @@ class Side:
     cycles: tuple[Cycle, ...]
     scores: dict[str, Score]
     change: Change | None  # of the index; None for the reference itself
-    changes: dict[str, Change]  # of the measures
+    changes: dict[str, Change]  # of `ShownVisit.all_measures`
     differs: tuple[Difference, ...]  # what was not made or filmed like the reference
 
     @property
@@ -198,8 +198,8 @@ def _compared(
     if about is not first:
         if about.result is not None and first.result is not None:
             change, differs = change_since(about.result, first.result), not_alike(about.result, first.result)
-        for name, (other, _) in first.measures.items():
-            mine, _ = about.measures.get(name, (None, ""))
+        for name, (other, _) in first.all_measures.items():
+            mine, _ = about.all_measures.get(name, (None, ""))
             if mine is not None and other is not None:
                 errors = [(m.error_sd, m.minimal_change) for m in (mine, other)]
                 changes[name] = judged(mine.mean - other.mean, errors, differs)

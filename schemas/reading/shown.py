@@ -65,6 +65,15 @@ class ShownVisit:
         return None if self.shown is None else self.results[self.shown]
 
     @functools.cached_property
+    def all_measures(self) -> dict[str, tuple[Measure | None, str]]:
+        """`measures`, and those of tasks by "ACTIVITY.MEASURE": the mean over the recordings where they are several."""
+        of_tasks: dict[str, list[tuple[Measure | None, str]]] = {}
+        for r in self.recordings:
+            for name, found in self.tasks.get(r.name, {}).items():
+                of_tasks.setdefault(f"{r.condition.activity}.{name}", []).append(found)
+        return {**self.measures, **{name: _mean_of(found) for name, found in of_tasks.items()}}
+
+    @functools.cached_property
     def visit(self) -> Visit | None:
         """The visit with all of the shown result, which the page itself does not need. Raises as `load_visit`."""
         return None if self.load_visit is None else self.load_visit()
@@ -97,6 +106,16 @@ class ShownRecording:
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
+
+
+def _mean_of(found: Sequence[tuple[Measure | None, str]]) -> tuple[Measure | None, str]:
+    """Return the measure of one recording, the mean of several, or why none has it."""
+    from pbl_pipeline.gait import task_measure
+
+    known = [(m, reason) for m, reason in found if m is not None]
+    if len(known) < 2:
+        return known[0] if known else found[0]
+    return task_measure([m.mean for m, _ in known]), ""
 
 
 def _problem(video_id: int) -> str:

@@ -7,12 +7,11 @@ import datetime
 from collections import Counter
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.filming import Difference
 from pbl_pipeline.words import MEASURES
 
-from .. import session
+from .. import session, video
 from .shown import shown_visit
-from .visit_list import Change, Result, change_since, not_alike, results_of, visits_of
+from .visit_list import Change, Result, change_since, judged, not_alike, results_of, visits_of
 
 #: Name of the index among the measures.
 INDEX = "gdi"
@@ -22,8 +21,9 @@ INDEX = "gdi"
 class Point:
     """The value of a visit.
 
-    value: None where it is not known, for the reason. bounds: its 90 % interval; of a measure that of the spread of its
-    cycles alone. before: the change since the visit before with a value; first: since the first one.
+    value: None where it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
+    least, its minimal detectable change, are known, else of the spread of its cycles or repetitions alone. before: the
+    change since the visit before with a value; first: since the first one.
     """
 
     session_id: int
@@ -35,6 +35,8 @@ class Point:
     left: float | None
     right: float | None
     reason: str
+    error: float | None = None
+    least: float | None = None
     before: Change | None = None
     first: Change | None = None
 
@@ -43,8 +45,8 @@ class Point:
 class Trend:
     """The visits of a person, the earliest first, by the chain of methods that most of them have.
 
-    measure: the one that is shown; measures: all that can be; left_out: labels of the visits without a result of this
-    chain.
+    measure: the one that is shown; measures: all that can be, of tasks as "ACTIVITY.MEASURE"; left_out: labels of the
+    visits without a result of this chain.
     """
 
     subject: str
@@ -60,13 +62,16 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
 
     Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an unknown measure.
     """
+    from pbl_pipeline.gait import TASK_MEASURES
+
     subject = str(session.registered_visit(session_id)["subject"])
-    known = (INDEX, *MEASURES)
+    done = set((video.Video * session.Session & {"subject": subject}).to_arrays("activity"))
+    known = (INDEX, *MEASURES, *(f"{a}.{n}" for a, names in TASK_MEASURES.items() if a in done for n in names))
     if measure not in known:
         raise PblError(
             "USAGE",
-            found=f"the measure {measure[:40]!r}",
-            expected=f"one of {', '.join(known)}",
+            found=f"the measure '{measure[:40]}'" if measure else "no measure",
+            expected=f"a measure: {', '.join(known)}",
             next_step="choose one on the page",
         )
     rows = sorted(visits_of(subject), key=lambda v: (v.day or datetime.date.min, v.session_id))
@@ -100,7 +105,7 @@ def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
     if measure == INDEX:
         bounds = interval_90(result.index, result.sd)
         return {"value": result.index, "bounds": bounds, "left": None, "right": None, "reason": result.reason}
-    found, reason = shown_visit(session_id, at).measures.get(measure, (None, ""))
+    found, reason = shown_visit(session_id, at).all_measures.get(measure, (None, ""))
     if found is None:
         return {"value": None, "bounds": None, "left": None, "right": None, "reason": reason}
     return {
@@ -109,13 +114,15 @@ def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
         "left": found.left,
         "right": found.right,
         "reason": "",
+        "error": found.error_sd,
+        "least": found.minimal_change,
     }
 
 
 def _change(measure: str, point: Point, result: Result, earlier: Point, before: Result) -> Change | None:
-    """Return the change of a value; of a measure the whole error is not known, so it has no verdict."""
     if measure == INDEX:
         return change_since(result, before)
     assert point.value is not None
     assert earlier.value is not None
-    return Change(point.value - earlier.value, None, None, (*not_alike(result, before), Difference("error")))
+    errors = [(p.error, p.least) for p in (point, earlier)]
+    return judged(point.value - earlier.value, errors, not_alike(result, before))

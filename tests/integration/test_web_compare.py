@@ -187,7 +187,7 @@ def test_measures_say_that_their_interval_is_the_spread_of_cycles(visits: None):
 
 def test_measures_that_no_visit_has_are_named_once_by_their_reason():
     def side(**measures: tuple[object, str]) -> SimpleNamespace:
-        return SimpleNamespace(about=SimpleNamespace(measures=measures))
+        return SimpleNamespace(about=SimpleNamespace(all_measures=measures))
 
     task, known = "no trial of walking", (1.0, "")
     found = SimpleNamespace(

@@ -9,17 +9,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pymysql
 import pytest
 
 from pbl_pipeline.errors import PblError
 from schemas import fit, gait, gdi, qc, tracking
 from schemas.datajoint_setup import dj
 from schemas.decisions import review_decisions
+from schemas.intake.records import set_height
 from schemas.operations import forget
 from schemas.reading import shown, visit_list
 from schemas.reading.usable import Usable, usable
 from schemas.review import Decision
 from schemas.rows import delete_below
+from schemas.transactions import in_transaction
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
@@ -155,6 +158,35 @@ def test_a_worker_that_inserts_below_what_is_deleted_stops_no_decision(two_alike
     monkeypatch.setattr(dj.Table, "delete", blocked)
     assert send(browser, two_alike, form_of(browser, two_alike), 1).status_code == 303
     assert (len(times), len(fit.SessionFit()), len(tracking.SubjectChoice())) == (2, 0, 0)
+
+
+def test_a_worker_that_inserts_below_what_a_transaction_deletes_is_waited_for(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """An open transaction does not see the new row however often it tries: it is begun again."""
+    register(small_video(tmp_path, "walk"))
+    populate()
+    info, events = dj.conn().conn_info, gait.GaitEvents.full_table_name
+    account = {"user": info["user"], "password": info["passwd"], "autocommit": True}
+    with pymysql.connect(host=info["host"], port=info["port"], **account) as worker:
+        query = worker.cursor().execute
+        query(f"CREATE TABLE {events[:-1]}_kept` AS SELECT * FROM {events}")
+        delete_below(gait.GaitEvents, gait.GaitEvents.keys())
+        real, begun = dj.Table.delete, []
+
+        def insert_first(self: Any, **how: Any) -> int:
+            if not begun:
+                query(f"INSERT INTO {events} SELECT * FROM {events[:-1]}_kept`")
+            begun.append(self.table_name)
+            return real(self, **how)
+
+        monkeypatch.setattr(dj.Table, "delete", insert_first)
+        try:
+            changes = in_transaction(lambda: set_height("P001", 1.7))
+        finally:
+            query(f"DROP TABLE {events[:-1]}_kept`")
+    assert "gait_events" in changes[1]
+    assert (len(begun), len(gait.GaitEvents()), len(fit.SessionFit())) == (2, 0, 0)
 
 
 def test_a_fit_that_is_deleted_while_its_page_loads_is_pending(two_alike: int, monkeypatch: pytest.MonkeyPatch):

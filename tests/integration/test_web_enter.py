@@ -54,6 +54,9 @@ def test_each_change_is_a_row_with_what_was_before(two_visits: None):
     page = browser.get("/visits/1").text
     assert "clinical score mJOA: read from the &lt;i&gt;chart" in page
     assert re.search(r"TUG 9\.5 <span[^>]*>s<", page)
+    browser.headers["accept-language"] = "de"
+    assert re.search(r"TUG 9,5 <span[^>]*>s<", browser.get("/visits/1").text)
+    assert 'value="9,5"' in browser.get("/visits/1/enter").text
     # What is as it was changes nothing; an empty field removes.
     assert send(browser, 1, mJOA="13.0", TUG="9,50", BBS="", role="baseline").status_code == 303
     assert (score(1, "BBS"), len(Decision())) == (None, 5)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
+import itertools
 import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -224,10 +227,86 @@ def test_refusals_of_forms_are_german(clinic: None, english: set[str]):
         assert not english_of(page, english, NAMES + r"|instrument\w*|x{3,}|minimal_\w+"), values
     seen = re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/enter").text)
     assert seen is not None
-    for value in ("99", "-1", "viel", "12.5", "nan"):
-        page = web.post(browser, "/visits/1/enter", seen=seen[1], **{"value:mJOA": value}).text
+    contradict = {"value:mJOA": "2", "value:mJOA-LE": "3"}, {"value:10MWT_s": "1,5", "value:10MWT_m_per_s": "2"}
+    for value in (*({"value:mJOA": v} for v in ("99", "-1", "viel", "12.5", "nan")), *contradict):
+        page = web.post(browser, "/visits/1/enter", seen=seen[1], **value).text
         assert 'class="problem"' in page, value
         assert not english_of(page, english, NAMES + "|viel|nan|score"), value
+
+
+class _Forms(HTMLParser):
+    """The forms of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[_Form] = []
+        self._list = ""
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {k: v or "" for k, v in attrs}
+        name, kind = given.get("name", ""), given.get("type", "text")
+        if tag == "form":
+            self.found.append(_Form(given.get("action", ""), given.get("method", "get"), "enctype" in given))
+        elif not self.found:
+            return
+        elif tag == "option" and "selected" in given and self._list:
+            self.found[-1].fields[self._list] = given["value"]
+        elif tag in ("input", "select", "textarea") and name and kind not in ("file", "checkbox"):
+            self._list = name if tag == "select" else ""
+            self.found[-1].fields[name] = given.get("value", "")
+            if kind != "hidden":
+                self.found[-1].asked.append(name)
+        elif tag == "button" and name:
+            self.found[-1].fields.setdefault(name, given.get("value", ""))
+
+
+@dataclasses.dataclass
+class _Form:
+    """Where a form goes, its fields as they are, and the names of those that a person fills in."""
+
+    action: str
+    method: str
+    of_files: bool
+    fields: dict[str, str] = dataclasses.field(default_factory=dict)
+    asked: list[str] = dataclasses.field(default_factory=list)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "path",
+    ["/visits", "/visits/new", "/visits/1", "/visits/1/facts", "/visits/1/upload", "/visits/1/enter", "/visits/1/trend",
+     "/instruments", "/recordings/1"],
+)  # fmt: skip
+def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, english: set[str], path: str):
+    """The last test here: what is taken is another clinic. Empty, too long, of a wrong kind, out of range, with
+    decimals of either language, twice."""
+    browser = web.client(role="reviewer,operator")
+    browser.headers["accept-language"] = "de"
+    bad = [[""], ["x" * 300], ["<b>?"], ["-1"], ["9" * 400], ["1,5"], ["1.234,5"], ["31.2.2026"], ["1", "2"]]
+    asked = {(f.action, name) for f in _Forms(browser.get(path).text).found for name in f.asked}
+    assert asked
+    for (action, name), values in itertools.product(sorted(asked), bad):
+        there = _Forms(browser.get(path).text).found
+        form = next((f for f in there if f.action == action and name in f.asked), None)
+        if form is None:  # as of a check that was accepted
+            continue
+        sent = {**form.fields, name: values}
+        files = [("files", ("neu.txt", b"x"))] if form.of_files else None
+        how: Any = {"params": sent} if form.method == "get" else {"data": sent, "files": files}
+        answer = browser.request(form.method, action, **how, follow_redirects=False)
+        about = (action, name, [v[:12] for v in values])
+        if answer.status_code == 303:
+            continue
+        assert answer.status_code in (200, 400, 409), about
+        assert "INTERNAL" not in answer.text, about
+        shown = re.sub(r"(?s)<datalist.*?</datalist>", "", answer.text)
+        assert not english_of(shown, english, NAMES + r"|x{3,}|neu\.txt|1\.234,5|<b>\?|instrument\w*|\w+_\w+"), about
+        if answer.status_code == 200 and form.method == "post" and action != "/visits":
+            at = answer.text.find(f'name="{name}"')
+            beside = answer.text[at : answer.text.find("</div>", at)]
+            # A right value may leave another field wrong; 300 letters are too many for each.
+            assert 'class="problem"' in (beside if values == bad[1] and not form.of_files else answer.text), about
 
 
 def advice() -> dict[str, str]:
@@ -276,6 +355,28 @@ def test_the_advice_of_every_check_has_its_german(english: set[str]):
     untold = {text: file for text, file in every.items() if "<span" in texts.library("de", text)}
     # The advice about the far leg names a side and is written out for both.
     assert not {t: f for t, f in untold.items() if "leg was behind the" not in t}
+
+
+#: Where a page or what it calls refuses; what only commands and JSON say is left out.
+REFUSING = (
+    "schemas/studies/visit_forms.py", "schemas/decisions/review_decisions.py", "schemas/decisions/event_corrections.py",
+    "schemas/reading/shown.py", "schemas/reading/trend.py", "workers/browser_uploads.py", "workers/phone_uploads.py",
+    *(f"workers/web/{name}.py" for name in ("registration", "decide", "computing", "reports", "movement")),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("file", REFUSING)
+def test_every_refusal_of_a_page_has_its_german(file: str):
+    tree = ast.parse((Path(pbl_pipeline.__file__).parent.parent / file).read_text("utf-8"))
+    said: list[str] = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        parts = [k.value for k in node.keywords if k.arg in ("found", "expected", "next_step")]
+        parts += node.args[:3] if getattr(node.func, "id", "") in ("refused", "conflict") else []
+        said += [text for part in parts for text in _texts_of(part, {})]
+    assert said
+    assert not [text for text in said if "<span" in texts.on_page("de", text)]
 
 
 def test_a_choice_carried_to_another_tracking_has_its_german():

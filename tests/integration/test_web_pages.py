@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from schemas.intake.records import set_condition
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -27,6 +28,7 @@ PAGES = {
     "report": ("/visits/1/report", ""),
     "compare": ("/compare?v=1.0&v=4", ""),
     "trend": ("/visits/1/trend", ""),
+    "tasks": ("/visits/3/trend?measure=sit_to_stand.peak_trunk_lean_deg", ""),
     "letter": ("/visits/1/letter", ""),
     "refused": ("/recordings/5", ""),
     "enter": ("/visits/1/enter", ""),
@@ -74,7 +76,8 @@ def visits(chromium: Any, module_tables: Path) -> None:
     walk, two = small_video(module_tables, "walk"), small_video(module_tables, "two", people="two alike")
     register(walk, session_label="2026-01-10")
     register(two, session_label="after the second operation, left knee")
-    register(small_video(module_tables, "none", people="nobody"), subject="P002", session_label="2026-02-10")
+    nobody = register(small_video(module_tables, "none", people="nobody"), subject="P002", session_label="2026-02-10")
+    set_condition(nobody[0], activity="sit_to_stand")
     register(small_video(module_tables, "later"), session_label="2026-04-10")
     of_screen = (np.pad(f, ((20, 20), (0, 0), (0, 0))) for f in numbered_frames(60, 72, 128))
     register(write_video(module_tables / "screen.mp4", of_screen, constant_rate(60)), subject="P003")

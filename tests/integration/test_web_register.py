@@ -161,6 +161,11 @@ def test_what_is_stated_is_corrected_with_what_was_before(tmp_path: Path):
     page = browser.get("/visits/1").text
     assert "measured again" in page
     assert "71.5" in page
+    browser.headers["accept-language"] = "de"
+    german = browser.get("/visits/1").text
+    assert "1,72" in german
+    assert "Timed Up and Go" in german[german.index("measured again") :]
+    assert all(f'value="{v}"' in browser.get("/visits/1/facts").text for v in ("1,72", "71,5"))
     # The same again changes nothing; an empty field removes.
     n = len(Decision())
     assert correct(browser, height_m="1.720", mass_kg="71.5").status_code == 303

@@ -9,7 +9,8 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
-from schemas import gdi
+from schemas import gait, gdi
+from schemas.intake.records import set_condition
 from schemas.reading import comparison
 from schemas.reading.trend import trend_of
 from tests.integration import web
@@ -22,12 +23,21 @@ INDICES = {1: 80.0, 2: 85.0, 3: 95.0}
 
 @pytest.fixture(scope="module")
 def visits(module_tables: Path) -> None:
-    """Visits 1 to 3 of P001 with indices of an sd of 3 and a minimal change of 6, 4 of P002, and 5 of P001 that is not
-    computed."""
+    """Visits 1 to 3 of P001 with indices of an sd of 3 and a minimal change of 6, 4 of P002, 5 and 6 of
+    P003 who rises from a chair, at the second in two recordings, and 7 of P001 that is not computed."""
     days = (("P001", "2026-01-10"), ("P001", "2026-04-10"), ("P001", "2026-07-10"), ("P002", "2026-02-01"))
     for subject, day in days:
         register(small_video(module_tables, f"walk {day}"), subject=subject, session_label=day)
+    chair = {"chair 1": "2026-01-20", "chair 2": "2026-05-20", "chair 3": "2026-05-20"}
+    rising = [register(small_video(module_tables, n), subject="P003", session_label=d)[0] for n, d in chair.items()]
+    for recording in rising:
+        set_condition(recording, activity="sit_to_stand")
     populate()
+    for recording, seconds in zip(rising, (14.0, 11.0, 10.0), strict=True):
+        rows = gait.Spatiotemporal.Measure & {"video_id": recording, "measure": "five_rises_time_s"}
+        gait.Spatiotemporal.Measure.update1(
+            {**rows.keys()[0], "measure_mean": seconds, "measure_sd": 0.2, "measure_n": 5}
+        )
     register(small_video(module_tables, "later"), session_label="2026-09-10")
     for number, index in INDICES.items():
         key = comparison.shown_visit(number).key
@@ -37,7 +47,7 @@ def visits(module_tables: Path) -> None:
 
 def test_the_index_of_all_visits_with_what_is_more_than_chance(visits: None):
     found = trend_of(2)
-    assert found == trend_of(1) == trend_of(5)
+    assert found == trend_of(1) == trend_of(7)
     assert (found.subject, [p.session_id for p in found.points]) == ("P001", [1, 2, 3])
     assert found.left_out == ("2026-09-10",)
     first, second, third = found.points
@@ -64,6 +74,44 @@ def test_a_measure_has_its_spread_and_no_verdict(visits: None):
     for wrong, code in ((("nothing",), "USAGE"), ((), "DB_NOT_FOUND")):
         with pytest.raises(PblError, match=code):
             trend_of(1 if wrong else 99, *wrong)
+
+
+def test_a_measure_whose_error_is_known_is_judged_as_in_compare(visits: None):
+    sets = [{"fit_set": comparison.shown_visit(n).key["fit_set"]} for n in (1, 2)]
+    keys = list((gdi.SessionGdi.Measure & sets & {"session_measure": "cadence_steps_per_min"}).keys())
+    known = {"session_measure_error": 0.3, "session_measure_minimal_change": 0.5}
+    try:
+        for key in keys:
+            gdi.SessionGdi.Measure.update1({**key, **known})
+        second = trend_of(1, "cadence_steps_per_min").points[1]
+        compared = comparison.compare([(1, None), (2, None)]).compared[1]
+        assert second.before == compared.changes["cadence_steps_per_min"]
+        assert second.before is not None
+        assert (second.before.sure, second.before.least) == (abs(second.before.by) >= 0.5, 0.5)
+    finally:
+        for key in keys:
+            gdi.SessionGdi.Measure.update1({**key, **dict.fromkeys(known)})
+
+
+def test_times_of_a_task_are_compared_and_have_a_trend(visits: None):
+    name = "sit_to_stand.five_rises_time_s"
+    found = trend_of(5, name)
+    assert [p.value for p in found.points] == [14.0, 10.5]  # of two recordings the mean
+    change = found.points[1].before
+    assert change is not None
+    assert (change.by, change.sure, change.differs) == (-3.5, None, (Difference("error"),))
+    assert not any(m.startswith("tug") for m in found.measures)  # never done
+    side = comparison.compare([(5, None), (6, None)]).compared[1]
+    assert side.changes[name] == change
+    browser = web.client()
+    page = " ".join(browser.get("/compare?v=5&v=6").text.split())
+    assert "sit to stand: Time of five rises" in page
+    assert '<span class="value">10.50</span>' in page
+    assert page.count("interval: spread of the repetitions only") == 1
+    page = browser.get(f"/visits/6/trend?measure={name}").text
+    assert "14.00" in page
+    assert "-3.50" in page.replace("\N{MINUS SIGN}", "-")
+    assert "sit_to_stand" not in browser.get("/visits/1/trend").text
 
 
 def test_the_page_of_the_trend(visits: None):
@@ -98,4 +146,4 @@ def test_the_letter_is_one_visit_on_a_page(visits: None):
     assert "R. Viewer" in page
     assert page.count('<svg viewBox="0 0 280 200"') == 4
     assert "<form method" not in page.split("<main")[1]  # nothing to decide on paper
-    assert "no measures yet" in browser.get("/visits/5/letter").text
+    assert "no measures yet" in browser.get("/visits/7/letter").text

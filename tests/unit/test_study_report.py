@@ -242,7 +242,11 @@ def test_the_files_of_a_report(written):
     assert "nan" not in re.sub(r"<[^>]*>", " ", page).lower().split()
     for path in (out / "figures").glob("*.svg"):
         root = ET.parse(path).getroot()
-        words = " ".join(t.text or "" for t in root.iter("{http://www.w3.org/2000/svg}text"))
+        texts = list(root.iter("{http://www.w3.org/2000/svg}text"))
+        words = " ".join(t.text or "" for t in texts)
+        _, _, width, height = map(float, root.attrib["viewBox"].split())
+        at = [(float(t.attrib["x"]), float(t.attrib["y"])) for t in texts if "x" in t.attrib]
+        assert all(0 <= x < width and 0 < y < height for x, y in at), (path.name, at)  # none is cut off
         for said in ("synthetic spine cohort", "80 persons", "no video", f"PBL pipeline {code_version()}"):
             assert said in words, path.name
         assert "nan" not in path.read_text().lower()

@@ -17,7 +17,7 @@ from pbl_pipeline import charts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, number
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
 from . import texts
@@ -64,9 +64,9 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             found=found,
             names=names,
             keys=[charts.series_key(i) for i in range(len(names))],
-            measures=[n for n in MEASURES if any(_known(c, n) for c in found.compared)],
+            measures=[n for n in _names(found) if any(_known(c, n) for c in found.compared)],
             without=without(found),
-            of_cycles=[n for n in MEASURES if any(_interval(c, n) is not None for c in found.compared)],
+            of_cycles=[n for n in _names(found) if any(_interval(c, n) is not None for c in found.compared)],
             charts=charts_of(found, names, reader_language(request)),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
@@ -122,19 +122,24 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
 
 def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
     """The interval of a measure if it is that of the spread of its cycles alone; None where it has none."""
-    value, _ = one.about.measures.get(name, (None, ""))
+    value, _ = one.about.all_measures.get(name, (None, ""))
     return None if value is None or value.error_sd is not None else value.interval
 
 
 def _known(one: comparison.Side, name: str) -> bool:
-    return one.about.measures.get(name, (None, ""))[0] is not None
+    return one.about.all_measures.get(name, (None, ""))[0] is not None
+
+
+def _names(found: comparison.Comparison) -> list[str]:
+    """The measures that any of the results may have, in order."""
+    return list(dict.fromkeys(name for c in found.compared for name in c.about.all_measures))
 
 
 def without(found: comparison.Comparison) -> dict[tuple[str, ...], list[str]]:
     """The measures that no result has, by the reasons that the results give."""
     out: dict[tuple[str, ...], list[str]] = {}
-    for name in MEASURES:
-        reasons = dict.fromkeys(c.about.measures[name][1] for c in found.compared if name in c.about.measures)
+    for name in _names(found):
+        reasons = dict.fromkeys(c.about.all_measures[name][1] for c in found.compared if name in c.about.all_measures)
         if any(reasons) and not any(_known(c, name) for c in found.compared):
             out.setdefault(tuple(filter(None, reasons)), []).append(name)
     return out

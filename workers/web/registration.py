@@ -19,11 +19,12 @@ from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
 from ..incoming import VIDEO_ENDINGS, Copy
 from ..refresh import queue_visit
+from . import texts
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
-from .pages import Pages
+from .pages import Pages, reader_language
 from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
@@ -76,12 +77,13 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
-        stored = await tables.ask(visit_forms.facts, number_of(request))
+        stored, language = await tables.ask(visit_forms.facts, number_of(request)), reader_language(request)
+        numbers = {n: texts.in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
         return pages.show(
             request,
             "facts.html",
             facts=stored,
-            values={**stored.values, **values},
+            values={**stored.values, **numbers, **values},
             errors=errors,
             longest=visit_forms.FACTS,
             choices={"activity": ACTIVITIES, "pace": PACES},

@@ -11,6 +11,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from pbl_pipeline.errors import CODES
+from schemas.intake.sheets import with_point
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
@@ -106,6 +107,12 @@ def decimals(language: str, text: str) -> str:
     return _POINT.sub(",", text) if language == "de" else text
 
 
+def in_field(language: str, number: str) -> str:
+    """Return a stored number as a field shows it: with the decimals of a language, where that is read as the same."""
+    own = decimals(language, number)
+    return own if with_point(own) == number else number
+
+
 def in_chart(language: str, chart: Markup) -> Markup:
     """Return a chart whose numbers have the decimals of a language."""
     return Markup(_TEXT.sub(lambda m: decimals(language, m[0]), chart))  # noqa: S704  it was escaped when it was drawn
@@ -126,6 +133,8 @@ def on_page(language: str, english: str) -> Markup:
         return shown
     parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )|, (?=then `?pbl )", english)
     kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
+    if not kept:
+        return escape(text(language, "error.click"))
     stop = "" if kept.endswith((".", "!", "?")) else "."
     return Markup("{}{} {}").format(library(language, kept), stop, text(language, "error.click"))
 

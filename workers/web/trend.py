@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from pbl_pipeline import charts
-from pbl_pipeline.words import MEASURES
+from pbl_pipeline.words import MEASURES, TASKS
 from schemas.reading.trend import INDEX, Point, trend_of
 
 from . import texts
@@ -26,15 +26,16 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         if as_json(request):
             return pages.show(request, "", found=plain(found))
         language = reader_language(request)
-        decimals = 1 if found.measure == INDEX else MEASURES[found.measure][2]
-        title = texts.text(language, "visit.gdi")
-        if found.measure != INDEX:
-            title = texts.library_words(language, MEASURES[found.measure][0])
+        activity, _, name = found.measure.rpartition(".")
+        words, unit, decimals = ("", "", 1) if found.measure == INDEX else (MEASURES | TASKS)[name]
+        title = ": ".join(texts.library_words(language, w) for w in (activity, words) if w)
+        title = title or texts.text(language, "visit.gdi")
         label = texts.text(language, "trend.chart", name=title, n=len(found.points))
         picture = _chart(label, found.points, found.measure == INDEX)
         values = {
             "found": found,
             "title": title,
+            "unit": unit,
             "decimals": decimals,
             "picture": picture and texts.in_chart(language, picture),
             "index": INDEX,
