@@ -1,5 +1,5 @@
-"""From the link of a visit to its index: a Chromium films the demo recording, with orientations as sensors. A minute and a
-half on two idle cores; a loaded machine loses frames. `pytest -m machine tests/end_to_end/test_phone.py`."""
+"""From the link of a visit to its index: a Chromium films the demo recording, with orientations as sensors. Minutes,
+and two idle cores: a loaded machine loses frames. `pytest -m machine tests/end_to_end/test_phone.py`."""
 
 from __future__ import annotations
 
