@@ -44,6 +44,7 @@ allow.onclick = async () => {
   }
   await listening;
   video.srcObject = stream;
+  video.onresize = () => page.style.setProperty("--shape", `${video.videoWidth} / ${video.videoHeight}`);
   await video.play();
   allow.hidden = true, record.hidden = false;
   record.focus();
@@ -162,9 +163,9 @@ async function sendAll() {
         states.set(facts.name, t("sending", { n: Math.floor(100 * share) }));
         show();
       });
-      states.set(facts.name, t("refused", { why: told.error }));
+      states.set(facts.name, told.verdict);
       if (told.state === "received") await remove(facts.name);
-      else await keep({ ...facts, complete: false, about: { ...facts.about, why: told.error } });
+      else await keep({ ...facts, complete: false, about: { ...facts.about, why: told.verdict } });
     }
     if (!take && navigator.onLine && ["no_network", "ended"].some((name) => $(".said").textContent === t(name))) say("");
   } catch (error) {
@@ -205,7 +206,7 @@ function choose(step) {
 async function show() {
   const found = await all(), told = await request("/phone/state.json").catch(() => null);
   const lines = found.filter((one) => one.name !== taken?.name || !take).map((one) => {
-    const own = one.visit !== visit ? t("other_visit") : one.about.why ? t("refused", { why: one.about.why }) : states.get(one.name) ?? t("on_phone");
+    const own = one.visit !== visit ? t("other_visit") : one.about.why ?? states.get(one.name) ?? t("on_phone");
     const line = item(new Date(one.made).toLocaleTimeString(language), own);
     if (one.complete && !one.about.why) return line;
     const buttons = [[t("remove"), () => remove(one.name)]];
@@ -219,13 +220,22 @@ async function show() {
     return line;
   });
   for (const one of told?.recordings ?? [])
-    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict || t("refused", { why: one.error })));
-  $(".next").textContent = told?.next ?? "";
+    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict));
+  // What became of the last one: not of the one before, while it is on its way.
+  const waits = found.filter((one) => one.complete && one.visit === visit).pop();
+  if (waits) tell(".latest", states.get(waits.name) ?? t("on_phone"));
+  else if (told) tell(".latest", told.recordings[0]?.verdict ?? "");
+  if (told) tell(".next", told.next);
   if (told && !take) lead(told.protocol);
   list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
   $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toFixed(1) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
+}
+
+/** A screen reader reads it again only where it is another. @param {string} at @param {string} text */
+function tell(at, text) {
+  if ($(at).textContent !== text) $(at).textContent = text;
 }
 
 /** @param {string} head @param {string} text */
