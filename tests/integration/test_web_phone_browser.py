@@ -420,6 +420,51 @@ def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int)
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
 
 
+#: In the page: a camera that delivers a frame, by which the encoder is chosen, and one more.
+ONE_FRAME = """
+() => {
+  const Processor = MediaStreamTrackProcessor;
+  globalThis.MediaStreamTrackProcessor = class {
+    constructor(about) {
+      let n = 0;
+      this.readable = new Processor(about).readable.pipeThrough(new TransformStream({
+        transform: (frame, out) => { if (n++ < 2) out.enqueue(frame); else frame.close(); },
+      }));
+    }
+  };
+}
+"""
+
+
+def test_a_recording_of_one_frame_arrives(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate(ONE_FRAME)
+        film(page, 1.0)
+        page.locator(".keep").click()
+        arrived(page)
+    assert about_the_recording()["frames"] == 1
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames == 1
+
+
+def test_the_longest_take_ends_by_itself_and_is_kept(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        assert page.locator("main").get_attribute("data-most") == "600"
+        page.evaluate("() => { document.querySelector('main').dataset.most = '2'; }")
+        page.locator(".allow").click()
+        page.locator(".record").click()
+        page.locator(".said", has_text="Ten minutes").wait_for()
+        page.locator(".keep").click()
+        arrived(page)
+    assert 2 <= probe((video.Video & {"session_id": visit}).fetch1("video_path")).time_s[-1] < 5
+
+
+def test_the_first_load_is_small(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        sizes = page.evaluate("() => performance.getEntries().map((e) => [e.name, e.transferSize ?? 0])")
+    assert any("mediabunny" in name and size for name, size in sizes)
+    assert sum(size for _, size in sizes) < 300_000, sizes
+
+
 #: Widths and heights of phones (CSS px), upright and on their side.
 SIZES = [(360, 740), (390, 844), (430, 932), (740, 360), (844, 390), (932, 430)]
 

@@ -4,7 +4,7 @@ import { openCamera, Take } from "./capture_film.js";
 import { logOf, Sensors, up } from "./capture_sensors.js";
 import { all, keep, newFile, Refusal, remove, request, send } from "./capture_takes.js";
 
-const MOST_MS = 600_000, LEAST_ROOM = 3e8, AGAIN_MS = 3000;
+const LEAST_ROOM = 3e8, AGAIN_MS = 3000;
 const page = /** @type {HTMLElement} */ (document.querySelector("main"));
 const texts = JSON.parse(page.dataset.said ?? "{}"), language = document.documentElement.lang;
 const visit = Number(page.dataset.visit), size = Number(page.dataset.part);
@@ -138,7 +138,7 @@ setInterval(() => {
   if (take) {
     const s = Math.max(0, take.endMs - take.startMs) / 1000;
     clock.textContent = `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
-    if (s * 1000 > MOST_MS) stop("too_long");
+    if (s > Number(page.dataset.most)) stop("too_long");
   } else sensors.trim();
   if (!sensors.last) return;
   const [x, y] = up(sensors.last), held = Math.round(Math.atan2(x, y) / (Math.PI / 2)) * 90;
