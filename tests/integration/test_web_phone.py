@@ -432,7 +432,8 @@ def test_what_is_not_a_recording_is_refused(visit: int, tmp_path: Path):
     browser, whole = phone(visit), film(tmp_path)
     most = phone_recordings.PART_BYTES * MOST_PARTS
     for wrong in (
-        {"video_bytes": 10 * 10**9}, {"video_bytes": most + 1}, {"video_bytes": 1000 * phone_recordings.PART_BYTES}, {"log_bytes": most}, {"video_bytes": 0},
+        {"video_bytes": 10 * 10**9}, {"video_bytes": most + 1},
+        {"video_bytes": 1000 * phone_recordings.PART_BYTES}, {"log_bytes": most}, {"video_bytes": 0},
         {"video_bytes": -1}, {"video_bytes": True}, {"video_bytes": "1"}, {"log_bytes": None}, {"sha256": "x" * 64},
         {"sha256": "../../etc/passwd"}, {"sha256": 3},
     ):  # fmt: skip
