@@ -114,7 +114,6 @@ def camera_matrix(width: int, height: int) -> np.ndarray:
 def film(page: Any, n: int) -> np.ndarray:
     """Film until shortly before the last of `n` pictures, with the orientation in which each was taken; the times (s)
     at which the camera delivered the frames."""
-    page.locator(".allow").click()
     page.locator(".said", has_text="Ready").wait_for()
     page.evaluate(SHOWN)
 

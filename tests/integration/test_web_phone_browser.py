@@ -89,9 +89,11 @@ def filming(
     denied: bool = False,
     protocol: str = "",
     tls: bool = False,
+    script: str = "",
     **context: Any,
 ) -> Iterator[Any]:
-    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network. script: a
+    function that runs before those of the page."""
     where, scheme = Where(), "https" if tls else "http"
     if tls:
         cert, key = certificates.server_certificate(("127.0.0.1",))
@@ -104,6 +106,8 @@ def filming(
             if not denied:
                 made.grant_permissions(["camera", "accelerometer", "gyroscope"], origin=base)
             page, errors = made.new_page(), []
+            if script:
+                page.add_init_script(f"({script})()")
             page.on("pageerror", lambda error: errors.append(str(error)))
             page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
             if orientation:
@@ -131,9 +135,7 @@ def turn(page: Any, wxyz: tuple[float, ...]) -> None:
 
 
 def film(page: Any, seconds: float = 3.0) -> None:
-    """From the opened page to the end of a take: one tap for the camera, one to begin."""
-    if page.locator(".allow").is_visible():
-        page.locator(".allow").click()
+    """From the opened page to the end of a take: one tap to begin, one to end."""
     page.locator(".record").click()
     page.wait_for_selector("main[data-filming='yes']")
     page.wait_for_timeout(1000 * seconds)
@@ -158,7 +160,6 @@ def about_the_recording() -> dict[str, Any]:
 def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     with filming(camera, visit) as page:
         page.get_by_label("fast").check()
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(1500)
@@ -254,7 +255,6 @@ def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int
 
 def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(4500)
@@ -268,7 +268,6 @@ def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
 
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     with filming(camera, visit, orientation=False) as page:
-        page.locator(".allow").click()
         page.get_by_text("tells no orientation").wait_for()
         film(page, 1.5)
         page.locator(".again").click()
@@ -310,9 +309,7 @@ def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
 
 
 def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
-    with filming(camera, visit) as page:
-        page.evaluate(CANVAS)  # a camera whose picture can be turned
-        page.locator(".allow").click()
+    with filming(camera, visit, script=CANVAS) as page:  # a camera whose picture can be turned
         for why, act in (
             ("interrupted", "() => { Object.defineProperty(document, 'hidden', {get: () => true, configurable: true});"
                             " document.dispatchEvent(new Event('visibilitychange')); delete document.hidden; }"),
@@ -351,7 +348,6 @@ JUMPING = """
 def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit: int, jump_s: float):
     with filming(camera, visit) as page:
         page.evaluate(JUMPING)
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(2000)
@@ -366,7 +362,6 @@ def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit
 
 def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        page.locator(".allow").click()
         page.locator(".said", has_text="Ready").wait_for()
         page.evaluate(
             "() => { globalThis.estimate = navigator.storage.estimate.bind(navigator.storage);"
@@ -397,15 +392,18 @@ def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(cam
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 10
 
 
+#: In the page: the person does not allow the camera; a phone that asks for its sensors within a tap, as iOS does.
+REFUSING = (
+    "() => { navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', 'NotAllowedError'); }; }"
+)
+ASKING = "() => { DeviceOrientationEvent.requestPermission = async () => 'granted'; }"
+
+
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
     with filming(chromium, visit, denied=True) as page:  # has none
-        page.locator(".allow").click()
         page.locator(".said", has_text="camera").wait_for()
-    with filming(camera, visit, denied=True) as page:
-        page.evaluate(
-            "() => { const refuse = () => Promise.reject(new DOMException('', 'NotAllowedError'));"
-            " navigator.mediaDevices.getUserMedia = refuse; }"
-        )
+    with filming(camera, visit, denied=True, script=REFUSING) as page:
+        page.locator(".said", has_text="Permissions").wait_for()
         page.locator(".allow").click()
         page.locator(".said", has_text="Permissions").wait_for()
 
@@ -450,7 +448,6 @@ def test_the_longest_take_ends_by_itself_and_is_kept(camera: Any, visit: int):
     with filming(camera, visit) as page:
         assert page.locator("main").get_attribute("data-most") == "600"
         page.evaluate("() => { document.querySelector('main').dataset.most = '2'; }")
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.locator(".said", has_text="Ten minutes").wait_for()
         page.locator(".keep").click()
@@ -489,7 +486,7 @@ def look(page: Any, picture: Path) -> None:
 @pytest.mark.parametrize(("scheme", "language"), [("light", "en"), ("dark", "de")])
 def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: str, language: str, tmp_path: Path):
     folder = Path(os.environ.get("PBL_PICTURES") or tmp_path)
-    with filming(camera, visit, torn=True, color_scheme=scheme, locale=language) as page:
+    with filming(camera, visit, torn=True, script=ASKING, color_scheme=scheme, locale=language) as page:
         look(page, folder / f"phone-{scheme}-opened")
         page.locator(".allow").click()
         page.wait_for_function("() => document.querySelector('main').style.getPropertyValue('--shape')")

@@ -33,9 +33,12 @@ let why = "";
 /** The step of the protocol that is filmed. @type {any} */
 let chosen = null;
 
-allow.onclick = async () => {
+/** @type {Promise<void>|null} */
+let listening = null;
+
+async function open() {
   if (!navigator.mediaDevices) return say("not_secure");
-  const listening = sensors.listen();  // within the tap: iOS asks for it
+  listening ??= sensors.listen();  // within the tap: iOS asks for it
   try {
     stream = await openCamera();
   } catch (error) {
@@ -49,8 +52,9 @@ allow.onclick = async () => {
   allow.hidden = true, record.hidden = false;
   record.focus();
   stream.getVideoTracks()[0].onended = () => stop("interrupted");
-  setTimeout(() => say("ready", sensors.source ? "" : t("no_sensors")), 700);
-};
+  setTimeout(() => { if (!take) say("ready", sensors.source ? "" : t("no_sensors")); }, 700);
+}
+allow.onclick = open;
 
 record.onclick = () => (take ? stop("") : start());
 
@@ -250,4 +254,7 @@ setInterval(sendAll, AGAIN_MS);
 addEventListener("online", sendAll);
 navigator.serviceWorker?.register("/phone/offline.js", { scope: "/phone" }).catch(() => {});
 show().then(sendAll);
+// Where the sensors are asked for within a tap alone (iOS), the camera waits for that tap.
+const kinds = /** @type {any} */ (globalThis);
+if (kinds.RelativeOrientationSensor || !kinds.DeviceOrientationEvent?.requestPermission) open();
 page.dataset.ready = "yes";
