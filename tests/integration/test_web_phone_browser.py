@@ -393,10 +393,15 @@ def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(cam
 
 
 #: In the page: the person does not allow the camera; a phone that asks for its sensors within a tap, as iOS does.
-REFUSING = (
-    "() => { navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', 'NotAllowedError'); }; }"
-)
-ASKING = "() => { DeviceOrientationEvent.requestPermission = async () => 'granted'; }"
+REFUSING = """
+() => { navigator.mediaDevices.getUserMedia = async () => { throw new DOMException("", "NotAllowedError"); }; }
+"""
+ASKING = """
+() => {
+  delete globalThis.RelativeOrientationSensor;
+  DeviceOrientationEvent.requestPermission = async () => "granted";
+}
+"""
 
 
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
