@@ -98,7 +98,7 @@ def held(number: ArrayLike) -> Rotation:
 
 
 def seen(pictures: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """What that camera sees of pictures that a level one took."""
+    """Return what that camera sees of pictures that a level one took."""
     level = Rotation.from_quat(LEVEL, scalar_first=True)
     for n, picture in enumerate(pictures):
         wide, own = (camera_matrix(*size) for size in (picture.shape[1::-1], WINDOW))
@@ -204,7 +204,7 @@ def test_the_log_is_on_the_clock_of_the_pictures(walked: Walked):
     (path,) = walked.path.parent.glob("*.json")
     offset = offset_s(read_phone_log(path), walked.pictures, walked.times_s)
     assert abs(offset) <= 0.01
-    # What the fit takes for an offset is what it takes for one with a log that has none.
+    # The fit estimates the same offset with an ideal log.
     estimated = [trial_of(label)["trial_clock_offset"] for label in ("2026-01-10", "2026-02-01")]
     assert estimated[0] == pytest.approx(estimated[1], abs=0.01)
 
