@@ -204,6 +204,8 @@ def test_the_same_recording_twice_arrives_once(visit: int, tmp_path: Path):
     again = begin(browser, whole)
     assert (again["number"], again["state"], again["missing"]) == (first["number"], "received", [])
     assert finish(browser, first["number"]).json()["state"] == "received"
+    answer = put(browser, first["number"], 0, parts_of(whole)[0], len(whole))
+    assert (answer.status_code, code(answer)) == (422, "UPLOAD_REFUSED")
     assert send(phone(visit), whole)["number"] == first["number"]  # by a new link as well
     assert len(video.Video()) == len(PhoneRecording()) == 1
 
@@ -312,6 +314,14 @@ def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tm
     assert empty["state"] == "received"
 
 
+def test_a_recording_of_one_frame_is_to_be_filmed_again(visit: int, tmp_path: Path):
+    browser = phone(visit)
+    assert send(browser, small_video(tmp_path, "short", n=1).read_bytes(), attitude_log())["state"] == "received"
+    populate()
+    said = browser.get("/phone/state.json").json()["recordings"][0]["verdict"]
+    assert said.startswith("Film again: "), said
+
+
 def test_what_cannot_be_used_is_said_with_what_to_do(visit: int, tmp_path: Path):
     browser = phone(visit)
     send(browser, film(tmp_path))
@@ -405,11 +415,25 @@ def test_a_phone_reaches_nothing_but_its_own_visit(visit: int, tmp_path: Path):
     assert {int(n) for n in PhoneRecording().to_arrays("session_id")} == {visit}
 
 
+def test_the_session_of_a_reader_is_no_phone(visit: int, tmp_path: Path):
+    reader, whole = web.client("reader", target=nothing), film(tmp_path)
+    assert web.post(reader, f"/visits/{visit}/film", hours=2).status_code == 403
+    number = begin(phone(visit), whole)["number"]
+    for answer in (
+        reader.get("/phone"), reader.get("/phone/state.json"), finish(reader, number),
+        reader.post("/phone/recordings.json", json=stated(whole)),
+        put(reader, number, 0, parts_of(whole)[0], len(whole)),
+    ):  # fmt: skip
+        assert answer.status_code == 403, answer.request.url
+    assert len(PhoneLink()) == 1
+
+
 def test_what_is_not_a_recording_is_refused(visit: int, tmp_path: Path):
     browser, whole = phone(visit), film(tmp_path)
     most = phone_recordings.PART_BYTES * MOST_PARTS
     for wrong in (
-        {"video_bytes": 10 * 10**9}, {"video_bytes": most + 1}, {"log_bytes": most}, {"video_bytes": 0},
+        {"video_bytes": 10 * 10**9}, {"video_bytes": most + 1},
+        {"video_bytes": 1000 * phone_recordings.PART_BYTES}, {"log_bytes": most}, {"video_bytes": 0},
         {"video_bytes": -1}, {"video_bytes": True}, {"video_bytes": "1"}, {"log_bytes": None}, {"sha256": "x" * 64},
         {"sha256": "../../etc/passwd"}, {"sha256": 3},
     ):  # fmt: skip
@@ -463,6 +487,8 @@ def test_what_is_no_video_or_comes_with_a_bad_log_is_refused_by_its_code(visit: 
     told = send(browser, b"no video at all" * 1000)
     assert told["state"] == "refused"
     assert told["error"].startswith("VIDEO_NOT_A_VIDEO")
+    assert told["verdict"].startswith("cannot be used: ")
+    assert "VIDEO_NOT_A_VIDEO" not in told["verdict"]
     told = send(browser, film(tmp_path), b'{"time_s": [1]}')
     assert told["state"] == "refused"
     assert told["error"].startswith("PHONE_LOG")

@@ -89,9 +89,11 @@ def filming(
     denied: bool = False,
     protocol: str = "",
     tls: bool = False,
+    script: str = "",
     **context: Any,
 ) -> Iterator[Any]:
-    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network."""
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network. script: a
+    function that runs before those of the page."""
     where, scheme = Where(), "https" if tls else "http"
     if tls:
         cert, key = certificates.server_certificate(("127.0.0.1",))
@@ -104,6 +106,8 @@ def filming(
             if not denied:
                 made.grant_permissions(["camera", "accelerometer", "gyroscope"], origin=base)
             page, errors = made.new_page(), []
+            if script:
+                page.add_init_script(f"({script})()")
             page.on("pageerror", lambda error: errors.append(str(error)))
             page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
             if orientation:
@@ -131,9 +135,7 @@ def turn(page: Any, wxyz: tuple[float, ...]) -> None:
 
 
 def film(page: Any, seconds: float = 3.0) -> None:
-    """From the opened page to the end of a take: one tap for the camera, one to begin."""
-    if page.locator(".allow").is_visible():
-        page.locator(".allow").click()
+    """From the opened page to the end of a take: one tap to begin, one to end."""
     page.locator(".record").click()
     page.wait_for_selector("main[data-filming='yes']")
     page.wait_for_timeout(1000 * seconds)
@@ -158,7 +160,6 @@ def about_the_recording() -> dict[str, Any]:
 def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     with filming(camera, visit) as page:
         page.get_by_label("fast").check()
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(1500)
@@ -254,7 +255,6 @@ def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int
 
 def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(4500)
@@ -268,7 +268,6 @@ def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
 
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     with filming(camera, visit, orientation=False) as page:
-        page.locator(".allow").click()
         page.get_by_text("tells no orientation").wait_for()
         film(page, 1.5)
         page.locator(".again").click()
@@ -310,9 +309,7 @@ def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
 
 
 def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
-    with filming(camera, visit) as page:
-        page.evaluate(CANVAS)  # a camera whose picture can be turned
-        page.locator(".allow").click()
+    with filming(camera, visit, script=CANVAS) as page:  # a camera whose picture can be turned
         for why, act in (
             ("interrupted", "() => { Object.defineProperty(document, 'hidden', {get: () => true, configurable: true});"
                             " document.dispatchEvent(new Event('visibilitychange')); delete document.hidden; }"),
@@ -351,7 +348,6 @@ JUMPING = """
 def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit: int, jump_s: float):
     with filming(camera, visit) as page:
         page.evaluate(JUMPING)
-        page.locator(".allow").click()
         page.locator(".record").click()
         page.wait_for_selector("main[data-filming='yes']")
         page.wait_for_timeout(2000)
@@ -366,7 +362,6 @@ def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit
 
 def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        page.locator(".allow").click()
         page.locator(".said", has_text="Ready").wait_for()
         page.evaluate(
             "() => { globalThis.estimate = navigator.storage.estimate.bind(navigator.storage);"
@@ -397,15 +392,23 @@ def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(cam
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 10
 
 
+#: In the page: the person does not allow the camera; a phone that asks for its sensors within a tap, as iOS does.
+REFUSING = """
+() => { navigator.mediaDevices.getUserMedia = async () => { throw new DOMException("", "NotAllowedError"); }; }
+"""
+ASKING = """
+() => {
+  delete globalThis.RelativeOrientationSensor;
+  DeviceOrientationEvent.requestPermission = async () => "granted";
+}
+"""
+
+
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
     with filming(chromium, visit, denied=True) as page:  # has none
-        page.locator(".allow").click()
         page.locator(".said", has_text="camera").wait_for()
-    with filming(camera, visit, denied=True) as page:
-        page.evaluate(
-            "() => { const refuse = () => Promise.reject(new DOMException('', 'NotAllowedError'));"
-            " navigator.mediaDevices.getUserMedia = refuse; }"
-        )
+    with filming(camera, visit, denied=True, script=REFUSING) as page:
+        page.locator(".said", has_text="Permissions").wait_for()
         page.locator(".allow").click()
         page.locator(".said", has_text="Permissions").wait_for()
 
@@ -420,21 +423,92 @@ def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int)
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: str, tmp_path: Path):
-    """At three widths, upright and on its side: nothing sticks out, and axe finds nothing."""
+#: In the page: a camera that delivers a frame, by which the encoder is chosen, and one more.
+ONE_FRAME = """
+() => {
+  const Processor = MediaStreamTrackProcessor;
+  globalThis.MediaStreamTrackProcessor = class {
+    constructor(about) {
+      let n = 0;
+      this.readable = new Processor(about).readable.pipeThrough(new TransformStream({
+        transform: (frame, out) => { if (n++ < 2) out.enqueue(frame); else frame.close(); },
+      }));
+    }
+  };
+}
+"""
+
+
+def test_a_recording_of_one_frame_arrives(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        page.evaluate(ONE_FRAME)
+        film(page, 1.0)
+        page.locator(".keep").click()
+        arrived(page)
+    assert about_the_recording()["frames"] == 1
+    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames == 1
+
+
+def test_the_longest_take_ends_by_itself_and_is_kept(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        assert page.locator("main").get_attribute("data-most") == "600"
+        page.evaluate("() => { document.querySelector('main').dataset.most = '2'; }")
+        page.locator(".record").click()
+        page.locator(".said", has_text="Ten minutes").wait_for()
+        page.locator(".keep").click()
+        arrived(page)
+    assert 2 <= probe((video.Video & {"session_id": visit}).fetch1("video_path")).time_s[-1] < 5
+
+
+def test_the_first_load_is_small(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        sizes = page.evaluate("() => performance.getEntries().map((e) => [e.name, e.transferSize ?? 0])")
+    assert any("mediabunny" in name and size for name, size in sizes)
+    assert sum(size for _, size in sizes) < 300_000, sizes
+
+
+#: Widths and heights of phones (CSS px), upright and on their side.
+SIZES = [(360, 740), (390, 844), (430, 932), (740, 360), (844, 390), (932, 430)]
+
+
+def look(page: Any, picture: Path) -> None:
+    """At each size nothing sticks out, the button of this step is in view, and axe finds nothing serious."""
     from axe_playwright_python.sync_playwright import Axe
 
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.evaluate("scrollTo(0, 0)")
+        for button in page.locator(":is(.film, .after) button:visible").all():
+            box = button.bounding_box()
+            assert box["height"] >= 44, (picture, width)
+            assert box["y"] + box["height"] <= height, (picture, width)
+        page.screenshot(path=picture.with_name(f"{picture.name}-{width}.png"), full_page=True)
+    found = Axe().run(page).response["violations"]
+    assert not [v["id"] for v in found if v["impact"] in ("serious", "critical")], found
+
+
+@pytest.mark.parametrize(("scheme", "language"), [("light", "en"), ("dark", "de")])
+def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: str, language: str, tmp_path: Path):
     folder = Path(os.environ.get("PBL_PICTURES") or tmp_path)
-    with filming(camera, visit, color_scheme=scheme, locale="de" if scheme == "dark" else "en") as page:
+    with filming(camera, visit, torn=True, script=ASKING, color_scheme=scheme, locale=language) as page:
+        look(page, folder / f"phone-{scheme}-opened")
         page.locator(".allow").click()
-        page.wait_for_timeout(800)
-        for width, height in ((360, 740), (390, 844), (430, 932), (844, 390)):
-            page.set_viewport_size({"width": width, "height": height})
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            page.screenshot(path=folder / f"phone-{width}-{scheme}.png", full_page=True)
-            found = Axe().run(page).response["violations"]
-            assert not [v["id"] for v in found if v["impact"] in ("serious", "critical")], found
-        film(page, 1.0)
-        page.screenshot(path=folder / f"phone-after-{scheme}.png", full_page=True)
-        page.locator(".again").click()
+        page.wait_for_function("() => document.querySelector('main').style.getPropertyValue('--shape')")
+        look(page, folder / f"phone-{scheme}-ready")
+        # The frame for the person lies in the picture: its box has the picture's shape.
+        box = page.locator(".view").bounding_box()
+        assert box["width"] / box["height"] == pytest.approx(640 / 480, rel=0.01)
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        look(page, folder / f"phone-{scheme}-filming")
+        page.locator(".record").click()
+        page.wait_for_selector(".after:not([hidden])")
+        look(page, folder / f"phone-{scheme}-after")
+        page.context.set_offline(True)
+        page.locator(".keep").click()
+        page.wait_for_function("() => document.querySelector('.latest').textContent")
+        look(page, folder / f"phone-{scheme}-waits")
+        page.context.set_offline(False)
+        page.wait_for_function("() => document.querySelector('.takes b')?.textContent === '1'", timeout=30_000)
+        look(page, folder / f"phone-{scheme}-sent")

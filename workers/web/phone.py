@@ -121,7 +121,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
             {
                 "visit": phone.session_id,
                 "expires": f"{phone.expires.isoformat()}Z",
-                "recordings": [{**_shown(sent), "verdict": verdict(language, judged)} for sent, judged in recordings],
+                "recordings": [_shown(language, sent, judged) for sent, judged in recordings],
                 "next": next_words(language, more),
                 "protocol": [dataclasses.asdict(step) for step in steps],
             }
@@ -197,7 +197,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
         if len(missing) == sent.n_parts:
             await _on_disk(phone_uploads.check_room, sent)
-        return JSONResponse({**_shown(sent), "missing": missing})
+        return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
 
     async def worker(request: Request) -> Response:
         """A script with a thread of its own; below the page's address, so that it is there without network as well."""
@@ -269,11 +269,13 @@ async def _body(request: Request, kind: str, most: int) -> bytes:
     return await read_body(request, most)
 
 
-def _shown(sent: Sent) -> dict[str, Any]:
+def _shown(language: str, sent: Sent, judged: Usable | None) -> dict[str, Any]:
+    why = texts.library_words(language, sent.error.partition(": ")[2])
     return {
         "number": sent.number,
         "sha256": sent.sha256,
         "state": sent.state,
         "error": sent.error,
         "about": sent.about,
+        "verdict": texts.text(language, "capture.refused", why=why) if why else verdict(language, judged),
     }

@@ -4,7 +4,7 @@ import { openCamera, Take } from "./capture_film.js";
 import { logOf, Sensors, up } from "./capture_sensors.js";
 import { all, keep, newFile, Refusal, remove, request, send } from "./capture_takes.js";
 
-const MOST_MS = 600_000, LEAST_ROOM = 3e8, AGAIN_MS = 3000;
+const LEAST_ROOM = 3e8, AGAIN_MS = 3000;
 const page = /** @type {HTMLElement} */ (document.querySelector("main"));
 const texts = JSON.parse(page.dataset.said ?? "{}"), language = document.documentElement.lang;
 const visit = Number(page.dataset.visit), size = Number(page.dataset.part);
@@ -33,9 +33,12 @@ let why = "";
 /** The step of the protocol that is filmed. @type {any} */
 let chosen = null;
 
-allow.onclick = async () => {
+/** @type {Promise<void>|null} */
+let listening = null;
+
+async function open() {
   if (!navigator.mediaDevices) return say("not_secure");
-  const listening = sensors.listen();  // within the tap: iOS asks for it
+  listening ??= sensors.listen();  // within the tap: iOS asks for it
   try {
     stream = await openCamera();
   } catch (error) {
@@ -44,12 +47,14 @@ allow.onclick = async () => {
   }
   await listening;
   video.srcObject = stream;
+  video.onresize = () => page.style.setProperty("--shape", `${video.videoWidth} / ${video.videoHeight}`);
   await video.play();
   allow.hidden = true, record.hidden = false;
   record.focus();
   stream.getVideoTracks()[0].onended = () => stop("interrupted");
-  setTimeout(() => say("ready", sensors.source ? "" : t("no_sensors")), 700);
-};
+  setTimeout(() => { if (!take) say("ready", sensors.source ? "" : t("no_sensors")); }, 700);
+}
+allow.onclick = open;
 
 record.onclick = () => (take ? stop("") : start());
 
@@ -137,7 +142,7 @@ setInterval(() => {
   if (take) {
     const s = Math.max(0, take.endMs - take.startMs) / 1000;
     clock.textContent = `${Math.floor(s / 60)}:${String(Math.floor(s % 60)).padStart(2, "0")}`;
-    if (s * 1000 > MOST_MS) stop("too_long");
+    if (s > Number(page.dataset.most)) stop("too_long");
   } else sensors.trim();
   if (!sensors.last) return;
   const [x, y] = up(sensors.last), held = Math.round(Math.atan2(x, y) / (Math.PI / 2)) * 90;
@@ -162,9 +167,9 @@ async function sendAll() {
         states.set(facts.name, t("sending", { n: Math.floor(100 * share) }));
         show();
       });
-      states.set(facts.name, t("refused", { why: told.error }));
+      states.set(facts.name, told.verdict);
       if (told.state === "received") await remove(facts.name);
-      else await keep({ ...facts, complete: false, about: { ...facts.about, why: told.error } });
+      else await keep({ ...facts, complete: false, about: { ...facts.about, why: told.verdict } });
     }
     if (!take && navigator.onLine && ["no_network", "ended"].some((name) => $(".said").textContent === t(name))) say("");
   } catch (error) {
@@ -205,7 +210,7 @@ function choose(step) {
 async function show() {
   const found = await all(), told = await request("/phone/state.json").catch(() => null);
   const lines = found.filter((one) => one.name !== taken?.name || !take).map((one) => {
-    const own = one.visit !== visit ? t("other_visit") : one.about.why ? t("refused", { why: one.about.why }) : states.get(one.name) ?? t("on_phone");
+    const own = one.visit !== visit ? t("other_visit") : one.about.why ?? states.get(one.name) ?? t("on_phone");
     const line = item(new Date(one.made).toLocaleTimeString(language), own);
     if (one.complete && !one.about.why) return line;
     const buttons = [[t("remove"), () => remove(one.name)]];
@@ -219,13 +224,22 @@ async function show() {
     return line;
   });
   for (const one of told?.recordings ?? [])
-    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict || t("refused", { why: one.error })));
-  $(".next").textContent = told?.next ?? "";
+    if (one.state !== "uploading") lines.push(item(`${one.number}`, one.verdict));
+  // What became of the last one: not of the one before, while it is on its way.
+  const waits = found.filter((one) => one.complete && one.visit === visit).pop();
+  if (waits) tell(".latest", states.get(waits.name) ?? t("on_phone"));
+  else if (told) tell(".latest", told.recordings[0]?.verdict ?? "");
+  if (told) tell(".next", told.next);
   if (told && !take) lead(told.protocol);
   list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
   $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toFixed(1) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
+}
+
+/** A screen reader reads it again only where it is another. @param {string} at @param {string} text */
+function tell(at, text) {
+  if ($(at).textContent !== text) $(at).textContent = text;
 }
 
 /** @param {string} head @param {string} text */
@@ -240,4 +254,7 @@ setInterval(sendAll, AGAIN_MS);
 addEventListener("online", sendAll);
 navigator.serviceWorker?.register("/phone/offline.js", { scope: "/phone" }).catch(() => {});
 show().then(sendAll);
+// Where the sensors are asked for within a tap alone (iOS), the camera waits for that tap.
+const kinds = /** @type {any} */ (globalThis);
+if (kinds.RelativeOrientationSensor || !kinds.DeviceOrientationEvent?.requestPermission) open();
 page.dataset.ready = "yes";

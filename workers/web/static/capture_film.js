@@ -61,6 +61,8 @@ export class Take {
     /** @type {Promise<unknown>} */
     this.work = Promise.resolve();
     this.failed = "";
+    /** @type {{end: () => void}|null} */
+    this.source = null;
   }
 
   async start() {
@@ -73,6 +75,7 @@ export class Take {
   /** Frames to packets to the file, until `stop`. */
   async encode() {
     const source = frames(this.video, this.track), rate = this.track.getSettings().frameRate || 30;
+    this.source = source;
     let frame = await source.next();
     if (!frame) return;
     const { kind, wanted } = await configuration(frame, rate);
@@ -161,6 +164,7 @@ export class Take {
   /** End, and have all of it in the file. */
   async stop() {
     this.running = false;
+    this.source?.end();  // a camera that has stopped delivers nothing to wait for
     await this.work.catch(() => {});
   }
 }

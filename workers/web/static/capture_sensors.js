@@ -1,6 +1,7 @@
 // The phone's orientation and motion, and the log of them that `--attitude` takes (docs/phone_capture.md).
 
-const RATE_HZ = 60, STILL_MS = 20;
+/** A browser reports a reading when it changes: after HELD_MS without one it is what it was. */
+const RATE_HZ = 60, HELD_MS = 250, STILL_MS = 20;
 
 /** The quaternion (w, x, y, z) from the device to a world with z up of the angles that `deviceorientation` tells, in deg: turned about z, then
  * the new x, then the new y. @param {number} alpha @param {number} beta @param {number} gamma */
@@ -21,12 +22,24 @@ export function logOf(samples, startMs, endMs, phone) {
   /** @type {Record<string, any>} */
   const log = { frame: "device", phone };
   for (const [sensor, { names, rows }] of samples) {
-    const kept = rows.filter((row, i) => row[0] > startMs - 500 && row[0] < endMs + 500 && (!i || row[0] > rows[i - 1][0]));
+    const kept = inOrder(rows, sensor === "orientation" ? endMs : -Infinity).filter((row) => row[0] > startMs - 500 && row[0] < endMs + 500);
     if (kept.length < 2) continue;
-    log[sensor] = { time_s: kept.map((row) => round(row[0] - startMs, 2) / 1000) };
+    log[sensor] = { time_s: kept.map((row) => round(round(row[0], 2) - round(startMs, 2), 2) / 1000) };
     names.forEach((name, i) => { log[sensor][name] = kept.map((row) => round(row[i + 1], 6)); });
   }
   return log.orientation ? log : null;
+}
+
+/** Readings by their times: a busy page hears of some late. Those until `heldMs` are held. @param {number[][]} rows @param {number} heldMs */
+function inOrder(rows, heldMs) {
+  const sorted = [...rows].sort((a, b) => a[0] - b[0]);
+  return sorted.flatMap((row, i) => {
+    const following = sorted[i + 1]?.[0], next = following ?? Math.max(heldMs, row[0] + 1);
+    if (round(next, 2) <= round(row[0], 2)) return [];
+    const isHeld = heldMs > row[0] && (following === undefined || following - row[0] > HELD_MS);
+    const n = isHeld ? Math.ceil((next - row[0]) / STILL_MS) - 1 : 0;
+    return [row, ...Array.from({ length: n }, (_, k) => [row[0] + (k + 1) * STILL_MS, ...row.slice(1)])];
+  });
 }
 
 /** @param {number} value @param {number} digits */
@@ -62,11 +75,6 @@ export class Sensors {
     });
     for (const [Kind, name] of /** @type {const} */ ([[kinds.Accelerometer, "accelerometer"], [kinds.Gyroscope, "gyroscope"]]))
       this.generic(Kind, name, ["x", "y", "z"], (s) => [s.x, s.y, s.z]);
-    // Browsers report a reading when it changes: until then it is what it was.
-    setInterval(() => {
-      const rows = this.samples.get("orientation")?.rows, now = performance.now();
-      if (rows?.length && now - rows[rows.length - 1][0] > 1.5 * STILL_MS) rows.push([now, ...rows[rows.length - 1].slice(1)]);
-    }, STILL_MS);
   }
 
   /** @param {any} Kind @param {string} sensor @param {string[]} names @param {(s: any) => number[]} read */
@@ -87,9 +95,9 @@ export class Sensors {
     if (sensor === "orientation") this.last = values;
   }
 
-  /** Forget what is older than two seconds: nothing is filmed. */
+  /** Forget what is older than two seconds, but the last: nothing is filmed. */
   trim() {
     const oldest = performance.now() - 2000;
-    for (const own of this.samples.values()) own.rows = own.rows.filter((row) => row[0] > oldest);
+    for (const own of this.samples.values()) own.rows = own.rows.filter((row, i) => row[0] > oldest || i === own.rows.length - 1);
   }
 }
