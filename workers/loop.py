@@ -107,7 +107,7 @@ class Worker:
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
     job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
     phone: looks often, and for nothing but jobs that are queued. long_waits: called where no job is more urgent than
-    that of a long recording, which another process takes. siblings: other processes of this machine work, too.
+    that of a long recording, which another process takes. siblings: other processes of this machine also work.
     """
 
     tables: Sequence[Any]

@@ -52,7 +52,7 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     """
     begin, compiled = time.perf_counter(), compile_seconds()
     twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
-    several = len(sessions) > 1  # then in lanes, also a part of them: each way has programs of its own to compile
+    several = len(sessions) > 1  # then in lanes, also a part of them: each way has other programs to compile
     solve = functools.partial(_solve, params=params, several=several)
     starts = [_with_detector(s, params) for s in starts]
     found = solve(sessions, [s.problem for s in sessions], starts, last=not twice)

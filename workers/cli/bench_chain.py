@@ -56,16 +56,19 @@ def chain(
 ) -> None:
     """Put copies of VIDEO through all tables with `pbl worker`, and print what many recordings cost.
 
-    Without VIDEO the demo recording at 1920x1080. Works in a database of its own, which is removed. A first round, of
-    two recordings for each process, compiles and is not counted. What takes longer with longer recordings is taken as
-    proportional to their length.
+    Without VIDEO the demo recording at 1920x1080. Works in a separate database, which is removed. A first round, of
+    two recordings for each process, compiles and is not counted. The cost is taken as proportional to the length.
     """
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.resources import cores
     from pbl_pipeline.temporary import new_folder
 
+    from pbl_pipeline.video import sha256_of
+
     if json_path is not None:
         check_out_file(json_path)
+    if video is not None:
+        sha256_of(video)  # raises what is wrong with the file before anything is measured
     options = options_of("all", processes, once=True, selftest=False)
     with new_folder() as folder:
         found = _measure(folder, video, videos or 4 * options.processes, options)
