@@ -62,7 +62,6 @@ def chain(
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.resources import cores
     from pbl_pipeline.temporary import new_folder
-
     from pbl_pipeline.video import sha256_of
 
     if json_path is not None:
