@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.long, pytest.mark.slow]
 KINDS = (*VARIANTS, "other container")
 #: Here the detector sees the legs so badly that steps are missing between those found: no complete cycle, no number.
 BLURRED = "a tenth"
-#: The recording played faster: more steps a minute than walking has, as where the steps of a slow walk are counted twice.
+#: The recording played faster: more steps a minute than walking has, as where each step of a slow walk counts twice.
 HASTY, TIME_SHARE = "hasty", 0.6
 #: Root mean square difference (deg) of two mean curves from which on a reader would see a change.
 SEEN_DEG = 5.0
