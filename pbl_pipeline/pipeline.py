@@ -28,6 +28,7 @@ from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.resources import cores, shared_cores
 from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
 from pbl_pipeline.video import PhoneLog, attitude_of, find_camera, frames_kept, probe, read_phone_log, sha256_of
@@ -182,7 +183,7 @@ def measured(
     return dataclasses.replace(visit.with_measures(measures), kinetics=kinetics)
 
 
-def write_results(out: Path, visit: Visit, title: str = "Gait report") -> list[Path]:
+def write_results(out: Path, visit: Visit, title: str = "Gait report", language: str = LANGUAGES[0]) -> list[Path]:
     """Write everything that a person or program reads of a visit into `out` and return the paths, the report first.
 
     The files of `visit.save_visit`, `<name>.overlay.mp4` of each recording whose video is known, and `report.html`
@@ -196,7 +197,7 @@ def write_results(out: Path, visit: Visit, title: str = "Gait report") -> list[P
         overlays = [out / f"{r.name}.{OVERLAY}" for r in filmed]
         for recording, path in zip(filmed, overlays, strict=True):
             draw_overlay(recording, path)
-        report = write_visit_report(out / REPORT, shown, title)
+        report = write_visit_report(out / REPORT, shown, title, language)
     return [report, *(p for p in overlays if p.exists()), *save_visit(visit, out)]
 
 
@@ -212,14 +213,14 @@ def draw_overlay(recording: Recording, path: Path) -> None:
     render_overlay(video, recording.fit, path, keypoints=recording.keypoints, events=events)
 
 
-def write_visit_report(path: Path, visit: Visit, title: str = "Gait report") -> Path:
+def write_visit_report(path: Path, visit: Visit, title: str = "Gait report", language: str = LANGUAGES[0]) -> Path:
     """Write the report of a visit with pictures from its videos and return its path.
 
     Raises the `PblError`s of `overlay_frames` and `deidentify.to_show`.
     """
     with _as_shown(visit) as shown:
         pictures = {r.name: _pictures(r, r.fit) for r in shown.fitted if r.fit is not None}
-        return write_report(path, shown, pictures, title)
+        return write_report(path, shown, pictures, title, None, language)
 
 
 @contextlib.contextmanager

@@ -41,6 +41,7 @@ from pbl_pipeline.report.words import (
     size,
 )
 from pbl_pipeline.shipped import shipped_page, shipped_text
+from pbl_pipeline.texts import LANGUAGES, page_in
 from pbl_pipeline.visit import Recording, Visit
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, number, significant
 
@@ -404,6 +405,7 @@ def write_report(
     pictures: Mapping[str, Sequence[Picture]] | None = None,
     title: str = "Gait report",
     norm: NormativeSet | None = None,
+    language: str = LANGUAGES[0],
 ) -> Path:
     """Write the report of a visit as one HTML file and return its path.
 
@@ -412,7 +414,8 @@ def write_report(
     angles over time. The file appears when it is complete.
 
     `pictures`: by the name of the recording. `norm`: the set of the index; None for the one that the measures name,
-    where it is one that ships. Raises what `Recording.fit` and `Recording.keypoints` raise.
+    where it is one that ships. `language`: one of `texts.LANGUAGES`. Raises what `Recording.fit` and
+    `Recording.keypoints` raise.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -423,7 +426,8 @@ def write_report(
     )
     part = path.with_name(f"{path.name}.part{os.getpid()}")
     try:
-        part.write_text(template.render(page=page, css=css), encoding="utf-8")
+        html = template.render(page=page, css=css, language=language)
+        part.write_text(page_in(language, html), encoding="utf-8")
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -31,7 +31,7 @@ from starlette.staticfiles import StaticFiles
 from pbl_pipeline.body import load_body
 from pbl_pipeline.visit import Recording
 from tests.walking_fit import walking_fit
-from workers.web import texts
+from workers import web
 from workers.web.movement import Movement
 
 PAGE = '<!doctype html><link rel="stylesheet" href="/static/page.css"><canvas></canvas>'
@@ -68,7 +68,7 @@ async ([width, height]) => {
 
 def app_of(n_frames: int) -> Starlette:
     """The page's scripts over a walk of so many frames."""
-    body, files = load_body(), Path(texts.__file__).parent
+    body, files = load_body(), Path(web.__file__).parent
     found = Movement.of(Recording.of("walk", walking_fit(body.joint_names, body.sha256, n_frames=n_frames)))
 
     async def page(request: Request) -> Response:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from pbl_pipeline.texts import LANGUAGES
+
 from ._kind import kind_option
 
 
@@ -14,8 +16,13 @@ from ._kind import kind_option
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
 @kind_option
+@click.option(
+    "--language", type=click.Choice(LANGUAGES), default=LANGUAGES[0], show_default=True, help="Of the report."
+)
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
-def report(subject: str, label: str | None, fit_method: str | None, fit_set_kind: str | None, out: Path) -> None:
+def report(
+    subject: str, label: str | None, fit_method: str | None, fit_set_kind: str | None, language: str, out: Path
+) -> None:
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
     from pbl_pipeline.files import check_out_folder
@@ -24,5 +31,5 @@ def report(subject: str, label: str | None, fit_method: str | None, fit_set_kind
     check_out_folder(out)
     schemas.activate(methods=False)
     wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
-    for path in write_visit({k: v for k, v in wanted.items() if v is not None}, out):
+    for path in write_visit({k: v for k, v in wanted.items() if v is not None}, out, language):
         click.echo(path)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
+from pbl_pipeline.texts import LANGUAGES
 
 from .. import fit, gait, gdi, keypoints, privacy, session, tracking, video
 from ..chain import before
@@ -347,8 +348,9 @@ def _single(rows: list[dict], what: str, columns: Sequence[str]) -> dict:
     )
 
 
-def write_visit(restriction: Any, out: Path) -> list[Path]:
-    """Write the files of `pbl_pipeline.pipeline.write_results` for one visit; nothing is computed anew.
+def write_visit(restriction: Any, out: Path, language: str = LANGUAGES[0]) -> list[Path]:
+    """Write the files of `pbl_pipeline.pipeline.write_results` for one visit, the report in a language; nothing is
+    computed anew.
 
     Raises `PblError` DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what
     `to_show` raises; VIDEO_MISSING when a recording is no longer where it was.
@@ -357,7 +359,7 @@ def write_visit(restriction: Any, out: Path) -> list[Path]:
     from pbl_pipeline.pipeline import write_results
 
     with contextlib.ExitStack() as open_files:
-        return write_results(out, to_show(fitted_visit(restriction, whole=True), open_files))
+        return write_results(out, to_show(fitted_visit(restriction, whole=True), open_files), language=language)
 
 
 def to_show(visit: Visit, open_files: contextlib.ExitStack) -> Visit:

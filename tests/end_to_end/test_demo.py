@@ -29,6 +29,7 @@ from pbl_pipeline.video import probe
 from schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import without_posix
 from tests.database import new_home, remove_home
+from tests.german import REPORT_NAMES, english_of, english_words
 
 pytestmark = pytest.mark.slow
 
@@ -205,4 +206,8 @@ def test_reports_and_exports_come_from_a_named_server_without_posix(home, out, t
     assert ".trc" in {path.suffix for path in map(Path, done.out.splitlines()) if path.stat().st_size}
     done = without_posix.pbl("report", "--subject", "NOBODY", "--out", tmp_path / "r", variables=server)
     assert done.error_code == "DB_NOT_FOUND", done.err
+    assert pbl(home, "report", "--subject", "DEMO", "--language", "de", "--out", tmp_path / "r").returncode == 0
+    german = (tmp_path / "r/report.html").read_text("utf-8")
+    assert "Wie dieser Bericht zu lesen ist" in german
+    assert not english_of(german, english_words(), REPORT_NAMES)
     assert pbl(home, "db", "stop").returncode == 0

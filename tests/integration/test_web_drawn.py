@@ -13,6 +13,7 @@ import pytest
 from pbl_pipeline.video import sha256_of
 from schemas import fit, privacy
 from schemas.origin import Origin
+from tests.german import REPORT_NAMES, english_of, english_words
 from tests.integration import web
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -78,6 +79,18 @@ def test_a_report_is_served_without_scripts_and_says_what_it_is_of(visit: Path, 
     assert browser.get("/visits/1/report?result=7").status_code == 404
     assert browser.get("/visits/99/report").status_code == 404
     assert browser.get("/recordings/99/overlay").status_code == 404
+
+
+def test_a_report_is_in_the_language_of_its_reader(visit: Path, browser: Any, monkeypatch: pytest.MonkeyPatch):
+    names = REPORT_NAMES + "|Scale"  # a check that the fit of this test has alone
+    for language in ("de", "en"):
+        monkeypatch.setitem(browser.headers, "accept-language", language)
+        browser.get("/visits/1/report?result=0")
+        until(browser, "/visits/1/report/state?result=0")
+        report = browser.get("/visits/1/report?result=0").text
+        assert f'<html lang="{language}">' in report
+        assert ("Wie dieser Bericht zu lesen ist" in report) == (language == "de")
+        assert bool(english_of(report, english_words(), names)) == (language == "en")
 
 
 @pytest.mark.long

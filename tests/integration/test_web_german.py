@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import itertools
-import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -17,84 +16,22 @@ import pytest
 
 import pbl_pipeline
 import pbl_pipeline.fit
+from pbl_pipeline import texts
 from pbl_pipeline.kinetics import REASONS
 from pbl_pipeline.words import check_words
 from schemas import session, study
 from schemas.intake.records import set_condition
+from tests.german import english_of, english_words
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
-from workers.web import texts
-
-#: Attributes that a person reads or hears.
-_READ = ("aria-label", "alt", "title", "placeholder", "data-play", "data-pause", "data-text", "data-failed",
-         "data-checked")  # fmt: skip
-#: English words that are German words as well, or names of units and formats.
-_BOTH = {"in", "an", "am", "was", "war", "so", "die", "des", "also", "links", "person", "median"}
-
-
-class _Reader(HTMLParser):
-    """The texts of a page, without scripts, styles and what is marked as a name (translate="no", code)."""
-
-    _VOID = frozenset({"meta", "link", "input", "img", "br", "rect", "circle", "line"})
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-        self._hidden: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
-        hides = tag in ("script", "style", "code", "video") or given.get("translate") == "no"
-        other = given.get("lang") not in (None, "de")  # such as the button that changes the language
-        if self._hidden or hides or (other and tag in ("button", "input")):
-            if tag not in self._VOID:
-                self._hidden.append(tag)
-            return
-        self.texts += [text for name in _READ if (text := given.get(name))]
-        said = json.loads(given.get("data-said") or "{}")  # by the script of the page
-        self.texts += [by_language["de"] for by_language in said.values()]
-        if other and tag != "html":
-            self.texts.append(f"<{tag} lang={given['lang']}>")
-
-    def handle_endtag(self, tag: str) -> None:
-        if self._hidden and tag in self._hidden:
-            while self._hidden.pop() != tag:
-                pass
-
-    def handle_data(self, data: str) -> None:
-        if not self._hidden and data.strip():
-            self.texts.append(data)
-
-
-def words(text: str) -> set[str]:
-    return set(re.findall(r"[a-zäöüß]+", text.lower()))
 
 
 @pytest.fixture(scope="module")
 def english() -> set[str]:
-    """Words of the English texts that no German text has."""
-    of: dict[str, set[str]] = {"en": set(), "de": set()}
-    for name, text in texts.catalogue().items():
-        of["en"] |= words(text.get("en", name.removeprefix("library.")))
-        of["de"] |= words(text["de"])
-    return {w for w in of["en"] - of["de"] - _BOTH if len(w) > 1}
-
-
-def english_of(page: str, english: set[str], names: str) -> list[str]:
-    """Texts of a page with an English word or a decimal point that belongs to no name."""
-    reader = _Reader()
-    reader.feed(page)
-    found = []
-    for text in reader.texts:
-        own = re.sub(names, " ", text)
-        if (words(own) & english) or re.search(r"(?<![\d.])\d+\.\d+(?![\d.])", own) or own.startswith("<"):
-            found.append(" ".join(text.split()))
-        elif found and found[-1].startswith("<"):
-            found[-1] += text  # what is marked
-    return found
+    return english_words()
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from schemas import lab, session, study, video
 from schemas.review import Decision
@@ -17,7 +18,7 @@ from schemas.studies.visit_forms import FACTS, NEW, facts
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
-from workers.web import multipart, texts
+from workers.web import multipart
 
 VISIT = {"subject": "P001", "visit": "2026-01-10"}
 

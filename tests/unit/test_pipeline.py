@@ -80,7 +80,7 @@ def test_report_and_metrics_agree_on_the_outcome(
     visit, _ = pipeline.run_visit([chain.small_video(tmp_path, "walk")], tmp_path / "out")
     pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
-    (shown, pictures, title), *_ = written
+    (shown, pictures, title, *_), *_ = written
     page = page_of(shown, pictures, title, None)
     assert visit.judged is not None
     assert content["outcome"] == page["verdict"]["outcome"] == visit.judged.outcome

@@ -20,10 +20,10 @@ from pbl_pipeline.video import Camera
 from pbl_pipeline.visit import Recording
 from tests.walker import observe
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
-from workers.web import texts
+from workers.web import movement
 from workers.web.movement import Movement, body_json
 
-STATIC = Path(texts.__file__).parent / "static"
+STATIC = Path(movement.__file__).parent / "static"
 TESTS = Path(__file__).parent / "web_scripts"
 
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node on this machine: apt-get install nodejs")

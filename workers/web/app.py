@@ -17,7 +17,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Receive, Scope, Send
 
-from pbl_pipeline import settings
+from pbl_pipeline import settings, texts
 from pbl_pipeline.errors import PblError
 
 from ..process_queue import ProcessQueue
@@ -36,7 +36,6 @@ from . import (
     recordings,
     registration,
     reports,
-    texts,
     trend,
     visits,
 )

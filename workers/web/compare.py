@@ -13,14 +13,13 @@ from markupsafe import Markup
 from starlette.requests import Request
 from starlette.responses import Response
 
-from pbl_pipeline import charts
+from pbl_pipeline import charts, texts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
-from . import texts
 from .address import Address, interval, page
 from .pages import Pages, as_json, plain, reader_language
 from .source import Videos

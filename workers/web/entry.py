@@ -10,10 +10,9 @@ from starlette.responses import RedirectResponse, Response
 from pbl_pipeline.errors import PblError
 from schemas.studies import study_sheets, visit_forms
 
-from . import texts
 from .access import form_of, sender
 from .address import Address, number_of
-from .pages import Pages, reader_language
+from .pages import Pages, in_field, reader_language
 from .tables import Tables
 
 #: What the names of the fields begin with: an instrument may be called as another field of the form.
@@ -27,7 +26,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         request: Request, entry: visit_forms.Form, values: Mapping[str, str], errors: Mapping[str, PblError]
     ) -> Response:
         language = reader_language(request)
-        scores = {name: texts.in_field(language, entry.values[name]) for name in entry.instruments}
+        scores = {name: in_field(language, entry.values[name]) for name in entry.instruments}
         return pages.show(
             request,
             "enter.html",

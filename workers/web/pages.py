@@ -17,12 +17,13 @@ import pandas as pd
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
+from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
 from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, check_words, number, significant
+from schemas.intake.sheets import with_point
 from schemas.reading.shown import ShownVisit
 
-from . import texts
 from .access import HEADERS, HOURS, Session
 from .address import JSON
 
@@ -180,3 +181,9 @@ class Pages:
 def _refusal(found: str, next_step: str) -> PblError:
     expected = "a request of somebody who is signed in and has the right"
     return PblError("WEB_REFUSED", found=found, expected=expected, next_step=next_step)
+
+
+def in_field(language: str, number: str) -> str:
+    """Return a stored number as a field shows it: with the decimals of a language, where that is read as the same."""
+    own = texts.decimals(language, number)
+    return own if with_point(own) == number else number

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
+from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
 from schemas.capture import UPLOADING
@@ -28,7 +29,7 @@ from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
 from ..process_queue import ProcessQueue
-from . import certificates, texts
+from . import certificates
 from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
 from .address import FILM, OPEN, Address, number_of
 from .computing import Target

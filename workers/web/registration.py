@@ -19,12 +19,11 @@ from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
 from ..incoming import VIDEO_ENDINGS, Copy
 from ..refresh import queue_visit
-from . import texts
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
-from .pages import Pages, reader_language
+from .pages import Pages, in_field, reader_language
 from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
@@ -78,7 +77,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
         stored, language = await tables.ask(visit_forms.facts, number_of(request)), reader_language(request)
-        numbers = {n: texts.in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
+        numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
         return pages.show(
             request,
             "facts.html",

@@ -19,7 +19,7 @@ from schemas.reading import shown as reading
 from ..process_queue import ProcessQueue, Task, Work
 from .access import REPORT_POLICY
 from .address import Address, number_of, shown_of
-from .pages import Pages
+from .pages import Pages, reader_language
 from .tables import Tables
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ SECONDS, N_BYTES = 3600.0, 8 * 2**30
 def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
     """The addresses of this part."""
 
-    async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: int) -> Work:
+    async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: Any) -> Work:
         """The work that a request is about, begun where it was not. Raises what stopped it, once."""
         wanted = await tables.ask(key, *args)
         work = making.find(wanted)
@@ -59,7 +59,7 @@ def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
 
     async def report(request: Request) -> Response:
         number, shown = number_of(request), shown_of(request)
-        work = await work_of(request, report_key, load_report, number, shown)
+        work = await work_of(request, report_key, load_report, number, shown, reader_language(request))
         if work.path is None:
             return pages.show(request, "report_made.html", number=number, shown=shown, work=work)
         headers = {"content-security-policy": REPORT_POLICY}
@@ -69,7 +69,8 @@ def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
         return state(making.find(await tables.ask(overlay_key, number_of(request))))
 
     async def report_state(request: Request) -> Response:
-        return state(making.find(await tables.ask(report_key, number_of(request), shown_of(request))))
+        key = await tables.ask(report_key, number_of(request), shown_of(request), reader_language(request))
+        return state(making.find(key))
 
     return [
         Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
@@ -110,22 +111,22 @@ def load_overlay(video_id: int) -> Task:
         return _task("overlay.mp4", _draw, stack.pop_all(), dataclasses.replace(found, shown=path))
 
 
-def report_key(session_id: int, shown: int) -> tuple[Any, ...]:
-    """Return what the report of a result of a visit depends on."""
+def report_key(session_id: int, shown: int, language: str) -> tuple[Any, ...]:
+    """Return what the report of a result of a visit in a language depends on."""
     about = reading.computed_visit(session_id, shown)
     copies = [_copy_of(r.number) for r in about.recordings if r.number is not None]
-    return ("report", session_id, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
+    return ("report", session_id, language, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
 
 
-def load_report(session_id: int, shown: int) -> Task:
-    """Return how the report of a result of a visit is written."""
+def load_report(session_id: int, shown: int, language: str) -> Task:
+    """Return how the report of a result of a visit is written in a language."""
     from schemas.reading.visits import to_show
 
     about = reading.computed_visit(session_id, shown)
     assert about.visit is not None
     with contextlib.ExitStack() as stack:
         visit = to_show(about.visit, stack).loaded()
-        return _task("report.html", _write, stack.pop_all(), visit)
+        return _task("report.html", _write, stack.pop_all(), visit, language)
 
 
 def _task(file: str, function: Callable[..., None], open_files: contextlib.ExitStack, *args: Any) -> Task:
@@ -153,7 +154,7 @@ def _draw(out: Path, recording: Recording) -> None:
     draw_overlay(recording, out)
 
 
-def _write(out: Path, visit: Visit) -> None:
+def _write(out: Path, visit: Visit, language: str) -> None:
     from pbl_pipeline.pipeline import write_visit_report
 
-    write_visit_report(out, visit)
+    write_visit_report(out, visit, language=language)

@@ -8,11 +8,10 @@ from markupsafe import Markup
 from starlette.requests import Request
 from starlette.responses import Response
 
-from pbl_pipeline import charts
+from pbl_pipeline import charts, texts
 from pbl_pipeline.words import MEASURES, TASKS
 from schemas.reading.trend import INDEX, Point, trend_of
 
-from . import texts
 from .address import Address, number_of, page
 from .pages import Pages, as_json, plain, reader_language
 from .tables import Tables

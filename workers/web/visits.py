@@ -11,6 +11,7 @@ from urllib.parse import urlencode
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline import texts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
@@ -33,7 +34,6 @@ from pbl_pipeline.words import ANGLES, KINETICS
 from schemas.reading import visit_list
 from schemas.reading.shown import ShownVisit
 
-from . import texts
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of
 from .computing import told as told_of

@@ -1,8 +1,9 @@
-"""The page's texts in its languages, from one catalogue (`texts.toml`)."""
+"""The texts of pages and reports in their languages, from one catalogue (`texts.toml`)."""
 
 from __future__ import annotations
 
 import functools
+import html
 import re
 import tomllib
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from pbl_pipeline.errors import CODES
-from schemas.intake.sheets import with_point
 
 #: The first is taken where a browser asks for none of them.
 LANGUAGES = ("en", "de")
@@ -26,6 +26,10 @@ _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 #: A command or its option, and one in brackets behind what it does.
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
+#: Tags of a page, and what stands in it that is not read or is marked as a name.
+_TAGS = re.compile(r'(?s)(<style>.*?</style>|<b translate="no">.*?</b>|<[^>]+>)')
+_LABELS = re.compile(r'(?<= (?:aria-label|data-label)=")[^"]+(?=")|(?<= alt=")[^"]+(?=")')
+_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z0-9])")
 
 
 @functools.cache
@@ -107,15 +111,46 @@ def decimals(language: str, text: str) -> str:
     return _POINT.sub(",", text) if language == "de" else text
 
 
-def in_field(language: str, number: str) -> str:
-    """Return a stored number as a field shows it: with the decimals of a language, where that is read as the same."""
-    own = decimals(language, number)
-    return own if with_point(own) == number else number
-
-
 def in_chart(language: str, chart: Markup) -> Markup:
     """Return a chart whose numbers have the decimals of a language."""
     return Markup(_TEXT.sub(lambda m: decimals(language, m[0]), chart))  # noqa: S704  it was escaped when it was drawn
+
+
+def page_in(language: str, page: str) -> str:
+    """Return a page that was written in English, its texts and labels in a language; what is not known stays."""
+    if language == LANGUAGES[0]:
+        return page
+    parts = _TAGS.split(page)
+    parts[::2] = [_said(language, text) for text in parts[::2]]
+    parts[1::2] = [_LABELS.sub(lambda m: _said(language, m[0]), tag) for tag in parts[1::2]]
+    return "".join(parts)
+
+
+def _said(language: str, escaped: str) -> str:
+    """Return an escaped text in a language: as a whole, else sentence by sentence."""
+    text = " ".join(html.unescape(escaped).split())
+    if not text:
+        return escaped
+    parts = [text] if f"library.{text}" in catalogue() else _SENTENCES.split(text)
+    said = [_sentence(language, part) for part in parts]
+    own = _sentence(language, text) if None in said else None
+    own = own or " ".join(new or part for new, part in zip(said, parts, strict=True))
+    before, after = (" " if edge.isspace() else "" for edge in (escaped[0], escaped[-1]))
+    return f"{before}{escape(own)}{after}"
+
+
+def _sentence(language: str, text: str) -> str | None:
+    """Return what the library says, also where it begins with a capital and ends with a stop here."""
+    if not any(c.isalpha() for c in text):
+        return decimals(language, text)
+    stops = (pattern for pattern, _ in _patterns(language) if pattern.pattern.endswith(r"\."))
+    if f"library.{text}" in catalogue() or any(pattern.fullmatch(text) for pattern in stops):
+        return _library_words(language, text)
+    bare = text.removesuffix(".")
+    if (own := _library_words(language, bare)) is not None:
+        return own + text[len(bare) :]
+    own = _library_words(language, bare[0].lower() + bare[1:])
+    return None if own is None else own[0].upper() + own[1:] + text[len(bare) :]
 
 
 def library(language: str, english: str) -> str:
