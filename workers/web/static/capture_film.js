@@ -4,7 +4,7 @@ import { EncodedPacket, EncodedVideoPacketSource, Mp4OutputFormat, Output, Strea
 
 /** Codecs in the order in which they are tried: what the container calls them, and what the encoder does. */
 const CODECS = /** @type {const} */ ([["avc", "avc1.64002a"], ["avc", "avc1.4d402a"], ["avc", "avc1.42e02a"], ["vp9", "vp09.00.41.08"], ["av1", "av01.0.09M.08"]]);
-const BITS_PER_PIXEL = 0.12, KEY_EVERY_US = 2e6, MOST_WAITING = 12;
+const BITS_PER_PIXEL = 0.2, KEY_EVERY_US = 2e6, MOST_WAITING = 12;
 
 /** The back camera, as large and fast as is useful. */
 export function openCamera() {
