@@ -56,10 +56,12 @@ SHOWN = """
 
 
 class Walked(NamedTuple):
-    """A walk that the page filmed. times_s: of its frames, as the camera delivered them; pictures: their numbers."""
+    """A walk that the page filmed. times_s: of its frames, as the camera delivered them; pictures: their numbers; file:
+    the same clip as a file."""
 
     visit: int
     path: Path
+    file: Path
     times_s: np.ndarray
     pictures: np.ndarray
 
@@ -165,7 +167,7 @@ def walked(
         other = VisitRecord("P001", "2026-02-01", camera_file=folder / "camera.json")
         ingest([file], other, files=[Sensors(attitude=folder / "log.json")])
         populate()
-        yield Walked(visit, path, times_s, pictures)
+        yield Walked(visit, path, file, times_s, pictures)
     remove_all()
 
 
@@ -192,6 +194,13 @@ def test_each_picture_has_the_time_at_which_the_camera_delivered_it(walked: Walk
     assert np.ptp(walked.times_s - walked.pictures / FPS) < 1.5 / FPS
     # A loaded machine loses frames: then they are counted.
     assert about["frames"] + about["dropped"] == pytest.approx(np.ptp(walked.pictures) + 1, abs=2)
+
+
+def test_the_pictures_are_those_of_the_file(walked: Walked):
+    numbered_frames = enumerate(read_frames(walked.file), walked.pictures[0])
+    of_file = (frame.image for n, frame in numbered_frames if n in walked.pictures)
+    frames = zip(read_frames(walked.path), of_file, strict=True)
+    assert np.mean([cv2.PSNR(np.asarray(frame.image), np.asarray(image)) for frame, image in frames]) > 33  # dB
 
 
 def test_the_index_of_a_phone_is_that_of_the_same_clip_as_a_file(walked: Walked):

@@ -57,12 +57,14 @@ def camera(chromium: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iterator[Any]:
     """A Chromium whose camera shows these frames (BGR) at 30 a second, from the first when it is opened."""
     with av.open(str(path), "w", format="mjpeg") as out:
-        stream = out.add_stream("mjpeg", rate=30, options={"q:v": "2"})
+        stream = out.add_stream("mjpeg", rate=30, options={"qmin": "2", "qmax": "2"})
         stream.pix_fmt = "yuvj420p"
         for frame in frames:
             if not stream.codec_context.is_open:
                 stream.height, stream.width = frame.shape[:2]
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="bgr24")))
+            planes = av.VideoFrame.from_ndarray(frame, format="bgr24").to_ndarray(format="yuv420p")
+            # Of 16 to 235, as Chromium takes them, whatever the JPEG says.
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(planes, format="yuvj420p")))
         out.mux(stream.encode(None))
     args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
             f"--use-file-for-fake-video-capture={path}"]  # fmt: skip

@@ -4,7 +4,8 @@ import { EncodedPacket, EncodedVideoPacketSource, Mp4OutputFormat, Output, Strea
 
 /** Codecs in the order in which they are tried: what the container calls them, and what the encoder does. */
 const CODECS = /** @type {const} */ ([["avc", "avc1.64002a"], ["avc", "avc1.4d402a"], ["avc", "avc1.42e02a"], ["vp9", "vp09.00.41.08"], ["av1", "av01.0.09M.08"]]);
-const BITS_PER_PIXEL = 0.12, KEY_EVERY_US = 2e6, MOST_WAITING = 12;
+/** With the most bits a second, ten minutes remain within what the server takes of a recording. */
+const BITS_PER_PIXEL = 0.2, MOST_BITS = 12e6, KEY_EVERY_US = 2e6, MOST_WAITING = 12;
 
 /** The back camera, as large and fast as is useful. */
 export function openCamera() {
@@ -42,7 +43,7 @@ function frames(video, track) {
 async function configuration(frame, rate) {
   const [width, height] = [frame.codedWidth, frame.codedHeight];
   for (const [kind, codec] of CODECS) {
-    const wanted = { codec, width, height, bitrate: Math.round(BITS_PER_PIXEL * width * height * rate), framerate: rate, latencyMode: /** @type {const} */ ("realtime") };
+    const wanted = { codec, width, height, bitrate: Math.min(MOST_BITS, Math.round(BITS_PER_PIXEL * width * height * rate)), framerate: rate, latencyMode: /** @type {const} */ ("realtime") };
     if ((await VideoEncoder.isConfigSupported(wanted).catch(() => null))?.supported) return { kind, wanted };
   }
   throw new Error("no encoder");
