@@ -763,6 +763,7 @@ def form(path: Path) -> None:
 def use_form(path: Path) -> None:
     """As the page reads it while it arrives; a form that it refuses has the code USAGE here."""
     import asyncio
+    from concurrent.futures import ThreadPoolExecutor
 
     from starlette.requests import Request
 
@@ -782,6 +783,7 @@ def use_form(path: Path) -> None:
         return sum([len(p) if isinstance(p, bytes) else 1 async for p in parts(request)])
 
     try:
-        asyncio.run(read())
+        with ThreadPoolExecutor(1) as thread:  # the thread of a test may have an event loop that runs
+            thread.submit(asyncio.run, read()).result()
     except Refused as error:
         raise PblError("USAGE", found=str(error), expected="a form", next_step="send it again") from error
