@@ -80,7 +80,7 @@ def text(found: Measured, cores: int, video_s: float, machines: int) -> str:
     from pbl_pipeline.bench.run import number, table
 
     n, scale = found.videos, video_s / found.video_s
-    where = f"{cores} cores, {found.gpus} GPUs, {found.processes} processes" if found.gpus else f"{cores} cores"
+    where = f"{cores} cores, {f'GPUs: {found.gpus}, ' if found.gpus else ''}{found.processes} processes"
     jobs = sorted(found.jobs_s.items(), key=lambda j: -j[1])
     whole = sum(found.jobs_s.values())
     parts = table(
@@ -103,8 +103,9 @@ def text(found: Measured, cores: int, video_s: float, machines: int) -> str:
         ],
     )
     rate = f"{n} recordings of {found.video_s:.3g} s in {found.seconds:.0f} s: {n / found.seconds:.3g} a second"
+    such = "one such machine" if machines == 1 else f"{machines} such machines"
     processor = f"{found.processor_s / n:.3g} s of processor time each"
-    return f"{where}: {rate}, {processor}\n\n{parts}\n\n{machines} such machines:\n{cost}"
+    return f"{where}: {rate}, {processor}\n\n{parts}\n\n{such}:\n{cost}"
 
 
 def _measure(folder: Path, video: Path | None, n: int, options: Any) -> Measured:
