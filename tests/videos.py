@@ -10,11 +10,6 @@ import av
 import numpy as np
 
 
-def numbered(film: bytes, number: int) -> bytes:
-    """The bytes of an MP4 as another file with the same pictures: a box that readers skip holds the number."""
-    return film + (16).to_bytes(4) + b"free" + number.to_bytes(8)
-
-
 def write_video(
     path: str | Path,
     frames_bgr: Iterable[np.ndarray],

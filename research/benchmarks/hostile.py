@@ -14,9 +14,9 @@ import time
 
 import click
 
+from pbl_pipeline.bench.detect import numbered
 from tests.database import installation
 from tests.integration import chain
-from tests.videos import numbered
 
 
 def flipped(data: bytes, draw: random.Random) -> bytes:

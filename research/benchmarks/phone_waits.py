@@ -20,10 +20,9 @@ from pathlib import Path
 import click
 import numpy as np
 
-from pbl_pipeline.bench.detect import demo_clip
+from pbl_pipeline.bench.detect import demo_clip, numbered
 from research.benchmarks.workers import _PBL, say
 from tests.database import installation
-from tests.videos import numbered
 
 #: Seconds between two questions to the database, and after which a recording that has no answer counts as none.
 _ASK_S, _MOST_S = 0.25, 600.0

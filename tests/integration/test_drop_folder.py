@@ -17,12 +17,12 @@ from pathlib import Path
 import pytest
 
 from pbl_pipeline import temporary
+from pbl_pipeline.bench.detect import numbered
 from schemas import connection, lab, session, video, worker
 from schemas.intake import VisitRecord, ingest, uploads
 from schemas.operations import archive as layout
 from schemas.operations import backup, forget
 from tests.command import pbl
-from tests.videos import numbered
 from workers import incoming
 
 from . import chain

@@ -15,13 +15,13 @@ from pathlib import Path
 
 import pytest
 
+from pbl_pipeline.bench.detect import numbered
 from schemas import tracking, video
 from schemas.operations import embedded
 from schemas.operations.orphans import orphans
 from schemas.reading.status import queue_counts
 from tests import slurm
 from tests.rows import register
-from tests.videos import numbered
 
 from . import chain
 

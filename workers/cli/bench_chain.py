@@ -147,12 +147,13 @@ def _measure(folder: Path, video: Path | None, n: int, options: Any) -> Measured
 
 def _registered(folder: Path, film: bytes, first: int, n: int) -> list[Path]:
     """Register `n` recordings of a visit each, with the same pictures in other bytes."""
+    from pbl_pipeline.bench.detect import numbered
     from schemas.intake import VisitRecord, ingest
 
     paths = []
     for number in range(first, first + n):
         path = folder / f"walk{number:07d}.mp4"
-        path.write_bytes(film + (16).to_bytes(4) + b"free" + number.to_bytes(8))  # a box that readers skip
+        path.write_bytes(numbered(film, number))
         (result,) = ingest([path], VisitRecord(f"S{number:07d}", "1"))
         if result.error is not None:
             raise result.error
