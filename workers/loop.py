@@ -277,5 +277,5 @@ class Worker:
         self.found.add(found)
         if found.queued or found.freed:
             event(log, logging.INFO, "refreshed", queued=found.queued, freed=found.freed, planned=found.planned)
-        mine, queued = {t.__name__ for t in self.tables}, [*found.queued, *(["SessionFit"] if found.planned else [])]
-        return any(name in mine for name in queued) or bool(found.freed)
+        mine = {t.__name__ for t in self.tables}
+        return any(name in mine for name in found.queued) or bool(found.freed)

@@ -153,14 +153,13 @@ def _refresh(tables: Sequence[Any], lately: Scope | None) -> Refreshed:
     for table in tables:
         if table is fit.SessionFit:
             out.planned = plan(None if lately is None else lately.sessions)
+            out.queued += Counter({table.__name__: out.planned})
         where = None if lately is None else lately.where(table)
         if lately is not None and where is None:
             out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
             continue
         out.swept += queue.sweep(table)
-        n = queue.fill(table, where=where)
-        if n:
-            out.queued[table.__name__] = n
+        out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
     return out
 
 
