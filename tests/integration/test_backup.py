@@ -259,9 +259,8 @@ def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../x", "", "a\nb", "..\\x"])
 def test_paths_that_leave_the_store_are_refused(path: str):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^BACKUP_INVALID: "):
         backup_files.safe_path(path)
-    assert error.value.code == "BACKUP_INVALID"
 
 
 def test_regular_backups_hold_recordings_once_and_the_oldest_go(

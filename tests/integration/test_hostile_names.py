@@ -131,9 +131,8 @@ def test_labels_hold_no_control_characters(tmp_path: Path, field: str, label: st
 @pytest.mark.parametrize("field", ["dataset", "source", "origin"])
 def test_so_are_those_of_references(field: str, tmp_path: Path):
     for label in (*REFUSED, "", "x" * 2000):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^USAGE: "):
             add_reference("a.mp4", tmp_path / "a.mot", **{field: label})  # type: ignore[arg-type]
-        assert error.value.code == "USAGE"
 
 
 def test_so_is_the_name_of_a_calibration(tmp_path: Path):
@@ -170,9 +169,8 @@ def test_no_file_from_outside_is_unpickled(tmp_path: Path):
     np.save(tmp_path / "bomb.npy", bomb)
     (tmp_path / "bomb.npy").rename(tmp_path / "array.npz")
     for name in ("bomb.npz", "plain.npz", "array.npz"):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
             load_npz(tmp_path / name, ("time_s", "names"))
-        assert error.value.code == "FILE_FORMAT"
         for command in (
             ["fit", "--out", tmp_path / "o"],
             ["events", "--out", tmp_path / "e.csv"],
@@ -190,6 +188,5 @@ def test_a_log_with_impossible_stamps_is_refused(tmp_path: Path, stamp: str):
     log = tmp_path / "Orientation.csv"
     rows = "\n".join(f"{stamp},{i},1,0,0,0,0,0,0" for i in range(9))
     log.write_text(f"time,seconds_elapsed,qw,qx,qy,qz,roll,pitch,yaw\n{rows}\n")
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         read_phone_log(log)
-    assert error.value.code == "PHONE_LOG"

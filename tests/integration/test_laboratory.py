@@ -267,6 +267,5 @@ def test_bad_files(tmp_path, walk):
     ],
 )
 def test_wrong_calls(tmp_path, words, code):
-    with pytest.raises(PblError) as caught:
+    with pytest.raises(PblError, match=f"^{code}: "):
         CliRunner().invoke(command, [*words, "--out", str(tmp_path / "m.json")], catch_exceptions=False)
-    assert caught.value.code == code

@@ -136,9 +136,8 @@ def test_what_cannot_be_built(walkers: Path):
         ({"name": "x1", "populations": (), "subjects": ("C01",)}, "NORM_INVALID"),
     )
     for arguments, code in refused:
-        with pytest.raises(PblError) as caught:
+        with pytest.raises(PblError, match=f"^{code}: "):
             norms.build_norm(**arguments)
-        assert caught.value.code == code, arguments
     assert len(gdi.NormativeSet()) == count
 
 

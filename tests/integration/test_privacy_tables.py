@@ -87,9 +87,8 @@ def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Pa
     assert shown(walk) == path
 
     assert (privacy.Deidentified & {"video_id": nobody}).fetch1("deidentified_status") == "NO_HEAD"
-    with pytest.raises(PblError) as uncovered:
+    with pytest.raises(PblError, match=r"^HEAD_NOT_FOUND: "):
         shown(nobody)
-    assert uncovered.value.code == "HEAD_NOT_FOUND"
     (empty,) = [e for e in pipeline_status().empty if e.table == "Deidentified"]
     assert "no head was found" in str(empty)
     assert "Deidentified" in {s.table for s in why(walk).steps}
@@ -118,6 +117,5 @@ def test_a_worker_without_the_setting_says_so(tables, tmp_path: Path):
 
 def test_another_word_is_refused(tables):
     tables.setenv("PBL_DEIDENTIFY", "mosaic")
-    with pytest.raises(PblError) as refused:
+    with pytest.raises(PblError, match=r"^USAGE: "):
         _ = privacy.Deidentified().key_source
-    assert refused.value.code == "USAGE"

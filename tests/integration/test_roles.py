@@ -270,9 +270,8 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
 
 @pytest.mark.parametrize("name", ["gdi", "lab_more", "My", "a-b", "1a", "x" * 41])
 def test_schemas_that_an_analyst_cannot_have(name: str):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^USAGE: "):
         roles.Account("analyst", "maria", "%", (name,))
-    assert error.value.code == "USAGE"
 
 
 def test_another_account_of_a_role_and_its_end(secrets: Path):
@@ -287,9 +286,8 @@ def test_another_account_of_a_role_and_its_end(secrets: Path):
 
 @pytest.mark.parametrize("user", ["pbl", "pbl_admin", "root", "a'b", "x" * 33])
 def test_accounts_that_the_server_needs_are_left_alone(user: str):
-    with pytest.raises(PblError) as error:
+    with pytest.raises(PblError, match=r"^USAGE: "):
         roles.Account("worker", user, "%")
-    assert error.value.code == "USAGE"
 
 
 def test_the_dry_run_prints_what_would_be_done_and_no_password(database: Path, tmp_path: Path):

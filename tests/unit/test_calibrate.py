@@ -209,9 +209,8 @@ def test_boards_that_cannot_be():
         {"kind": "charuco", "dictionary": "DICT_1"},
         {"kind": "charuco", "squares": (40, 40), "dictionary": "DICT_4X4_50"},
     ):
-        with pytest.raises(PblError) as error:
+        with pytest.raises(PblError, match=r"^USAGE: "):
             Board(**{"kind": "checkerboard", "squares": (9, 6), "square_mm": 30.0, **bad})
-        assert error.value.code == "USAGE", bad
 
 
 @pytest.mark.parametrize("squares", ["9x" + "6" * 5000, "9", "9x6x5", "-9x6"])

@@ -80,9 +80,8 @@ def scaled(name: str, by: float) -> Callable[[dict[str, Any]], object]:
 def test_faults_in_arrays(tmp_path: Path, kind: str, change: Callable[[dict[str, Any]], object], code: str):
     KINDS[kind].write(tmp_path / kind)
     path = changed(tmp_path / kind, change)
-    with guarded() as peak, pytest.raises(PblError) as error:
+    with guarded() as peak, pytest.raises(PblError, match=f"^{code}: "):
         KINDS[kind].use(path)
-    assert error.value.code == code
     assert peak.grown_mib < 256
 
 
