@@ -6,26 +6,15 @@ import dataclasses
 import json
 import time
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bench
-from pbl_pipeline.bench import Case, Data, case, data
+from pbl_pipeline.bench import Case, Data, case
 from research.benchmarks import fit as comparison
 from research.benchmarks import fit_data
-from research.benchmarks.fit_case import accuracy_of, camera_error_deg
+from research.benchmarks.fit_case import accuracy_of
 from tests.unit.test_bench import row
-
-
-def test_the_cases_of_the_comparison_are_solver_by_trials_by_camera_by_batch():
-    methods = list(comparison.METHOD_OF.values())
-    cases = comparison.speed_cases(methods, (1, 10), fit_data.MOTIONS, (1, 16, 64), 3, 3)
-    assert len(cases) == 2 * 2 * 3 + 2 * 2
-    assert {c.batch for c in cases if c.method == "paper-2025"} == {1}
-    assert all(c.data.n_sessions == (c.batch if c.batch > 1 else 3) for c in cases)
-    assert len({c.label for c in cases}) == len(cases)
 
 
 @pytest.mark.parametrize(
@@ -48,32 +37,6 @@ def test_options_choose_the_cases_of_the_comparison(options, n, monkeypatch):
     done = CliRunner().invoke(comparison.main, options)
     assert done.exit_code == 0, done.output
     assert len(asked) == n
-
-
-def test_batches_of_the_paper_solver_alone_are_no_benchmark():
-    done = CliRunner().invoke(comparison.main, ["--solver", "implicit-adam", "--batch", "16"])
-    assert done.exit_code == 2
-    assert "gauss-newton" in done.output
-
-
-def test_data_of_the_comparison_have_a_camera(tmp_path):
-    what = fit_data.WalkerData(n_trials=1, n_sessions=1, n_frames=60, motion="handheld", short_side_px=720)
-    fit_data.write(tmp_path, what)
-    (session,) = data.sessions(tmp_path)
-    (keypoints,) = data.read_keypoints(session)
-    assert keypoints.image_size_px == (720, 1280)
-    assert data.read_truth(session, "R_nc")[0].shape == (60, 3, 3)
-    assert float(data.read_truth(session, "clock_offset_s")[0]) == 0.04
-    assert what.key != dataclasses.replace(what, motion="static").key
-
-
-def test_camera_error_is_the_median_angle():
-    true = Rotation.from_euler("z", np.linspace(0, 1, 5)[:, None])
-    off = Rotation.from_euler("x", np.deg2rad([0, 1, 2, 3, 170])[:, None])
-    quat = (true * off).as_quat(scalar_first=True)
-    quat[0] = np.nan
-    assert camera_error_deg(quat, true.as_matrix()) == pytest.approx(2.5)
-    assert camera_error_deg(-quat[1:4], true.as_matrix()[1:4]) == pytest.approx(2)  # q and -q are one rotation
 
 
 def compared(of, motion="handheld"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from research.benchmarks.gpu_worker import Plan, figures, plans, union_s, windows
+from research.benchmarks.gpu_worker import figures
 
 
 def span(name: str, begin: float, end: float, n: float = 1, compiling: float = 0.0) -> dict:
@@ -35,30 +35,6 @@ SPANS = [
 ]
 
 
-def test_overlapping_spans_count_once_and_only_within_the_window():
-    assert union_s([(0, 2), (1, 3), (5, 9), (6, 7)], (1, 8)) == pytest.approx(2 + 3)
-    assert union_s([], (0, 4)) == 0
-
-
-def test_the_window_begins_where_the_warm_up_is_computed():
-    assert windows(SPANS, 2) == ((10, 20), (10, 24))
-    assert windows(SPANS, 0) == ((1, 20), (1, 24))
-    with pytest.raises(ValueError, match="nothing was computed"):
-        windows(SPANS, 6)
-    with pytest.raises(ValueError, match="nothing was computed"):
-        windows([span("run", 0, 1)], 0)
-
-
-def test_sessions_that_are_computed_one_by_one():
-    each = [
-        (t, span("run", t, t + 3), span("make_compute", t + 1, t + 2), span("device", t + 1, t + 2)) for t in (0, 3, 6)
-    ]
-    found = figures([s for _, *spans in each for s in spans], 1)
-    assert windows([s for _, *spans in each for s in spans], 1) == ((2, 8), (2, 9))
-    assert (found["sessions"], found["busy_share"]) == (2, pytest.approx(2 / 6))
-    assert found["ms_per_session"]["run"] == pytest.approx(2000)
-
-
 def test_figures():
     found = figures(SPANS, 2)
     assert found["busy_share"] == pytest.approx((4 + 4) / 10)  # 5 s of the second call, less 1 s of compiling
@@ -70,13 +46,3 @@ def test_figures():
     assert found["warm_up_seconds"] == 10
     assert found["ms_per_session"]["device"] == pytest.approx(8000 / 4)
     assert found["ms_per_session"]["run"] == pytest.approx(1000 * (1 + 1 + 1 + 1 + 1 + 3) / 6)
-
-
-def test_sessions_are_of_one_to_three_trials_and_the_same_each_time():
-    lengths = (5.0, 7.5, 10.0)
-    found = plans(200, lengths, alike=False)
-    assert found == plans(200, lengths, alike=False)
-    assert {len(p.seconds) for p in found} == {1, 2, 3}
-    assert {s for p in found for s in p.seconds} == set(lengths)
-    assert {p.camera for p in found} == {"static", "handheld"}
-    assert set(plans(5, lengths, alike=True)) == {Plan((5.0,), "static")}

@@ -33,17 +33,6 @@ def test_coverage_by_hand():
     assert frame_coverage([found, other]) == (4, 1, 2)
 
 
-def test_located_heads_are_boxes_of_heads():
-    clips = located_clips()
-    assert {c.name for c in clips if not c.tune} == {"walk", "STS", "cam01", "cam04"}
-    for head in (h for c in clips for h in c.heads):
-        size = head.boxes_px[:, 2:] - head.boxes_px[:, :2]
-        assert (np.diff(head.frames) > 0).all()
-        assert ((size > 20) & (size < 170)).all()
-    sts = next(c for c in clips if c.name == "STS").heads[0].boxes()
-    np.testing.assert_allclose(sts[5], sts[0] + (sts[15] - sts[0]) / 3)
-
-
 @pytest.mark.long
 @pytest.mark.slow
 def test_the_heads_of_two_real_people_are_covered(tmp_path):
