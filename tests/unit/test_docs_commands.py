@@ -78,8 +78,3 @@ def test_the_examples_of_the_help():
 )
 def test_a_wrong_call_is_seen(call: str):
     assert wrong(call.split(), whole=True)
-
-
-def test_calls_that_are_right():
-    for call in ("run walk.mp4 --out results", "validate walk.fit.npz --reference walk.mot", "db init"):
-        assert not wrong(call.split(), whole=True)

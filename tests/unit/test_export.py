@@ -27,10 +27,10 @@ from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.qc import FAIL, Check
 from pbl_pipeline.validation import reference_of_mot
-from pbl_pipeline.video import Camera, PhoneLog, Sensor
-from pbl_pipeline.visit import Held, Recording, Visit, save_visit, visit_of_fits
+from pbl_pipeline.video import PhoneLog, Sensor
+from pbl_pipeline.visit import Held, Recording, Visit, save_visit
 from tests.command import pbl
-from tests.exported import marked_fit, with_markers
+from tests.exported import keypoints_of, marked_fit, with_markers
 from tests.unit.visits import solution_of
 from tests.walking_fit import foot_events, walking_fit
 
@@ -47,23 +47,9 @@ def fit() -> TrialFit:
 
 @pytest.fixture(scope="module")
 def keypoints(fit: TrialFit) -> Keypoints:
-    rng, (n, j) = np.random.default_rng(1), fit.markers_world_m.shape[:2]
-    confidence = rng.uniform(0.3, 1.0, (n, j))
-    xy = rng.uniform(0, 300, (n, j, 2))
-    xy[4, 3], confidence[4, 3] = np.nan, 0.0
-    return Keypoints(
-        time_s=fit.time_s,
-        names=fit.marker_names,
-        marker_set=fit.marker_set,
-        xy_px=xy,
-        xyz_cam_m=np.full((n, j, 3), np.nan),
-        root_relative=True,
-        confidence=confidence,
-        image_size_px=(640, 360),
-        camera=Camera(fit.camera.matrix, np.zeros(5), "guess: a test"),
-        box_px=np.zeros((n, 4)),
-        origin="a detector, licence Apache-2.0",
-    )
+    seen = keypoints_of(fit)
+    seen.xy_px[4, 3], seen.confidence[4, 3] = np.nan, 0.0
+    return seen
 
 
 @pytest.fixture(scope="module")
@@ -740,12 +726,3 @@ def test_wrong_calls(files, tmp_path, monkeypatch, arguments, code):
     monkeypatch.chdir(files)
     done = pbl("export", *arguments, "--out", tmp_path / "a")
     assert (done.code, done.error_code) == (1, code), done.err
-
-
-def test_keypoints_of_another_recording_are_not_taken(files, fit, tmp_path):
-    shorter = marked_fit(n_frames=90)
-    shorter.save(tmp_path / "walk.fit.npz")
-    (tmp_path / "walk.keypoints.npz").write_bytes((files / "walk.keypoints.npz").read_bytes())
-    visit = visit_of_fits([tmp_path / "walk.fit.npz"])
-    assert visit.recordings[0].keypoints is None
-    assert load_body().sha256 == fit.body_sha256

@@ -18,7 +18,6 @@ from pbl_pipeline.fit import (
     LEVEL_CAMERA_R_NC,
     METHODS,
     ImplicitAdamParams,
-    TrialFit,
     check_trial,
     fit_session,
 )
@@ -106,54 +105,6 @@ def test_fit_shares_one_body_and_reports_how_it_was_made(two_trials):
     assert a.params_hash == quick().hash
     assert fit.loss_trace[-1, 0] == 1500
     assert fit.loss_trace[-1, 1] < 0.3 * fit.loss_trace[0, 1]
-
-
-def test_fit_file_round_trip(two_trials, tmp_path):
-    trial = two_trials[2].trials[0]
-    trial.save(tmp_path / "a.fit.npz")
-    back = TrialFit.load(tmp_path / "a.fit.npz")
-    for field in dataclasses.fields(TrialFit):
-        a, b = getattr(trial, field.name), getattr(back, field.name)
-        if isinstance(a, np.ndarray):
-            np.testing.assert_array_equal(a, b)
-        elif field.name != "camera":
-            assert a == b or (a != a and b != b), field.name  # NaN: not estimated
-
-
-def test_frames_outside_the_view_are_unknown(two_trials):
-    # Two trials again, of the same length: the compiled program of the fixture serves.
-    k = two_trials[1][0]
-    confidence = k.confidence.copy()
-    confidence[:20] = 0
-    xy, xyz = k.xy_px.copy(), k.xyz_cam_m.copy()
-    xy[:20], xyz[:20] = np.nan, np.nan
-    cut = dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence)
-    fit = fit_session([cut, two_trials[1][1]], ["a", "b"], quick(250))
-    assert np.all(np.isnan(fit.trials[0].qpos[:20]))
-    assert np.all(np.isfinite(fit.trials[0].qpos[20:]))
-    assert np.all(np.isfinite(fit.trials[1].qpos))
-
-
-@pytest.mark.parametrize(
-    ("change", "code", "text"),
-    [
-        ({"time_s": TIME_S[::-1].copy()}, "FIT_INPUT", "time stamps"),
-        ({"time_s": np.where(TIME_S > 1, 1.0, TIME_S)}, "FIT_INPUT", "time stamps"),
-        ({"confidence": np.zeros((len(TIME_S), 33))}, "FIT_INPUT", "in view"),
-        (
-            {"xyz_cam_m": np.where(np.arange(33)[:, None] == 5, np.nan, np.ones((len(TIME_S), 33, 3)))},
-            "FIT_INPUT",
-            "NaN",
-        ),
-        ({"marker_set": "no_such_set"}, "MARKER_SET_UNKNOWN", "no_such_set"),
-        ({"names": tuple(f"m{i}" for i in range(33))}, "MARKER_SET_UNKNOWN", "m0"),
-    ],
-)
-def test_bad_keypoints_are_refused(change, code, text):
-    k = dataclasses.replace(observe(plain_walk(TIME_S), TIME_S), **change)
-    with pytest.raises(PblError, match=text) as error:
-        fit_session([k], ["a"], quick(250))
-    assert error.value.code == code
 
 
 def test_under_a_second_in_view_is_refused():

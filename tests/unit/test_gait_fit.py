@@ -34,6 +34,7 @@ from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
 from pbl_pipeline.visit import Recording, Visit, save_visit
 from tests.unit.visits import solution_of
+from tests.walking_fit import walking_fit
 
 STRIDE_S = 1.1
 CAMERA = Camera(np.array([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]]), np.zeros(5), "test")
@@ -44,34 +45,9 @@ def make_fit(time_s: np.ndarray, values: dict[str, np.ndarray | float], name: st
     qpos = np.zeros((len(time_s), 40))
     for joint, value in values.items():
         qpos[:, body.joint_names.index(joint)] = value
-    n = len(time_s)
-    fit = TrialFit(
-        name=name,
-        time_s=time_s,
-        joint_names=body.joint_names,
-        qpos=qpos,
-        qpos_sd=np.full_like(qpos, np.nan),
-        marker_set="blazepose_33",
-        marker_names=(),
-        markers_world_m=np.zeros((n, 0, 3)),
-        phone_quat_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
-        scale=np.ones(8),
-        site_offset_m=np.zeros((0, 3)),
-        residual_2d_px=np.zeros((n, 0)),
-        residual_3d_m=np.zeros((n, 0)),
-        camera=CAMERA,
-        image_size_px=(1000, 1000),
-        camera_motion="static",
-        camera_position_m=np.zeros(3),
-        orientation_source="assumed: level",
-        phone_clock_offset_s=float("nan"),
-        solver="formula",
-        params_hash="0",
-        body_sha256=body.sha256,
-        loss=0.0,
-        seconds=0.0,
-    )
-    return dataclasses.replace(fit, **changes)
+    plain = walking_fit(body.joint_names, body.sha256, name=name, n_frames=len(time_s), marker_names=())
+    given = {"time_s": time_s, "qpos": qpos, "camera": CAMERA, "image_size_px": (1000, 1000)}
+    return dataclasses.replace(plain, **given | changes)
 
 
 def walking(time_s: np.ndarray, heading_deg: float = 0.0, start_s: float = 0.0, speed: float = 1.2) -> dict:

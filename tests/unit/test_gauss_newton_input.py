@@ -47,16 +47,17 @@ def first(k: Keypoints, n: int) -> Keypoints:
 
 
 BAD: dict[str, tuple[str, Callable[[Any], dict]]] = {
-    "NaN pixel": ("FIT_INPUT", lambda k: {"xy_px": put(k.xy_px, seen(k), np.nan)}),
-    "infinite 3D point": ("FIT_INPUT", lambda k: {"xyz_cam_m": put(k.xyz_cam_m, seen(k), np.inf)}),
+    "NaN pixel": ("FIT_INPUT: NaN", lambda k: {"xy_px": put(k.xy_px, seen(k), np.nan)}),
+    "infinite 3D point": ("FIT_INPUT: NaN", lambda k: {"xyz_cam_m": put(k.xyz_cam_m, seen(k), np.inf)}),
     "NaN confidence": ("FILE_FORMAT", lambda k: {"confidence": put(k.confidence, (3, 4), np.nan)}),
     "negative confidence": ("FILE_FORMAT", lambda k: {"confidence": put(k.confidence, (3, 4), -1)}),
-    "nothing seen": ("FIT_INPUT", lambda k: {"confidence": np.zeros_like(k.confidence)}),
-    "repeated stamp": ("FIT_INPUT", lambda k: {"time_s": put(k.time_s, (5,), k.time_s[4])}),
-    "backward stamps": ("FIT_INPUT", lambda k: {"time_s": k.time_s[::-1]}),
+    "nothing seen": ("FIT_INPUT: in view", lambda k: {"confidence": np.zeros_like(k.confidence)}),
+    "repeated stamp": ("FIT_INPUT: time stamps", lambda k: {"time_s": put(k.time_s, (5,), k.time_s[4])}),
+    "backward stamps": ("FIT_INPUT: time stamps", lambda k: {"time_s": k.time_s[::-1]}),
     "NaN stamp": ("FIT_INPUT", lambda k: {"time_s": put(k.time_s, (5,), np.nan)}),
-    "unknown marker set": ("MARKER_SET_UNKNOWN", lambda k: {"marker_set": "unheard_of"}),
+    "unknown marker set": ("MARKER_SET_UNKNOWN: unheard_of", lambda k: {"marker_set": "unheard_of"}),
     "names in another order": ("MARKER_SET_UNKNOWN", lambda k: {"names": k.names[::-1]}),
+    "other names": ("MARKER_SET_UNKNOWN: m0", lambda k: {"names": tuple(f"m{i}" for i in range(len(k.names)))}),
     "one zero quaternion": ("PHONE_LOG", lambda k: {"phone_quat_wxyz": put(k.phone_quat_wxyz, (5,), 0)}),
     "zero quaternions": ("PHONE_LOG", lambda k: {"phone_quat_wxyz": np.zeros_like(k.phone_quat_wxyz)}),
     "backward phone": ("PHONE_LOG", lambda k: {"phone_time_s": k.phone_time_s[::-1]}),
@@ -65,20 +66,26 @@ BAD: dict[str, tuple[str, Callable[[Any], dict]]] = {
 }
 
 
-def code_of(make: Callable[[], SessionInput]) -> str:
-    """The code with which a session is refused: at its construction or as the result of the fit."""
+def refusal(make: Callable[[], SessionInput]) -> PblError:
+    """The error with which a session is refused: at its construction or as the result of the fit."""
     try:
         result = fit_sessions([make()], METHODS["gauss-newton"])[0]
     except PblError as error:
-        return error.code
+        return error
     assert isinstance(result, PblError)
-    return result.code
+    return result
+
+
+def code_of(make: Callable[[], SessionInput]) -> str:
+    return refusal(make).code
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_keypoints_have_a_code(trial, name):
-    code, change = BAD[name]
-    assert code_of(lambda: SessionInput([dataclasses.replace(trial, **change(trial))], ["a"], "handheld")) == code
+    (code, _, found), change = BAD[name][0].partition(": "), BAD[name][1]
+    error = refusal(lambda: SessionInput([dataclasses.replace(trial, **change(trial))], ["a"], "handheld"))
+    assert error.code == code
+    assert found in error.found
 
 
 @pytest.mark.parametrize("n", [0, 1, 20])

@@ -165,16 +165,6 @@ def test_a_detector_that_assumes_a_taller_person_gives_the_same_angles(fitted):
     assert cm[1] == pytest.approx(cm[0], rel=1e-2)
 
 
-@pytest.mark.slow
-def test_a_stated_height_scales_lengths_and_leaves_angles(fitted):
-    own = fitted.trials[0]
-    tall = fit_session([seen()], ["a"], "blazepose", height_m=1.2).trials[0]
-    assert np.rad2deg(np.nanmax(np.abs(tall.qpos - own.qpos)[:, 6:])) < 0.05
-    ratio = tall.scale / own.scale
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
-    np.testing.assert_allclose(tall.markers_world_m, ratio[0] * own.markers_world_m, rtol=1e-4, atol=1e-4)
-
-
 def test_metres_are_those_of_the_body():
     body, markers = load_body(), marker_set("blazepose_33")
     exact = observe(np.zeros((5, 40)), TIME_S[:5], marker_set="blazepose_33", view="frontal", noise=None).keypoints

@@ -30,7 +30,6 @@ from pbl_pipeline.gait import (
     Gdi,
     gait_metrics,
 )
-from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.pipeline import measured
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 from pbl_pipeline.report.page import page_of
@@ -38,7 +37,7 @@ from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import Camera, VideoInfo
 from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_of_fits
 from tests.command import pbl
-from tests.exported import marked_fit
+from tests.exported import keypoints_of, marked_fit
 from tests.inputs import video_info
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, fields, leaves
 from tests.unit.visits import solution_of
@@ -66,23 +65,6 @@ def stand(name: str) -> TrialFit:
     body = load_body()
     fit = walking_fit(body.joint_names, body.sha256, n_frames=120, walks=False, name=name)
     return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=fit.qpos)
-
-
-def keypoints_of(fit: TrialFit) -> Keypoints:
-    rng, (n, j) = np.random.default_rng(1), fit.markers_world_m.shape[:2]
-    return Keypoints(
-        time_s=fit.time_s,
-        names=fit.marker_names,
-        marker_set=fit.marker_set,
-        xy_px=rng.uniform(0, 300, (n, j, 2)).astype(np.float32),
-        xyz_cam_m=np.full((n, j, 3), np.nan),
-        root_relative=True,
-        confidence=rng.uniform(0.3, 1.0, (n, j)).astype(np.float32),
-        image_size_px=(640, 360),
-        camera=Camera(fit.camera.matrix, np.zeros(5), "guess: a test"),
-        box_px=np.zeros((n, 4)),
-        origin="a detector, licence Apache-2.0",
-    )
 
 
 def video_of(name: str, time_s: np.ndarray) -> VideoInfo:
