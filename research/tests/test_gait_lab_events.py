@@ -13,6 +13,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import detect_events, feet_from_markers
 from research.benchmarks.events import Tally, cross_validated, lab_walks, reduced
+from tests import not_none
 
 pytestmark = pytest.mark.slow
 
@@ -71,8 +72,7 @@ def test_the_event_model_against_the_force_plates(shared_data):
     these walks ask for (docs/events.md)."""
     tally = Tally()
     for walk in lab_walks():
-        assert walk.feet is not None
-        tally.add(detect_events(walk.feet, "phase-transformer"), walk.events.events)
+        tally.add(detect_events(not_none(walk.feet), "phase-transformer"), walk.events.events)
     print(tally)  # noqa: T201
     assert tally.labels == 95
     assert tally.matched >= 0.97
@@ -105,8 +105,7 @@ def test_the_event_model_on_ankles_with_noise(shared_data):
     """17 joints at 30 Hz with 20 mm noise."""
     tally = Tally()
     for walk in lab_walks():
-        assert walk.feet is not None
-        tally.add(detect_events(reduced(walk.feet, seed=7)), walk.events.events)
+        tally.add(detect_events(reduced(not_none(walk.feet), seed=7)), walk.events.events)
     assert tally.matched >= 0.95
     assert tally.invented <= 1
     for event in ("foot_down", "foot_up"):

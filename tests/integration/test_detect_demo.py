@@ -23,6 +23,7 @@ from pbl_pipeline.tracking import (
     track_people,
 )
 from pbl_pipeline.video import guess_camera, load_camera, read_frames
+from tests import not_none
 from tests.unit.test_blazepose import BY_EYE, asset
 from tests.videos import constant_rate, write_video
 
@@ -46,9 +47,7 @@ def tracking(demo) -> Tracking:
 @pytest.fixture(scope="module")
 def keypoints(demo, tracking) -> Keypoints:
     camera = load_camera(assets.fetch("demo_camera"), SIZE)
-    chosen = choose_subject(tracking).person_id
-    assert chosen is not None
-    return detect_keypoints(demo, tracking, chosen, camera)
+    return detect_keypoints(demo, tracking, not_none(choose_subject(tracking).person_id), camera)
 
 
 def cut(demo: Path, start: int, stop: int, x: slice, y: slice) -> Iterator[np.ndarray]:
@@ -141,8 +140,7 @@ def test_looking_where_it_is_needed_is_as_good_as_looking_in_every_frame(demo, t
 def test_the_walker_is_chosen_with_a_reason(tracking):
     choice = choose_subject(tracking)
     assert choice.status == "CHOSEN"
-    assert choice.person_id is not None
-    assert abs(hips_at(tracking, 105)[choice.person_id][0] - 959) < 60
+    assert abs(hips_at(tracking, 105)[not_none(choice.person_id)][0] - 959) < 60
     assert choice.score - choice.runner_up_score > 0.15
     assert "walks" in choice.reason
 

@@ -24,6 +24,7 @@ from schemas.reading.why import why
 from schemas.rows import delete_below, utc_now
 from schemas.studies import visit_forms
 from schemas.studies.study_sheets import import_sheets
+from tests import not_none
 from tests.command import pbl
 from tests.integration import chain, web
 from tests.rows import register
@@ -51,9 +52,7 @@ def done(run: Run) -> dict[str, int]:
 
 
 def found() -> Kinetics:
-    kinetics_of = load_visit(VISIT).kinetics
-    assert kinetics_of is not None
-    return kinetics_of
+    return not_none(load_visit(VISIT).kinetics)
 
 
 def correct(**values: str) -> tuple[str, ...]:
@@ -203,8 +202,7 @@ def test_a_job_that_fails_leaves_the_rest_of_the_visit(upright: None, tmp_path: 
     assert (row.table, row.code, row.next_step) == ("Kinetics", "FIT_INPUT", "fit again")
     visit = load_visit(VISIT)
     assert visit.kinetics is None
-    assert visit.measures is not None
-    assert visit.measures.gdi.mean is not None
+    assert not_none(visit.measures).gdi.mean is not None
     assert [f.table for f in visit_progress(1).failed] == ["Kinetics"]
     assert "a broken motion" in why(1).verdict
     page = web.client().get("/visits/1").text
@@ -237,8 +235,7 @@ def test_forces_are_of_the_trials_that_the_index_pools(upright: None, tmp_path: 
     delete = set_condition(2, pace="self_selected")
     assert any("kinetics" in text for text in delete), delete
     populate()
-    own = load_visit({**VISIT, "gdi_method": default}).kinetics
-    assert own is not None
+    own = not_none(load_visit({**VISIT, "gdi_method": default}).kinetics)
     assert own.measures["vertical_impulse_bw_s"].n > n[default]
 
 

@@ -27,6 +27,7 @@ from pbl_pipeline.gait import (
 from pbl_pipeline.gait.laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
 from research.benchmarks.gdi import children, conventions
+from tests import not_none
 
 MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 
@@ -97,13 +98,10 @@ def test_measures_of_a_child(walk):
     metrics = gait_metrics([read_lab_trial(walk)], model="gillette-2008")
     values = metrics.spatiotemporal
     assert values.n_cycles_used == values.n_cycles_found == 3
-    stride, speed, width = (values[k] for k in ("stride_length_m", "speed_m_per_s", "step_width_m"))
-    assert stride is not None
-    assert speed is not None
-    assert width is not None
+    assert values["stride_length_m"] is not None
+    speed, width = (not_none(values[k]) for k in ("speed_m_per_s", "step_width_m"))
     # The pelvis' way by its markers is another measurement of the same speed.
-    feet = read_lab_trial(walk).feet
-    assert feet is not None
+    feet = not_none(read_lab_trial(walk).feet)
     way = np.linalg.norm(np.diff(feet.pelvis_m[[0, -1], :2], axis=0)) / (feet.time_s[-1] - feet.time_s[0])
     assert speed.mean == pytest.approx(way, rel=0.03)
     assert 0.03 < width.mean < 0.2

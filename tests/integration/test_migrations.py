@@ -23,7 +23,7 @@ from schemas.chain import ON_REQUEST
 from schemas.decisions import event_corrections
 from schemas.intake import VisitRecord, ingest
 from schemas.reading import frames
-from tests import mysql
+from tests import mysql, not_none
 from tests.command import pbl
 from tests.database import keep, new_home, put_back, remove_home, server
 from tests.rows import everything, register
@@ -169,8 +169,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
 def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
     """Compute a visit whose events are corrected, and take migration 0004 back."""
     _visits(folder, "2026-03-01")
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     (time, side, kind, _), *others = found.events
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
     _compute()
@@ -343,9 +342,7 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert migrations.migrate().steps == []
     # Nothing is pending; going back to the detected events computes theirs again.
     assert not populate(_chain()).did_something
-    found = event_corrections.shown(1)
-    assert found is not None
-    event_corrections.take_back(1, "B. Second", found.state)
+    event_corrections.take_back(1, "B. Second", not_none(event_corrections.shown(1)).state)
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 

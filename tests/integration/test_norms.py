@@ -18,6 +18,7 @@ from schemas import fit, gait, gdi, lab, load_visit, norms, session
 from schemas.cli.norm import norm as command
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames
+from tests import not_none
 from tests.command import pbl
 from tests.rows import remove_all
 from workers.populate import populate
@@ -97,9 +98,7 @@ def _used_by_a_session(walkers: Path, expected) -> None:
 
 
 def metrics_of(restriction: dict[str, str]) -> GaitMetrics:
-    found = load_visit(restriction).measures
-    assert found is not None
-    return found
+    return not_none(load_visit(restriction).measures)
 
 
 def _sets(subject: str):
@@ -117,8 +116,7 @@ def test_nine_angles_in_the_tables(walkers: Path):
     assert found["session_gdi"] == pytest.approx(fresh.mean, abs=1e-3)
     assert fresh.profile is not None
     assert found["session_gps"] == pytest.approx(fresh.profile.gps, abs=1e-3)
-    assert metrics.gdi.profile is not None
-    assert metrics.gdi.profile.left == pytest.approx(fresh.profile.left, abs=1e-3)
+    assert not_none(metrics.gdi.profile).left == pytest.approx(fresh.profile.left, abs=1e-3)
     assert (gdi.SessionGdi.Check & found & {"gdi_check": "norm_convention"}).fetch1("gdi_check_outcome") == "WARN"
     with pytest.raises(PblError, match="NORM_INVALID"):
         gdi.resolve("gillette-2008", "gillette-166-body-angles")

@@ -35,6 +35,7 @@ from schemas.method_rows import resolve_method
 from schemas.plan import plan_fit_sets
 from schemas.reading import frames
 from schemas.reading.status import pipeline_status
+from tests import not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.rows import register
@@ -51,9 +52,7 @@ def errors(run) -> dict[str, dict[str, int]]:
 
 def camera_of(number: int) -> Camera:
     """The camera that the keypoints of the session's video of this number (from 0) were computed with."""
-    found = load_visit({"subject": "P001"}).recordings[number].keypoints
-    assert found is not None
-    return found.camera
+    return not_none(load_visit({"subject": "P001"}).recordings[number].keypoints).camera
 
 
 def done(run) -> dict[str, int]:
@@ -120,7 +119,6 @@ def _everything_comes_back(paths: list[Path]) -> None:
     for path, trial in zip(paths, results.fitted, strict=True):
         info = pbl_pipeline.video.probe(path)
         assert trial.video is not None
-        assert trial.choice is not None
         assert trial.keypoints is not None
         assert trial.fit is not None
         assert trial.video.time_s.tolist() == info.time_s.tolist()
@@ -129,7 +127,7 @@ def _everything_comes_back(paths: list[Path]) -> None:
         tracks = chain.track_people(path)
         tracked = reading.load_tracking({"video_id": trial.number})
         np.testing.assert_allclose(tracked.persons[1].box_px, tracks.persons[1].box_px, rtol=1e-6)
-        assert trial.choice.person_id == 1
+        assert not_none(trial.choice).person_id == 1
         points = chain.detect_keypoints(path, tracks, 1, pbl_pipeline.video.guess_camera(info))
         np.testing.assert_allclose(trial.keypoints.xy_px, points.xy_px, rtol=1e-5)
         assert trial.keypoints.camera.source.startswith("guess")
@@ -139,8 +137,7 @@ def _everything_comes_back(paths: list[Path]) -> None:
         assert trial.fit.qpos.dtype == np.float32
         assert trial.fit.orientation_source == made.orientation_source
         assert np.isnan(trial.fit.phone_clock_offset_s)
-        assert trial.events is not None
-        assert trial.events.status == "PASS"
+        assert not_none(trial.events).status == "PASS"
         assert any(c.used and c.curves for c in trial.cycles)
     assert (results.solution.iterations, results.solution.converged) == (7, True)
     lib = pbl_pipeline.gait
@@ -183,9 +180,7 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
     assert gdi.SessionGdi.fetch1("session_reason")
     assert qc.SessionQc.fetch1("qc_outcome") == "EMPTY"
     assert len(keypoints.Keypoints()) == 1
-    found = load_visit({"subject": "P001"}).measures
-    assert found is not None
-    assert found.status == "EMPTY"
+    assert not_none(load_visit({"subject": "P001"}).measures).status == "EMPTY"
     assert not populate().did_something
 
 
@@ -233,8 +228,7 @@ def test_a_failed_fit_gives_no_measures_in_tables_and_files(
         ("Spatiotemporal", "walk2.mp4"): why,
     }
     found = load_visit({"subject": "P001"})
-    judged = found.judged
-    assert judged is not None
+    judged = not_none(found.judged)
     fresh = pbl_pipeline.gait.gait_metrics(
         [r.fit for r in found.fitted if r.fit is not None], fit_checks=found.fit_checks
     )

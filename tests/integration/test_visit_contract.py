@@ -38,6 +38,7 @@ from schemas import load_visit as load_from_tables
 from schemas.decisions import event_corrections
 from schemas.intake import Methods, ingest
 from schemas.intake import VisitRecord as Whose
+from tests import not_none
 from tests.command import pbl
 from tests.exported import with_markers
 from tests.integration import chain, test_markers, test_rigs, web
@@ -127,24 +128,20 @@ def another_norm(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     ingest([video], Whose("P001", "2026-03-01", mass_kg=MASS_KG), methods=Methods(norm=NORM))
     populate()
     both = run([video], folder / "out", norm=NORM)
-    assert both.of_tables.measures is not None
-    assert both.of_tables.measures.gdi.norm == NORM
+    assert not_none(both.of_tables.measures).gdi.norm == NORM
     return both
 
 
 def corrected_event(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     """A person moves an event by 0.1 s; on files the chain is given the same correction."""
     both = one_trial(folder, patch)
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     events = [e[:3] for e in found.events]
     time, side, kind = events[6]
     event_corrections.save(1, [*events[:6], (time + 0.1, side, kind), *events[7:]], "A. First", found.state)
     populate()
-    corrected = event_corrections.shown(1)
-    assert corrected is not None
-    assert corrected.hand is not None
-    by_hand = [GaitEvent(t, s, k, 1.0 if p is None else p) for t, s, k, p in corrected.hand]
+    corrected = not_none(event_corrections.shown(1))
+    by_hand = [GaitEvent(t, s, k, 1.0 if p is None else p) for t, s, k, p in not_none(corrected.hand)]
     detect = metrics.detect_events
     patch.setattr(metrics, "detect_events", lambda *args: apply_correction(detect(*args), by_hand, 1))
     both = run([folder / "walk.mp4"], both.folder)
@@ -234,9 +231,8 @@ def of_both(visit: Visit) -> Visit:
         of_video: dict[str, Any] = {"video": None, "choice": None, "load_keypoints": None} if from_fit else {}
         return dataclasses.replace(r, number=None, condition=Condition(), load_log=None, **of_video)
 
-    assert visit.solution is not None
     methods = {k: v for k, v in visit.methods.items() if k == "Fit" or not from_fit}
-    changes = {"solution": dataclasses.replace(visit.solution, seconds=0.0), "methods": methods}
+    changes = {"solution": dataclasses.replace(not_none(visit.solution), seconds=0.0), "methods": methods}
     whose: dict[str, Any] = {"subject": "-", "label": "", "date": "", "key": {}}
     return as_stored(dataclasses.replace(visit, recordings=tuple(map(common, visit.recordings)), **changes, **whose))
 
@@ -244,10 +240,8 @@ def of_both(visit: Visit) -> Visit:
 # ----------------------------------------------------------------------------------------------------- what is the same
 def test_the_visit_is_the_same(both: Both) -> None:
     assert both.of_files.lacks == both.of_tables.lacks == ()
-    assert both.of_tables.measures is not None
-    assert both.of_tables.measures.gdi.mean is not None
-    assert both.of_tables.kinetics is not None
-    assert both.of_tables.kinetics.measures
+    assert not_none(both.of_tables.measures).gdi.mean is not None
+    assert not_none(both.of_tables.kinetics).measures
     assert_same(of_both(both.of_tables), of_both(both.of_files))
 
 

@@ -18,6 +18,7 @@ from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import IMPORTANT_CHANGE, chances, change_sd
 from schemas import fit, gait, gdi, study
 from schemas.reading import comparison, frames, registered
+from tests import not_none
 from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -67,9 +68,7 @@ def test_changes_against_the_reference(visits: None):
     np.testing.assert_allclose(knee(second), LESS * knee(first), atol=0.7)
     name = "stride_time_s"
     values = [c.about.measures[name][0] for c in (first, second)]
-    assert values[0] is not None
-    assert values[1] is not None
-    assert second.changes[name].by == values[1].mean - values[0].mean
+    assert second.changes[name].by == not_none(values[1]).mean - not_none(values[0]).mean
     assert second.changes[name].sure is None  # no figure says what is more than chance
     assert (second.scores["mJOA"].change, second.scores["mJOA"].important) == (3.0, True)  # its minimal change is 2
     assert second.scores["mJOA-LE"].change is None  # the reference has none
@@ -77,11 +76,9 @@ def test_changes_against_the_reference(visits: None):
     assert len(without.curves) == 0
     turned = comparison.compare([(1, None), (2, None)], (2, None))
     assert turned.reference == 1
-    assert turned.compared[0].change is not None
-    assert turned.compared[0].change.by == -6.0
+    assert not_none(turned.compared[0].change).by == -6.0
     gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 79.0})
-    again = comparison.compare([(1, None), (2, None)]).compared[1].change
-    assert again is not None
+    again = not_none(comparison.compare([(1, None), (2, None)]).compared[1].change)
     assert (again.by, again.sure) == (7.0, True)
     gdi.SessionGdi.update1({k: first.about.key[k] for k in gdi.SessionGdi.primary_key} | {"session_gdi": 80.0})
 
@@ -122,8 +119,7 @@ def from_other_sides(visits: None) -> Iterator[None]:
 
 def test_visits_filmed_from_other_sides(from_other_sides: None):
     found = comparison.compare([(1, None), (2, None)])
-    change = found.compared[1].change
-    assert change is not None
+    change = not_none(found.compared[1].change)
     assert change.least == pytest.approx(1.645 * np.hypot(3, 3), abs=0.01)
     assert change.differs == (Difference("view", ("right",), ("left",)),)
     assert change.sure is False
@@ -146,8 +142,7 @@ def test_visits_filmed_from_other_sides(from_other_sides: None):
 def test_a_visit_with_an_aid_is_not_judged(visits: None):
     study.Visit.insert1({"session_id": 2, "visit_role": "3_months", "assistive_device": "Cane & <b>"})
     try:
-        change = comparison.compare([(1, None), (2, None)]).compared[1].change
-        assert change is not None
+        change = not_none(comparison.compare([(1, None), (2, None)]).compared[1].change)
         assert (change.sure, [d.what for d in change.differs]) == (None, ["aid"])
         page = web.client().get("/compare?v=1&v=2").text
         assert "+6.0: not comparable: other walking aid (cane &amp; &lt;b&gt;, before: none)" in page
@@ -167,8 +162,7 @@ def test_a_visit_with_a_stated_height_is_not_judged(visits: None):
     before = (fit.SessionFit & key).fetch1("fit_height")
     fit.SessionFit.update1({**key, "fit_height": 1.7})
     try:
-        change = comparison.compare([(1, None), (2, None)]).compared[1].change
-        assert change is not None
+        change = not_none(comparison.compare([(1, None), (2, None)]).compared[1].change)
         assert (change.sure, change.differs) == (None, (Difference("height", ("stated",), ("not_stated",)),))
     finally:
         fit.SessionFit.update1({**key, "fit_height": before})
@@ -210,9 +204,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
         sd = change_sd((0.5, 0.5), (0.3, 0.3))
         assert change.real == chances(change.by, sd).real
         assert (change.important, change.least) == (None, 0.5)
-        index = found.change
-        assert index is not None
-        assert index.important is not None
+        index = not_none(found.change)
         page = web.client().get("/compare?v=1&v=2").text
         assert "probability of a true rise: " in page
         assert "by at least 5: " in page
@@ -220,7 +212,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
         assert data["found"]["compared"][1]["change"]["real"] == pytest.approx(index.real)
         listed: Any = registered.changes({"subject": "P001"}).set_index("measure")
         assert listed.loc["gdi", "real"] == pytest.approx(index.real, abs=5e-4)
-        assert listed.loc["gdi", "important"] == pytest.approx(index.important, abs=5e-4)
+        assert listed.loc["gdi", "important"] == pytest.approx(not_none(index.important), abs=5e-4)
         assert listed.loc["cadence_steps_per_min", "least"] == 0.5
         assert listed.loc["stance_percent", "not_comparable"] == "error"
         assert registered.changes({"subject": "P002"}).empty  # one visit
@@ -234,8 +226,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
 def test_tables_and_a_visit_from_them_know_the_same_filming(visits: None):
     about = comparison.shown_visit(1)
     assert about.result is not None
-    assert about.visit is not None
-    assert about.result.filming == about.visit.filming
+    assert about.result.filming == not_none(about.visit).filming
     assert about.result.filming is not None
     assert about.result.filming.cameras
     assert about.result.filming.pictures

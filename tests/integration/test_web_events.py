@@ -25,6 +25,7 @@ from schemas.reading.visit_list import Filter, visit_page
 from schemas.review import Decision
 from schemas.rows import delete_below
 from schemas.studies import slices
+from tests import not_none
 from tests.integration import decide_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
@@ -43,17 +44,14 @@ def visit(folder: Path) -> str:
 
 def moved(number: int = 1, by: float = 0.1, which: int = 6) -> list[tuple[float, str, str]]:
     """The events of a recording, one of them later by so many seconds."""
-    found = event_corrections.shown(number)
-    assert found is not None
+    found = not_none(event_corrections.shown(number))
     events = [e[:3] for e in found.events]
     time, side, kind = events[which]
     return [*events[:which], (time + by, side, kind), *events[which + 1 :]]
 
 
 def save(number: int, events: list[tuple[float, str, str]], by: str = "A. First") -> dict[str, int]:
-    found = event_corrections.shown(number)
-    assert found is not None
-    return event_corrections.save(number, events, by, found.state)
+    return event_corrections.save(number, events, by, not_none(event_corrections.shown(number)).state)
 
 
 def form_of(browser: Any, number: int) -> dict[str, str]:
@@ -106,8 +104,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     page = browser.get("/recordings/1").text
     assert "1 events corrected by A. First" in page
     assert page.count("by hand</td>") == 1
-    shown = shown_recording(1).recording.events
-    assert shown is not None
+    shown = not_none(shown_recording(1).recording.events)
     assert next(e for e in shown.events if e.probability == 1.0).time_s == pytest.approx(time + 0.1, abs=1e-4)
     # What follows is computed again: of the corrected trial and of the visit alone.
     run = {t.table: t.done for t in populate().tables if t.done}
@@ -126,12 +123,10 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     assert (result.methods[1], result.corrected) == (visit, True)
     assert "A person corrected events of this visit" in browser.get("/visits/1").text
     found = load_visit({"session_id": 1})
-    assert found.measures is not None
-    one, two = (t.events for t in found.measures.trials)
+    one, two = (t.events for t in not_none(found.measures).trials)
     assert (one.corrected, two.corrected) == (True, False)
     assert (one.method, one.params_hash) == (two.method, two.params_hash)
-    counting = event_corrections.shown(1)
-    assert counting is not None
+    counting = not_none(event_corrections.shown(1))
     assert [e.time_s for e in one.events] == [e[0] for e in (counting.hand or ())]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
     monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
@@ -159,8 +154,7 @@ def test_moving_an_event_back_leaves_nothing_set_by_hand(visit: str):
     detected = moved(by=0.0)
     save(1, moved(by=0.1))
     save(1, detected)
-    counting = event_corrections.shown(1)
-    assert counting is not None
+    counting = not_none(event_corrections.shown(1))
     assert counting.hand is None
     assert not counting.stale
     assert "events corrected by" not in web.client().get("/recordings/1").text
@@ -232,8 +226,7 @@ def test_what_is_refused_changes_nothing(visit: str):
 
 
 def test_two_people_correct_at_the_same_moment(visit: str):
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     calls = [(1, moved(by=d), name, found.state) for d, name in ((0.1, "A. First"), (0.05, "B. Second"))]
     late, done = decide_target.at_once("schemas.decisions.event_corrections.save", *calls)
     assert (done, late[0]) == (("done", ""), "DECIDED_MEANWHILE")
@@ -279,8 +272,7 @@ def test_a_decision_waits_for_the_insert_that_reads_what_it_changes(visit: str):
     from schemas import connection
 
     save(1, moved())
-    key = fit.trial_key(1)
-    assert key is not None
+    key = not_none(fit.trial_key(1))
     waited = threading.Event()
 
     def other() -> None:
@@ -302,8 +294,7 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     populate()
     review_decisions.decide_person(1, 2)
     populate()
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     assert (found.hand, found.stale) == (None, True)
     assert (gait.GaitCycle & {"video_id": 1} & fit.current()).fetch1("correction_no") is None
     page = web.client().get("/recordings/1").text
@@ -315,11 +306,9 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     # The last correction of each person counts: of the other one there was none to take back.
     review_decisions.decide_person(1, 2)
     populate()
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     event_corrections.take_back(1, "A. First", found.state)
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     assert (found.hand, found.stale) == (None, False)
 
 
@@ -350,8 +339,7 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
 
 
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
-    before = event_corrections.shown(1)
-    assert before is not None
+    before = not_none(event_corrections.shown(1))
     with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:
         page.goto("/recordings/1")
         page.wait_for_selector("[data-ready]")
@@ -409,8 +397,7 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
         with page.expect_navigation():
             page.get_by_role("button", name="Save the events").click()
         page.wait_for_selector("[data-ready]")
-    found = event_corrections.shown(1)
-    assert found is not None
+    found = not_none(event_corrections.shown(1))
     assert found.hand is not None
     set_by_hand = [e for e in found.hand if e[3] is None]
     assert [(round(t * 30), s, k) for t, s, k, _ in set_by_hand] == [(frame - 2, *before.detected[6][1:3])]

@@ -21,6 +21,7 @@ from pbl_pipeline.kinetics import REASONS
 from pbl_pipeline.words import check_words
 from schemas import session, study
 from schemas.intake.records import set_condition
+from tests import not_none
 from tests.german import english_of, english_words
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
@@ -109,9 +110,7 @@ def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english
         one.headers["accept-language"] = "de"
     refused = phone.get("/visits").text
     link = web.post(browser, "/visits/1/film", hours="2").text
-    found = re.search(r"/phone/open\?key=[\w-]+", link)
-    assert found is not None
-    page = phone.get(found[0]).text
+    page = phone.get(not_none(re.search(r"/phone/open\?key=[\w-]+", link))[0]).text
     assert "data-said" in page
     for text in (refused, link, page, phone.get("/phone/open?key=another").text):
         assert 'lang="de"' in text
@@ -122,8 +121,7 @@ def test_refusals_of_registration_and_upload_are_german(clinic: None, english: s
     browser = web.client(role="reviewer")
     browser.headers["accept-language"] = "de"
     token, long = web.token(browser), "x" * 300
-    seen = re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/facts").text)
-    assert seen is not None
+    seen = not_none(re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/facts").text))
     stated = {"height_m": "172", "mass_kg": "viel", "population": long, "assistive_device": long}
     pages = [
         web.post(browser, "/visits/new", subject="P001", visit="2026-01-10").text,
@@ -162,8 +160,7 @@ def test_refusals_of_forms_are_german(clinic: None, english: set[str]):
         page = web.post(browser, "/instruments", **values).text
         assert page.count('class="problem"') >= 3
         assert not english_of(page, english, NAMES + r"|instrument\w*|x{3,}|minimal_\w+"), values
-    seen = re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/enter").text)
-    assert seen is not None
+    seen = not_none(re.search(r'name="seen" value="([^"]+)"', browser.get("/visits/1/enter").text))
     contradict = {"value:mJOA": "2", "value:mJOA-LE": "3"}, {"value:10MWT_s": "1,5", "value:10MWT_m_per_s": "2"}
     for value in (*({"value:mJOA": v} for v in ("99", "-1", "viel", "12.5", "nan")), *contradict):
         page = web.post(browser, "/visits/1/enter", seen=seen[1], **value).text

@@ -11,6 +11,7 @@ import pytest
 from pbl_pipeline import settings
 from pbl_pipeline.visit import visit_facts
 from schemas import load_visit
+from tests import not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -46,16 +47,14 @@ def test_a_page_as_json_is_what_the_library_and_the_page_say(visits: Path):
         (1, "P001", "2026-01-10"),
     ]
     visit = load_visit({"session_id": 1})
-    assert visit.judged is not None
     about = content_of(browser, PAGES[1])["about"]
-    stored = {**visit_facts(visit), "metrics": visit.judged.to_dict()}
+    stored = {**visit_facts(visit), "metrics": not_none(visit.judged).to_dict()}
     assert about["visit"] == json.loads(json.dumps(stored))
     assert about["checks"]
     assert len(about["of_person"]) == 2
     recording = content_of(browser, PAGES[2])["about"]
     assert (recording["number"], recording["session_id"], recording["n_frames"]) == (1, 1, 240)
-    events = visit.recordings[0].events
-    assert events is not None
+    events = not_none(visit.recordings[0].events)
     assert [e["time_s"] for e in recording["recording"]["events"]] == [e.time_s for e in events.events]
     compared = content_of(browser, PAGES[3])["found"]["compared"]
     assert [c["about"]["row"]["session_id"] for c in compared] == [1, 2]

@@ -9,6 +9,7 @@ import pytest
 
 from pbl_pipeline.render import body_track
 from schemas import fit, reading, video
+from tests import not_none
 from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
@@ -47,11 +48,8 @@ def test_the_body_that_is_sent_is_that_of_the_fit(looked_at):
     _, walk, _ = looked_at
     browser = web.client()
     body = browser.get(f"/recordings/{walk}/movement").json()["body"]
-    key = fit.trial_key(walk)
-    assert key is not None
-    fitted = reading.load_recording(walk).fit
-    assert fitted is not None
-    track = body_track(fitted)
+    assert fit.trial_key(walk) is not None
+    track = body_track(not_none(reading.load_recording(walk).fit))
     low, high = np.frombuffer(browser.get(f"/recordings/{walk}/body").content, np.uint8).reshape(2, -1, N_FRAMES)
     again = (low.astype(np.uint16) | high.astype(np.uint16) << 8).astype(np.int16).astype(np.int64)
     changes = np.concatenate([again[:, :1], np.cumsum(again[:, 1:], axis=1)], axis=1)
@@ -67,15 +65,14 @@ def test_curves_events_and_what_is_uncertain(looked_at):
 
     _, walk, _ = looked_at
     found = web.client().get(f"/recordings/{walk}/movement").json()
-    key = fit.trial_key(walk)
-    assert key is not None
+    assert fit.trial_key(walk) is not None
     about = reading.load_recording(walk)
-    assert about.fit is not None
-    assert about.events is not None
     assert len(found["time"]) == N_FRAMES
     knee = next(c for c in found["curves"] if c["name"] == "Knee flexion")
-    np.testing.assert_allclose(knee["left"]["value"], leg_angles(about.fit)["left"]["knee_flexion"], atol=0.006)
-    assert len(found["events"]) == len(about.events.events) > 4
+    np.testing.assert_allclose(
+        knee["left"]["value"], leg_angles(not_none(about.fit))["left"]["knee_flexion"], atol=0.006
+    )
+    assert len(found["events"]) == len(not_none(about.events).events) > 4
     far = {c.far_leg for c in about.cycles}
     for side in ("left", "right"):
         spans = found["uncertain"][side]

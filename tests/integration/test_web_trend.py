@@ -13,6 +13,7 @@ from schemas import gait, gdi
 from schemas.intake.records import set_condition
 from schemas.reading import comparison
 from schemas.reading.trend import trend_of
+from tests import not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -63,8 +64,7 @@ def test_the_index_of_all_visits_with_what_is_more_than_chance(visits: None):
 
 def test_a_measure_has_its_spread_and_no_verdict(visits: None):
     found = trend_of(1, "stride_time_s")
-    about = comparison.shown_visit(2).measures["stride_time_s"][0]
-    assert about is not None
+    about = not_none(comparison.shown_visit(2).measures["stride_time_s"][0])
     second = found.points[1]
     assert (second.value, second.bounds) == (about.mean, about.interval)
     assert (second.left, second.right) == (about.left, about.right)
@@ -97,8 +97,7 @@ def test_times_of_a_task_are_compared_and_have_a_trend(visits: None):
     name = "sit_to_stand.five_rises_time_s"
     found = trend_of(5, name)
     assert [p.value for p in found.points] == [14.0, 10.5]  # of two recordings the mean
-    change = found.points[1].before
-    assert change is not None
+    change = not_none(found.points[1].before)
     assert (change.by, change.sure, change.differs) == (-3.5, None, (Difference("error"),))
     assert not any(m.startswith("tug") for m in found.measures)  # never done
     side = comparison.compare([(5, None), (6, None)]).compared[1]

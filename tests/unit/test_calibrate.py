@@ -12,6 +12,7 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import Board, calibrate_video, load_camera
 from pbl_pipeline.video.calibrate import View, calibrate, covered, different_views
+from tests import not_none
 from tests.board_video import film, varied_poses
 from tests.command import pbl
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -80,9 +81,7 @@ def test_a_known_lens_comes_back(videos, tmp_path, kind):
     assert content["coverage"] >= 0.5
     assert content["video"]["name"] == f"{kind}.mp4"
     assert f"{content['n_views']} views used" in done.out
-    drawn = cv2.imread(str(out.with_suffix(".png")))
-    assert drawn is not None
-    assert drawn.shape[1] == 900
+    assert not_none(cv2.imread(str(out.with_suffix(".png")))).shape[1] == 900
 
 
 def test_a_video_without_a_board(tmp_path):
@@ -194,9 +193,7 @@ def test_corners_on_one_line_are_no_view(monkeypatch):
 
     along = board.squares[0] - 1
     assert find(np.arange(along)) is None
-    found = find(np.arange(along + 1))
-    assert found is not None
-    np.testing.assert_array_equal(found[1], view.xy_px[: along + 1])
+    np.testing.assert_array_equal(not_none(find(np.arange(along + 1)))[1], view.xy_px[: along + 1])
 
 
 def test_boards_that_cannot_be():

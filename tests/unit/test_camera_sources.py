@@ -16,6 +16,7 @@ from pbl_pipeline.video.camera import reaches_corners
 from pbl_pipeline.video.container_tags import read_tags
 from pbl_pipeline.video.lens_calibration import preset_camera, presets, quarter_turn
 from research.phone_cameras import build
+from tests import not_none
 from tests.inputs import keypoints, video_info
 from tests.quicktime import edit_list, insert, meta
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -159,8 +160,7 @@ def test_presets_are_those_published(shared_data):
     assert build(published) == presets()
     for key, entry in published.items():
         height, width = (int(row[0]) for row in entry["imageSize"])
-        camera = preset_camera(video_info(model=key.split("/")[0], width_px=width, height_px=height))
-        assert camera is not None
+        camera = not_none(preset_camera(video_info(model=key.split("/")[0], width_px=width, height_px=height)))
         np.testing.assert_allclose(camera.matrix, entry["intrinsicMat"], atol=1e-3)
         np.testing.assert_allclose(camera.distortion, entry["distortion"][0], atol=1e-6)
 
@@ -168,11 +168,9 @@ def test_presets_are_those_published(shared_data):
 @pytest.mark.parametrize("name", ["iPhone 11", "iphone12,1", " iPhone  11 "])
 def test_a_preset_by_name_or_identifier(name):
     small_one, large = (
-        preset_camera(video_info(model=name)),
-        preset_camera(video_info(model=name, width_px=2160, height_px=3840)),
+        not_none(preset_camera(video_info(model=name))),
+        not_none(preset_camera(video_info(model=name, width_px=2160, height_px=3840))),
     )
-    assert small_one is not None
-    assert large is not None
     # Of this phone both formats are published, and differ.
     assert (small_one.matrix[0, 0], large.matrix[0, 0]) == (
         pytest.approx(912.2, abs=0.1),
@@ -196,37 +194,33 @@ def test_no_preset(model, lens):
 
 
 def test_a_preset_scales_and_turns_with_the_recording():
-    portrait = preset_camera(video_info(model="iPhone 11"))
-    assert portrait is not None
+    portrait = not_none(preset_camera(video_info(model="iPhone 11")))
     points = np.array([[0.3, -0.2, 2.0], [-0.4, 0.6, 2.5], [0.1, 0.9, 3.0]])
     seen = _project(points, portrait)
     # 1080p portrait: the same view, 1.5 times as many pixels.
-    larger = preset_camera(video_info(model="iPhone 11", width_px=1080, height_px=1920))
-    assert larger is not None
+    larger = not_none(preset_camera(video_info(model="iPhone 11", width_px=1080, height_px=1920)))
     np.testing.assert_allclose(_project(points, larger) + 0.5, 1.5 * (seen + 0.5), atol=1e-6)
     # The phone turned counter-clockwise (flag 0): right in the portrait picture is up, so (x, y) -> (y, W - 1 - x).
-    level = preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0))
-    assert level is not None
+    level = not_none(preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0)))
     np.testing.assert_allclose(
         _project(points @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), level),
         np.stack([seen[:, 1], 719 - seen[:, 0]], 1),
         atol=1e-6,
     )
-    on_its_head = preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180))
-    assert on_its_head is not None
+    on_its_head = not_none(preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180)))
     np.testing.assert_allclose(
         _project(points @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), on_its_head),
         np.stack([1279 - seen[:, 1], seen[:, 0]], 1),
         atol=1e-6,
     )
     # Upright, the phone on its head (flag 270): half a turn.
-    upside_down = preset_camera(video_info(model="iPhone 11", rotation_deg=270))
-    assert upside_down is not None
+    upside_down = not_none(preset_camera(video_info(model="iPhone 11", rotation_deg=270)))
     np.testing.assert_allclose(_project(points * [-1, -1, 1], upside_down), [719, 1279] - seen, atol=1e-6)
     # Copies whose pictures were turned: the shape tells more than the flag.
     for size, flag, same in (((720, 1280), 0, portrait), ((1280, 720), 90, level)):
-        copy = preset_camera(video_info(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
-        assert copy is not None
+        copy = not_none(
+            preset_camera(video_info(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
+        )
         np.testing.assert_array_equal(copy.matrix, same.matrix)
 
 
@@ -242,8 +236,9 @@ def test_four_quarter_turns_are_none():
 def test_every_preset_holds_over_the_whole_picture():
     for model in presets()["names"]:
         for width, height, turned in ((720, 1280, 90), (1920, 1080, 0), (1440, 1080, 180)):
-            camera = preset_camera(video_info(model=model, width_px=width, height_px=height, rotation_deg=turned))
-            assert camera is not None
+            camera = not_none(
+                preset_camera(video_info(model=model, width_px=width, height_px=height, rotation_deg=turned))
+            )
             assert reaches_corners(camera.matrix, camera.distortion, (width, height))
 
 

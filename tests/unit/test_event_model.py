@@ -33,6 +33,7 @@ from research.events._leg import leg_points
 from research.events._rhythm import Rhythm, draw_run, leg_phase, schedule
 from research.events._scenes import not_walking
 from research.events._sequence import ORDER
+from tests import not_none
 
 pytestmark = pytest.mark.slow
 
@@ -176,16 +177,14 @@ def test_who_does_not_walk(task):
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_leg_that_is_never_seen(side):
     feet = feet_of(truth_of(seed=1, seconds=6.0))
-    assert feet.legs_m is not None
-    legs = feet.legs_m.copy()
+    legs = not_none(feet.legs_m).copy()
     legs[:, 2:, 0 if side == "left" else 1] = np.nan
     empty(detect_events(dataclasses.replace(feet, legs_m=legs)), f"the {side} foot is never seen")
 
 
 def test_a_leg_that_is_hardly_seen():
     feet = feet_of(truth_of(seed=1, seconds=6.0))
-    assert feet.legs_m is not None
-    legs = feet.legs_m.copy()
+    legs = not_none(feet.legs_m).copy()
     legs[:130, 2:, 0] = np.nan
     found = detect_events(dataclasses.replace(feet, legs_m=legs))
     empty(found, "one leg is hardly seen")
@@ -330,8 +329,7 @@ def test_time_stamps_that_are_no_seconds():
 
 def test_mirrored_legs_without_feet_are_refused_by_their_knees():
     feet = feet_of(truth_of(seed=1, seconds=6.0), lambda xyz: xyz * [1, -1, 1])
-    assert feet.legs_m is not None
-    legs = feet.legs_m.copy()
+    legs = not_none(feet.legs_m).copy()
     legs[:, 3:] = np.nan
     with pytest.raises(PblError, match="GAIT_INPUT"):
         detect_events(dataclasses.replace(feet, legs_m=legs))

@@ -29,6 +29,7 @@ from pbl_pipeline.qc import FAIL, Check
 from pbl_pipeline.validation import reference_of_mot
 from pbl_pipeline.video import PhoneLog, Sensor
 from pbl_pipeline.visit import Held, Recording, Visit, save_visit
+from tests import not_none
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit, with_markers
 from tests.unit.visits import solution_of
@@ -123,8 +124,7 @@ def test_frames_without_a_pose_are_left_out_and_a_missing_marker_is_an_empty_cel
 def test_the_reader_of_references_finds_the_angles_and_the_pelvis_in_the_mot(out, fit):
     found = reference_of_mot(out / "walk" / "walk.mot")
     poses = trial_poses(fit)
-    assert found.pelvis_m is not None
-    np.testing.assert_allclose(found.pelvis_m, poses.position_m[10:175, poses.index("pelvis")], atol=1e-5)
+    np.testing.assert_allclose(not_none(found.pelvis_m), poses.position_m[10:175, poses.index("pelvis")], atol=1e-5)
     assert len(found.angles_deg) == 37
     for name in ("hip_flexion_r", "pelvis_list", "pro_sup_l", "mtp_angle_r"):
         own = np.degrees(fit.qpos[10:175, fit.joint_names.index(name)])
@@ -170,8 +170,7 @@ def opensim_kinematics(osim: Path, mot: Path) -> tuple[list[str], np.ndarray]:
     n = len(table["time"])
     position, rotation = {"/ground": np.zeros((n, 3))}, {"/ground": Rotation.identity(n)}
     for joint in model.findall("JointSet/objects/CustomJoint"):
-        frame = joint.find("frames/PhysicalOffsetFrame")
-        assert frame is not None
+        frame = not_none(joint.find("frames/PhysicalOffsetFrame"))
         assert frame.get("name") == joint.findtext("socket_parent_frame")
         parent, child = str(frame.findtext("socket_parent")), str(joint.findtext("socket_child_frame"))
         base = rotation[parent] * Rotation.from_euler("XYZ", vector(frame, "orientation"))
@@ -240,8 +239,7 @@ def walk() -> TrialFit:
 
 def _heights(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Height (m) of the pelvis in the MOT, and of the lowest of the calcanei and the toes' joints in the TRC."""
-    pelvis = reference_of_mot(folder / "walk.mot").pelvis_m
-    assert pelvis is not None
+    pelvis = not_none(reference_of_mot(folder / "walk.mot").pelvis_m)
     seen = WorldMarkers.from_trc(folder / "walk.trc", "blazepose_33")
     feet = [seen.names.index(f"{b}_{s}_o") for b in ("calcn", "toes") for s in "lr"]
     return pelvis[:, 2], seen.xyz_world_m[:, feet, 2].min(axis=1)
@@ -421,8 +419,7 @@ def test_long_and_wide_tables_hold_the_same(out, fit, metrics):
     )
     measures = table(out / "measures_long.csv", keep_default_na=False, na_values=[""]).set_index(list(SCALAR))
     wide = table(out / "measures_wide.csv").set_index("scope")
-    stride = metrics.spatiotemporal["stride_time_s"]
-    assert stride is not None
+    stride = not_none(metrics.spatiotemporal["stride_time_s"])
     assert wide.loc["session", "stride_time_s_mean"] == pytest.approx(stride.mean, abs=1e-6)
     left = measures.xs(("session", "stride_time_s", "left"), level=("scope", "measure", "statistic"))
     assert left["value"].item() == pytest.approx(stride.left, abs=1e-6)

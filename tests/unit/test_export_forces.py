@@ -25,6 +25,7 @@ from pbl_pipeline.kinetics import (
     visit_kinetics,
 )
 from pbl_pipeline.visit import Recording, Visit
+from tests import not_none
 from tests.walking_fit import walking_fit
 
 BODY = load_body()
@@ -67,15 +68,13 @@ def visit() -> Visit:
 
 
 def of(visit: Visit) -> Kinetics:
-    assert visit.kinetics is not None
-    return visit.kinetics
+    return not_none(visit.kinetics)
 
 
 def test_forces_are_in_newtons_in_opensims_ground(visit: Visit, tmp_path: Path) -> None:
     write_export(visit, ["forces"], tmp_path / "out")
     table = read_sto(tmp_path / "out" / "walk" / "walk.forces.mot")
-    series = of(visit).trials[0].series
-    assert series is not None
+    series = not_none(of(visit).trials[0].series)
     known = np.isfinite(series.force_bw).all(axis=(1, 2))
     assert table["time"] == pytest.approx(series.time_s[known], abs=1e-6)
     up = MASS_KG * GRAVITY * series.force_bw[known]
@@ -100,8 +99,7 @@ def test_opensim_finds_the_same_moments(visit: Visit, tmp_path: Path, monkeypatc
     opensim: Any = pytest.importorskip("opensim")
     walk = dataclasses.replace(visit.recordings[0], markers=_one_marker())
     write_export(dataclasses.replace(visit, recordings=(walk,)), ["osim", "mot", "forces"], tmp_path, _BARE)
-    folder, series = tmp_path / "walk", of(visit).trials[0].series
-    assert series is not None
+    folder, series = tmp_path / "walk", not_none(of(visit).trials[0].series)
     loads = tmp_path / "loads.xml"
     loads.write_text(_LOADS.format("".join(_LOAD.format(s) for s in "rl"), folder / "walk.forces.mot"))
     known = np.isfinite(series.force_bw).all(axis=(1, 2))

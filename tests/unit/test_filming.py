@@ -13,6 +13,7 @@ from pbl_pipeline.gait import Z90
 from pbl_pipeline.render import SIDE_COLOUR
 from pbl_pipeline.study_report import figures
 from schemas.reading.visit_list import Change, Result, change_since
+from tests import not_none
 
 FROM_LEFT = Filming(("left",), (), (), ("self_selected",), ("stated",), ("measured",), ("1080p",), "right")
 CHAIN = ("fit", "events", "index", "norm")
@@ -26,23 +27,18 @@ def after(index: float, filming: Filming, **fields) -> Result:
 
 def test_a_mirrored_walk_is_not_called_changed():
     """Indices of a recording and its mirror image, further apart than the minimal change of visits filmed alike."""
-    found = change_since(after(98.8, MIRRORED), BEFORE)
-    assert found is not None
+    found = not_none(change_since(after(98.8, MIRRORED), BEFORE))
     assert found.by == pytest.approx(5.2)
     assert found.sure is False
     assert found.least == pytest.approx(Z90 * math.hypot(4.0, 4.0))
     assert found.differs == (Difference("view", ("right",), ("left",)),)
-    alike = change_since(after(98.8, FROM_LEFT), BEFORE)
-    assert alike is not None
+    alike = not_none(change_since(after(98.8, FROM_LEFT), BEFORE))
     assert (alike.sure, alike.least, alike.differs) == (True, 5.0, ())
 
 
 def test_a_large_change_is_one_from_any_side():
-    found = change_since(after(104.0, MIRRORED), BEFORE)
-    assert found is not None
-    assert found.sure is True
-    unknown = change_since(after(104.0, MIRRORED, sd=None), BEFORE)
-    assert unknown is not None
+    assert not_none(change_since(after(104.0, MIRRORED), BEFORE)).sure is True
+    unknown = not_none(change_since(after(104.0, MIRRORED, sd=None), BEFORE))
     assert unknown.sure is None
     assert [d.what for d in unknown.differs] == ["view", "error"]
 
@@ -61,8 +57,7 @@ def test_a_large_change_is_one_from_any_side():
 def test_visits_that_were_not_filmed_alike_are_not_judged(what: str, changed: dict):
     other = dataclasses.replace(FROM_LEFT, **changed)
     for now, before in ((after(60.0, other), BEFORE), (BEFORE, after(60.0, other))):
-        found = change_since(now, before)
-        assert found is not None
+        found = not_none(change_since(now, before))
         assert found.sure is None
         assert [d.what for d in found.differs] == [what]
 

@@ -18,6 +18,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait._cycles import foot_passes
 from pbl_pipeline.gait.events import GaitEvent
+from tests import not_none
 
 
 def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bout: int = 0) -> list[GaitEvent]:
@@ -67,9 +68,7 @@ def test_first_and_last_step_are_dropped():
 
 def of(result: Spatiotemporal, name: str) -> Measure:
     """A measure that must be there."""
-    measure = result[name]
-    assert measure is not None
-    return measure
+    return not_none(result[name])
 
 
 def test_measures_by_hand():
@@ -224,8 +223,7 @@ def test_a_true_long_stride_is_used_and_counts_in_the_spread():
     stride = of(result, "stride_time_s")
     by_side = [[c.stride_time_s for c in cycles if c.used and c.side == side] for side in ("left", "right")]
     assert stride.variability == pytest.approx(np.sqrt(np.mean([np.var(x, ddof=1) for x in by_side])))
-    assert stride.variability is not None
-    assert stride.variability > 0.2
+    assert not_none(stride.variability) > 0.2
     assert "spread" not in result.reasons
 
 

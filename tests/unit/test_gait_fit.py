@@ -33,6 +33,7 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
 from pbl_pipeline.visit import Recording, Visit, save_visit
+from tests import not_none
 from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit
 
@@ -165,10 +166,9 @@ def test_a_walking_body(heading_deg):
     metrics = gait_metrics([fit])
     assert metrics.status == "PASS"
     values = metrics.spatiotemporal
-    stride, cadence, stance = (values[n] for n in ("stride_time_s", "cadence_steps_per_min", "stance_percent"))
-    assert stride is not None
-    assert cadence is not None
-    assert stance is not None
+    stride, cadence, stance = (
+        not_none(values[n]) for n in ("stride_time_s", "cadence_steps_per_min", "stance_percent")
+    )
     assert stride.mean == pytest.approx(STRIDE_S, abs=0.004)
     assert cadence.mean == pytest.approx(120 / STRIDE_S, abs=0.5)
     assert stance.left == pytest.approx(stance.right, abs=1.0)
@@ -178,8 +178,7 @@ def test_a_walking_body(heading_deg):
     down = np.array(metrics.trials[0].events.times("right", "foot_down"))
     assert np.abs((down + STRIDE_S / 2) % STRIDE_S - STRIDE_S / 2).max() < 0.06
     # Curves of the mean of the norm are closer to it than those of anybody.
-    assert metrics.gdi.mean is not None
-    assert metrics.gdi.mean > 100
+    assert not_none(metrics.gdi.mean) > 100
     used = [c for c in metrics.trials[0].cycles if c.used]
     assert 55 < used[0].curves["knee_flexion"].max() < 65
     for c in metrics.qc:
@@ -211,8 +210,7 @@ def test_legs_that_one_camera_does_not_see_alike_are_not_compared(camera_m, head
     fit = make_fit(time_s, walking(time_s, heading_deg), camera_position_m=np.array(camera_m))
     metrics = gait_metrics([fit])
     assert {c.far_leg for c in metrics.trials[0].cycles if c.used} == {far}
-    step = metrics.spatiotemporal["step_time_s"]
-    assert step is not None
+    step = not_none(metrics.spatiotemporal["step_time_s"])
     assert (step.left is None, step.asymmetry_percent is None) == (False, bool(far))
     check = next(c for c in metrics.qc if c.check == "legs_seen_alike")
     assert (check.outcome, f"the {far} leg was behind" in check.advice) == (("WARN", True) if far else ("PASS", False))
@@ -223,8 +221,7 @@ def test_legs_that_one_camera_does_not_see_alike_are_not_compared(camera_m, head
         there = dataclasses.replace(fit, camera_position_m=np.array(camera_m) * [1, -1, 1])
         both = gait_metrics([fit, there])
         assert next(c for c in both.qc if c.check == "legs_seen_alike").outcome == "PASS"
-        step = both.spatiotemporal["step_time_s"]
-        assert step is not None
+        step = not_none(both.spatiotemporal["step_time_s"])
         assert step.asymmetry_percent is not None
 
 
@@ -281,14 +278,10 @@ def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
     assert check.value is not None
     assert check.value > 150.0
     with_another = gait_metrics([usual, hasty])
-    cadence = with_another.spatiotemporal["cadence_steps_per_min"]
-    assert cadence is not None
-    assert cadence.mean < 150.0
+    assert not_none(with_another.spatiotemporal["cadence_steps_per_min"]).mean < 150.0
     assert (with_another.gdi.mean is None, with_another.outcome) == (False, "FAIL")
     accepted = gait_metrics([hasty], accept_cadence=True)
-    counted = accepted.spatiotemporal["cadence_steps_per_min"]
-    assert counted is not None
-    assert round(counted.mean, 2) == check.value
+    assert round(not_none(accepted.spatiotemporal["cadence_steps_per_min"]).mean, 2) == check.value
     assert accepted.gdi.mean is not None
     assert [c.outcome for c in accepted.checks if c.check == "cadence_plausible"] == ["WARN"]
     assert [c.exclusion for c in accepted.trials[0].cycles] == [
@@ -300,9 +293,7 @@ def test_a_slow_walk_is_measured_with_a_warning():
     time = np.arange(0, 12, 1 / 30)
     usual = make_fit(time, walking(time))
     metrics = gait_metrics([dataclasses.replace(usual, time_s=usual.time_s * 2.0)])
-    cadence = metrics.spatiotemporal["cadence_steps_per_min"]
-    assert cadence is not None
-    assert cadence.mean < 60.0
+    assert not_none(metrics.spatiotemporal["cadence_steps_per_min"]).mean < 60.0
     assert [(c.outcome, c.threshold) for c in metrics.checks if c.check == "cadence_plausible"] == [("WARN", 60.0)]
 
 
@@ -504,9 +495,7 @@ def test_a_foot_out_of_sight_for_a_moment_is_bridged_and_for_longer_is_not():
     time = np.arange(0, 8, 1 / 30)
     whole = feet_from_fit(fit_with_points(time, np.zeros(len(time), bool)))
     short = feet_from_fit(fit_with_points(time, (time > 4) & (time < 4.45)))
-    assert whole.legs_m is not None
-    assert short.legs_m is not None
-    np.testing.assert_array_equal(short.legs_m, whole.legs_m)
+    np.testing.assert_array_equal(not_none(short.legs_m), not_none(whole.legs_m))
     long = feet_from_fit(fit_with_points(time, (time > 3) & (time < 5)))
     assert long.legs_m is not None
     hidden = (time > 3.3) & (time < 4.7)

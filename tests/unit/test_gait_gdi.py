@@ -24,6 +24,7 @@ from pbl_pipeline.gait import (
     score_gdi,
 )
 from pbl_pipeline.gait.normative.norm import _checksum, _to_json
+from tests import not_none
 
 PERCENT = np.linspace(0, 98, 50)
 ABOUT = {"name": "toy", "version": 1, "source": "made up", "licence": "none", "convention": "none"}
@@ -194,9 +195,9 @@ def test_errors_that_pass_or_differ_between_the_sides_make_the_mean_surer(toy):
 
     def variance(cycles, **params):
         before = GdiParams(average="curves", min_cycles_per_side=0)
-        after, all_of_it = (score_gdi(cycles, toy, p).sd for p in (dataclasses.replace(before, **params), before))
-        assert after is not None
-        assert all_of_it is not None
+        after, all_of_it = (
+            not_none(score_gdi(cycles, toy, p).sd) for p in (dataclasses.replace(before, **params), before)
+        )
         return (after / all_of_it) ** 2
 
     assert variance(both, lasting=0.75) == pytest.approx(0.75)
@@ -226,9 +227,7 @@ def test_what_errors_lengthen_is_taken_back_from_the_distance(toy):
     assert index(0.2, times=1e-3).mean == pytest.approx(plain.mean, abs=1e-4)
     assert index(0.2, times=1e3).mean == pytest.approx(plain.mean + 0.5 * ten * np.log(3.0))
     # A shorter distance is changed by more by the same error.
-    more, before = index(0.2).sd, plain.sd
-    assert more is not None
-    assert before is not None
+    more, before = not_none(index(0.2).sd), not_none(plain.sd)
     assert more > before
     # A fit that does not know how sure it is has the index as it is; so has one that is infinitely unsure.
     for unknown in (index(0.2, known=False), index(0.2, times=np.inf)):

@@ -33,6 +33,7 @@ from research.paper_objective import PAPER_COST, objective_of
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import walk_qpos
+from tests import not_none
 
 pytestmark = pytest.mark.slow
 
@@ -154,20 +155,16 @@ def test_trajectories_use_the_encoding_again_and_do_not_depend_on_their_number()
     two, four = initial_trajectories(3, 2, *shape), initial_trajectories(3, 4, *shape)
     assert [a.weight.shape for a in two.layers] == [(2, 12, 16), (2, 12, 28), (2, 12, 28), (2, 12, 12), (2, 43, 12)]
     for a, b in zip(two.layers, four.layers, strict=True):
-        assert b.bias is not None
         np.testing.assert_array_equal(a.weight, b.weight[:2])
-        np.testing.assert_array_equal(a.bias, b.bias[:2])
-    last = two.layers[-1].bias
-    assert last is not None
-    assert np.all(last == 0)
+        np.testing.assert_array_equal(a.bias, not_none(b.bias)[:2])
+    assert np.all(not_none(two.layers[-1].bias) == 0)
     assert not np.array_equal(two.layers[0].weight[0], two.layers[0].weight[1])
     code = jnp.asarray(encode(np.array([[0.1, 0.7], [0.1, 0.7]]), frequencies(2.0, 5.0, 2)[:5]), jnp.float32)
     out = np.asarray(evaluate(two, code))
     x = by_hand = np.asarray(code[1, 1])
     for i, layer in enumerate(two.layers):
-        assert layer.bias is not None
         x = by_hand if i == 0 else np.concatenate([x, by_hand]) if i <= 2 else x
-        x = layer.weight[1] @ x + layer.bias[1]
+        x = layer.weight[1] @ x + not_none(layer.bias)[1]
         x = np.maximum(x, 0) if i < 4 else x
     np.testing.assert_allclose(out[1, 1], x, atol=1e-6)
 

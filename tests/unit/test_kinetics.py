@@ -38,6 +38,7 @@ from pbl_pipeline.names import check_mass
 from pbl_pipeline.report import write_report
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Visit, load_kinetics, save_kinetics
+from tests import not_none
 from tests.walking_fit import walking_fit
 
 BODY = load_body()
@@ -298,8 +299,7 @@ def test_a_walk_has_measures_with_intervals(walk: TrialFit) -> None:
     # Over a stride both feet carry the weight: half a stride each.
     assert impulse.mean == pytest.approx(0.55, abs=0.05)
     assert by_markers["braking_impulse_bw_s"].mean < 0 < by_markers["propulsion_impulse_bw_s"].mean
-    assert found.residual_bw is not None
-    assert found.residual_bw < 0.2
+    assert not_none(found.residual_bw) < 0.2
     cycle = next(c for c in found.trials[0].cycles if c.used)
     assert cycle.curves["force_vertical_bw"].shape == (51,)
     assert (cycle.curves_sd["force_vertical_bw"] > 0).any()
@@ -396,12 +396,10 @@ def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(walk: Trial
     save_kinetics(dataclasses.replace(kinetics_of(walk, mass_kg=70.0), trials=()), tmp_path)
     done = CliRunner().invoke(gait_command, [str(tmp_path / "walk.fit.npz"), "--out", str(tmp_path / "metrics.json")])
     assert done.exit_code == 0, done.output
-    found = load_kinetics(tmp_path, ["walk"])
-    assert found is not None
+    found = not_none(load_kinetics(tmp_path, ["walk"]))
     assert found.mass_kg == 70.0
     assert found.measures.keys() == kinetics_of(walk).measures.keys()
-    series = found.trials[0].series
-    assert series is not None
+    series = not_none(found.trials[0].series)
     assert series.force_bw.shape == (len(series.time_s), 2, 3)
 
 

@@ -43,6 +43,7 @@ from pbl_pipeline.gait.measurement import (
 )
 from pbl_pipeline.gait.metrics import with_errors
 from pbl_pipeline.gait.metrics_file import load_curves, save_curves
+from tests import not_none
 
 K = 2
 NORM = load_norm()
@@ -168,9 +169,7 @@ def test_the_default_fit_of_a_phone_has_a_measured_model():
 
 def errors(index: Gdi) -> tuple[float, float]:
     """Its standard deviation and its minimal change."""
-    assert index.sd is not None
-    assert index.minimal_change is not None
-    return index.sd, index.minimal_change
+    return not_none(index.sd), not_none(index.minimal_change)
 
 
 def walk(rng: np.random.Generator, far_leg: str, trial: str = "a", model: str = "blazepose-33") -> list[GaitCycle]:
@@ -300,21 +299,15 @@ def measured(far_leg: str = "right", error_model: str = "blazepose-33", metric: 
 
 
 def error_sd(found: Spatiotemporal, name: str) -> float | None:
-    measure = found[name]
-    assert measure is not None
-    return measure.error_sd
+    return not_none(found[name]).error_sd
 
 
 def test_measures_of_a_visit_state_their_error():
     model, found = load_model("blazepose-33"), measured()
-    stance = found["stance_percent"]
-    assert stance is not None
-    assert stance.variability is not None
+    stance = not_none(found["stance_percent"])
     assert stance.error_sd is not None
-    error = measure_error(model, "stance_percent", {"right": 8})
-    assert error is not None
-    sd, anew = error
-    chance = stance.variability / np.sqrt(8)
+    sd, anew = not_none(measure_error(model, "stance_percent", {"right": 8}))
+    chance = not_none(stance.variability) / np.sqrt(8)
     assert stance.error_sd == pytest.approx(np.hypot(sd, chance))
     assert stance.minimal_change == pytest.approx(Z90 * np.sqrt(2) * np.hypot(anew, chance), rel=1e-4)
     assert stance.interval == pytest.approx((stance.mean - Z90 * stance.error_sd, stance.mean + Z90 * stance.error_sd))

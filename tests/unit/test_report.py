@@ -22,6 +22,7 @@ from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
 from pbl_pipeline.visit import Recording, Solution, Visit
 from pbl_pipeline.words import number, significant
+from tests import not_none
 from tests.inputs import video_info
 from tests.walking_fit import walking_fit
 
@@ -170,11 +171,9 @@ def test_page_is_whole_and_asks_for_nothing(visit: Visit, tmp_path: Path) -> Non
 def test_page_shows_the_measures(visit: Visit, measured: GaitMetrics, tmp_path: Path) -> None:
     page = _page(visit, tmp_path)
     values = measured.spatiotemporal
-    cadence, stride, stance = (values[k] for k in ("cadence_steps_per_min", "stride_time_s", "stance_percent"))
-    assert cadence is not None
-    assert stride is not None
-    assert stance is not None
-    assert stance.left is not None
+    cadence, stride, stance = (
+        not_none(values[k]) for k in ("cadence_steps_per_min", "stride_time_s", "stance_percent")
+    )
     assert cadence.mean == pytest.approx(120 / 1.1, abs=2)  # the walker's own cadence
     for words in (
         "Visit 1",
@@ -182,7 +181,7 @@ def test_page_shows_the_measures(visit: Visit, measured: GaitMetrics, tmp_path: 
         "2026-11-20",
         f"{cadence.mean:.1f} steps/min",
         f"{stride.mean:.2f} s",
-        f"Left {stance.left:.1f}",
+        f"Left {not_none(stance.left):.1f}",
         f"n {stance.n}",
         "Double support",
         "GDI of three angles",
@@ -242,12 +241,11 @@ def test_names_are_escaped_everywhere(visit: Visit, walk: TrialFit, tmp_path: Pa
     video = dataclasses.replace(_video(EVIL.replace("/", "")), model=EVIL, recorded_utc=EVIL)
     recording = Recording.of(EVIL, fit, choice=choice, video=video, problem=EVIL)
     whole = _visit(recording, measures=gait_metrics([fit]).with_checks([Check(EVIL, WARN, None, None, EVIL)]))
-    assert whole.solution is not None
     evil = dataclasses.replace(
         whole,
         subject=EVIL,
         date=EVIL,
-        solution=dataclasses.replace(whole.solution, solver=EVIL, device=EVIL),
+        solution=dataclasses.replace(not_none(whole.solution), solver=EVIL, device=EVIL),
         methods={EVIL: EVIL},
     )
     path = _written(evil, tmp_path / "report.html", EVIL)
@@ -268,8 +266,7 @@ def test_verdict_is_the_worst_check(visit: Visit, tmp_path: Path) -> None:
     assert _verdict(page) == WARN
     assert "Usable with care" in page.text
     seen = Check("residual_2d_px", FAIL, 99.0, 9.0, "look at the overlay")
-    assert visit.measures is not None
-    page = _page(visit.with_measures(visit.measures.with_checks([*visit.checks, seen])), tmp_path)
+    page = _page(visit.with_measures(not_none(visit.measures).with_checks([*visit.checks, seen])), tmp_path)
     assert _verdict(page) == FAIL
     assert "Residual 2D (px): look at the overlay." in page.text
 

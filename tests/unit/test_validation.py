@@ -33,6 +33,7 @@ from pbl_pipeline.validation import (
     reference_of_qpos,
     view_classes,
 )
+from tests import not_none
 from tests.walking_fit import walking_fit, with_level_pelvis
 
 TIME = np.arange(200) / 100.0
@@ -58,8 +59,7 @@ def fit() -> TrialFit:
 def _turned(fit: TrialFit, yaw: float, shift_m: tuple[float, float, float]) -> TrialFit:
     """The same walk in a world that is turned about the vertical and shifted."""
     column = {n: i for i, n in enumerate(fit.joint_names)}
-    poses_path = reference_of_fit(fit, "").pelvis_m
-    assert poses_path is not None
+    poses_path = not_none(reference_of_fit(fit, "").pelvis_m)
     c, s = np.cos(yaw), np.sin(yaw)
     rest = load_body().mj_model.body("pelvis").pos
     moved = poses_path @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + shift_m - rest
@@ -306,8 +306,7 @@ def test_a_motion_file_in_degrees_or_radians(tmp_path: Path, unit: str, factor: 
     assert list(read.angles_deg) == [KNEE, "hip_flexion_r"]
     np.testing.assert_allclose(read.angles_deg[KNEE], 20, atol=1e-5)  # positive in flexion, whatever the model's sign
     np.testing.assert_allclose(read.angles_deg["hip_flexion_r"], 7, atol=1e-5)
-    assert read.pelvis_m is not None
-    np.testing.assert_allclose(read.pelvis_m[0], [1.0, -3.0, 2.0])  # y up becomes z up
+    np.testing.assert_allclose(not_none(read.pelvis_m)[0], [1.0, -3.0, 2.0])  # y up becomes z up
 
 
 def test_an_overextended_knee_keeps_its_sign(tmp_path: Path):

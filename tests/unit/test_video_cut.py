@@ -14,6 +14,7 @@ from av.video.reformatter import VideoReformatter
 from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import cut_image, read_frames
 from pbl_pipeline.video.frames import Orientation, cut_planes
+from tests import not_none
 from tests.videos import constant_rate, write_video
 
 #: Turned, 2.2 pixels a step, and partly beyond the picture.
@@ -67,8 +68,7 @@ def converted(frame: av.VideoFrame) -> np.ndarray:
 )
 def test_a_region_of_the_planes_is_that_of_the_picture(pixel_format, full_range, space):
     frame = decoded(smooth_picture(160, 120), pixel_format, space, full_range)
-    region = cut_planes(frame, Orientation(), MATRIX, SIZE)
-    assert region is not None
+    region = not_none(cut_planes(frame, Orientation(), MATRIX, SIZE))
     expected = cut_image(converted(frame), MATRIX, SIZE)
     assert region.shape == expected.shape == (50, 60, 3)
     beyond = cut_image(np.full((120, 160), 255, np.uint8), MATRIX, SIZE)
@@ -88,8 +88,7 @@ def test_a_region_of_the_planes_is_that_of_the_picture(pixel_format, full_range,
 def test_a_region_stands_upright(transpose, flip_x, flip_y):
     turn = Orientation(transpose, flip_x, flip_y)
     frame = decoded(smooth_picture(160, 120), "yuv444p", "bt601", False)
-    region = cut_planes(frame, turn, MATRIX, SIZE)
-    assert region is not None
+    region = not_none(cut_planes(frame, turn, MATRIX, SIZE))
     expected = cut_image(turn.apply(converted(frame)), MATRIX, SIZE)
     inside = well_inside(*((160, 120) if transpose else (120, 160)))
     apart = np.abs(region[inside].astype(int) - expected[inside])

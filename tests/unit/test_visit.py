@@ -36,6 +36,7 @@ from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import Camera, VideoInfo
 from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_of_fits
+from tests import not_none
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit
 from tests.inputs import video_info
@@ -202,16 +203,10 @@ def test_the_visits_of_these_tests_have_what_is_to_come_back() -> None:
     assert any(c.curves_missing for c in cycles("curves missing"))
     assert any(c.curves for c in cycles("curves missing"))
     for name, status in {"no gait": "EMPTY", "a fit that failed": "EMPTY", "one stands": "PASS"}.items():
-        measures = visit_called(name).measures
-        assert measures is not None
-        assert measures.status == status
-    fast = visit_called("another pace").measures
-    assert fast is not None
+        assert not_none(visit_called(name).measures).status == status
+    fast = not_none(visit_called("another pace").measures)
     assert [t.pooled for t in fast.trials] == [True, False]
-    nine = visit_called("nine angles").measures
-    assert nine is not None
-    assert nine.gdi.profile is not None
-    assert nine.gdi.profile.gps is not None
+    assert not_none(not_none(visit_called("nine angles").measures).gdi.profile).gps is not None
 
 
 def test_saved_again_it_is_the_same_files(folder: Path, tmp_path: Path) -> None:
@@ -290,10 +285,9 @@ def test_an_export_of_files_has_the_methods_that_made_them(how: str, tmp_path: P
         assert wide[f"{name}_left"] == pytest.approx(content[name]["left"], abs=1e-6)
     default = gait_metrics([fit])
     stance = default.spatiotemporal["stance_percent"]
-    assert default.gdi.mean is not None
     assert stance is not None
     # The two are far enough apart for this test to see the one for the other.
-    assert abs(default.gdi.mean - content["gdi"]["mean"]) > 0.5
+    assert abs(not_none(default.gdi.mean) - content["gdi"]["mean"]) > 0.5
     assert abs(stance.mean - content["stance_percent"]["mean"]) > 0.5
     about = json.loads((out / "export.json").read_text())["trials"]["walk"]
     assert about["event_method"].startswith("zeni-2008")
@@ -353,8 +347,7 @@ def test_pbl_gait_beside_the_fits_makes_a_whole_folder(tmp_path: Path) -> None:
     assert pbl("gait", *fits, "--out", tmp_path / "metrics.json").code == 0
     found = load_visit(tmp_path)
     assert found.lacks == ()
-    assert found.measures is not None
-    assert found.measures.trials == tuple(r.measured for r in found.fitted)
+    assert not_none(found.measures).trials == tuple(r.measured for r in found.fitted)
     expected = measured(visit_of(walk("walk"), walk("back", seed=9)))
     assert_same([r.cycles for r in expected.fitted], [r.cycles for r in found.fitted])
     # Elsewhere it writes metrics.json alone.
@@ -413,10 +406,8 @@ def test_a_folder_of_an_older_version_is_read_and_says_what_it_lacks(two: Visit,
     assert_same(two.judged.spatiotemporal.measures, found.measures.spatiotemporal.measures)
     assert found.measures.gdi.mean == pytest.approx(two.judged.gdi.mean, abs=ROUNDED[Gdi])
     for recording, before in zip(found.fitted, two.fitted, strict=True):
-        assert recording.measured is not None
-        assert before.events is not None
-        events = [dataclasses.replace(e, bout=0) for e in before.events.events]
-        assert_same(tuple(events), recording.measured.events.events)
+        events = [dataclasses.replace(e, bout=0) for e in not_none(before.events).events]
+        assert_same(tuple(events), not_none(recording.measured).events.events)
         assert_same(before.fit, recording.fit)
     page = dict(leaves(page_of(found, {}, "Visit", None)))
     assert page["/measures/0/mean"] == dict(leaves(page_of(two, {}, "Visit", None)))["/measures/0/mean"]
@@ -444,8 +435,7 @@ def test_the_events_of_an_older_folder_are_enough_for_c3d(two: Visit, saved: Pat
     make_old(saved)
     out = exported(tmp_path / "out", saved / "walk.fit.npz", to="c3d")
     group = ezc3d.c3d(str(out / "walk" / "walk.c3d"))["parameters"]["EVENT"]
-    assert two.recordings[0].events is not None
-    times = [e.time_s for e in two.recordings[0].events.events]
+    times = [e.time_s for e in not_none(two.recordings[0].events).events]
     np.testing.assert_allclose(group["TIMES"]["value"][1], times, atol=1e-4)
     (saved / "walk.events.csv").unlink()
     done = pbl("export", saved / "walk.fit.npz", "--to", "c3d", "--out", tmp_path / "none")
@@ -527,8 +517,7 @@ def test_a_value_of_another_type_never_ends_without_a_code(tmp_path: Path, file:
             path.write_text(json.dumps(damaged))
             try:
                 found = load_visit(tmp_path)
-                assert found.measures is not None
-                assert found.measures.table()
+                assert not_none(found.measures).table()
                 if i == j:  # a page takes ten times as long
                     page_of(found, {}, "Visit", None)
             except PblError:
@@ -578,9 +567,7 @@ def test_measures_of_an_earlier_fit_are_refused(two: Visit, saved: Path) -> None
     assert "residual_3d_cm" in caught.value.found
     assert load_visit(saved, measures=False).fit_checks == checks
     assert pbl("gait", *sorted(saved.glob("*.fit.npz"), reverse=True), "--out", saved / "metrics.json").code == 0
-    found = load_visit(saved).measures
-    assert found is not None
-    assert set(checks) <= set(found.before)
+    assert set(checks) <= set(not_none(load_visit(saved).measures).before)
 
 
 def test_measures_of_other_recordings_do_not_make_a_visit(two: Visit) -> None:

@@ -19,6 +19,7 @@ from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.visit import load_visit, save_beside
+from tests import not_none
 from tests.exported import with_markers
 from tests.walking_fit import walking_fit
 from workers.web import Options, ResultsFolder, Where, create_app, serve
@@ -95,8 +96,7 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
     assert page.count('<svg viewBox="0 0 280 200"') == 4
     assert "138 able-bodied adults (21 to 86 years)" in page
     shown = browser.get("/visits/1.json").json()["curves"]
-    metrics = load_visit(results / "2026-01-10").measures
-    assert metrics is not None
+    metrics = not_none(load_visit(results / "2026-01-10").measures)
     for angle in shown["angles"]:
         for side, (low, high) in angle["ranges"].items():
             curves = [c.curves[angle["name"]] for c in metrics.cycles if c.used and c.side == side]
@@ -106,8 +106,7 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
     far = next(c.far_leg for c in metrics.cycles if c.used)
     assert shown["far"] == far == "right"  # walks from right to left: the camera saw the left side
     assert "The right leg was behind the left one" in page
-    row = re.search(r"Step time.*?</tr>", page)
-    assert row is not None
+    row = not_none(re.search(r"Step time.*?</tr>", page))
     assert row[0].count("*</td>") == 2  # both sides of a measure of one leg are marked
     assert "*" not in re.findall(r"Cadence.*?</tr>", page)[0]
 
@@ -228,6 +227,4 @@ def test_results_are_found_again_when_they_were_made_anew(results, tmp_path):
     body = load_body()
     walking_fit(body.joint_names, body.sha256, name="walk", n_frames=200).save(out / "walk.fit.npz")
     assert folder.state(1) != before
-    found = folder.recording(1).recording.fit
-    assert found is not None
-    assert len(found.time_s) == 200
+    assert len(not_none(folder.recording(1).recording.fit).time_s) == 200
