@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from pbl_pipeline.bench import Case, Data, case, data
 from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg, mean_over, summary
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
+from workers.cli.bench_chain import MANY, Measured, text
 
 NAMES = load_body().joint_names
 
@@ -159,3 +161,57 @@ def test_an_unknown_method_has_a_code():
     (got,) = bench.run_cases([Case("no-such", Data(n_frames=40, n_sessions=1))], 120.0)
     assert got["error"] == "SOLVER_UNKNOWN"
     assert "no-such" in got["error_text"]
+
+
+# --- `pbl bench chain`: what it makes of its figures, and the whole of it on one recording.
+
+
+FOUND = Measured(
+    videos=10,
+    video_s=8.0,
+    processes=2,
+    gpus=1,
+    seconds=36.0,
+    processor_s=72.0,
+    original_bytes=10**9,
+    result_bytes=10**8,
+    jobs_s={"Keypoints": 30.0, "Tracking": 10.0},
+)
+
+
+def costs(found: Measured, video_s: float = 8.0, machines: int = 1) -> list[list[str]]:
+    """The numbers of each line of the cost table."""
+    return [line.split() for line in text(found, 16, video_s, machines).splitlines()[-len(MANY) :]]
+
+
+def test_the_cost_of_many_follows_from_what_was_measured():
+    assert costs(FOUND)[0] == ["1,000", "1.0", "2.0", "1.0", "100", "10.0"]
+    assert costs(FOUND)[2] == ["1,000,000", "1,000", "2,000", "1,000", "100,000", "10,000"]
+
+
+def test_longer_recordings_cost_more_and_more_machines_take_less_time():
+    assert costs(FOUND, video_s=16.0)[0][1:] == ["2.0", "4.0", "2.0", "200", "20.0"]
+    assert costs(FOUND, machines=10)[0][1:] == ["0.1", "2.0", "1.0", "100", "10.0"]
+
+
+def test_the_parts_say_which_table_takes_the_time():
+    lines = text(FOUND, 16, 8.0, 1).splitlines()
+    assert [line.split() for line in lines[4:6]] == [["Keypoints", "3.000", "75.0"], ["Tracking", "1.000", "25.0"]]
+    assert "0.278 a second, 7.2 s of processor time each" in lines[0]
+
+
+def test_without_a_gpu_there_are_no_gpu_hours():
+    assert costs(dataclasses.replace(FOUND, gpus=0))[0][3] == "-"
+
+
+@pytest.mark.long
+@pytest.mark.database
+@pytest.mark.slow
+def test_a_recording_goes_through_all_tables(tmp_path: Path):
+    pbl = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
+    options = ["--videos", "1", "--processes", "1", "--json", str(tmp_path / "chain.json")]
+    subprocess.run([*pbl, "bench", "chain", *options], check=True)
+    (row,) = json.loads((tmp_path / "chain.json").read_text())["rows"]
+    assert row["jobs_s"].keys() >= {"VideoInfo", "Tracking", "Keypoints", "SessionFit", "SessionGdi", "Kinetics"}
+    assert row["seconds"] > 0
+    assert row["result_bytes"] > 0

@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from pbl_pipeline import resources
+from pbl_pipeline import assets, resources
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.limited import LimitExceeded, limited
+from pbl_pipeline.resources import return_large_blocks
 from schemas.operations.embedded import process
 from tests.command import pbl
 from tests.ended_process import Ended
@@ -147,3 +151,97 @@ def test_the_numerical_library_keeps_to_its_share():
 def test_the_database_is_sized_to_the_machine(sixteen, tmp_path: Path, monkeypatch, limit: int, expected: int):
     groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(limit)})
     assert process.buffer_pool_mb() == expected
+
+
+# --- Pictures that are let go go back to the system.
+
+
+#: After the first picture was freed: does the next one lie in the heap, where it leaves a hole?
+PROGRAM = """
+import sys
+import numpy as np
+from pbl_pipeline.resources import return_large_blocks
+
+if sys.argv[1] == "fixed":
+    assert return_large_blocks()
+first = np.ones(6_220_800, np.uint8)
+del first
+place = np.ones(6_220_800, np.uint8).ctypes.data
+heap = next(line for line in open("/proc/self/maps") if line.rstrip().endswith("[heap]")).split()[0].split("-")
+print(int(heap[0], 16) <= place < int(heap[1], 16))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the C library's limit is that of Linux")
+def test_pictures_are_kept_out_of_the_heap():
+    if not return_large_blocks():
+        pytest.skip("another C library than glibc")
+
+    def in_heap(how: str) -> str:
+        done = subprocess.run([sys.executable, "-c", PROGRAM, how], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert (in_heap("free"), in_heap("fixed")) == ("True", "False")
+
+
+# --- A function that takes too long or too much is ended; what it raises arrives.
+
+
+@pytest.mark.parametrize(
+    ("function", "argument", "said"),
+    [
+        (time.sleep, 600.0, "more than 3 s"),
+        (bytearray, 2**31, "more than 256 MiB of memory"),
+        (os._exit, 3, "ended with code 3"),
+    ],
+    ids=["time", "memory", "death"],
+)
+def test_what_takes_too_much_is_ended(function, argument, said: str):
+    begun = time.monotonic()
+    with pytest.raises(LimitExceeded, match=said):
+        limited(function, argument, seconds=3.0 if function is time.sleep else 300.0, n_bytes=2**28)
+    assert time.monotonic() - begun < 300.0
+
+
+def test_what_is_raised_there_is_raised_here():
+    with pytest.raises(ValueError, match="invalid literal"):
+        limited(int, "x", seconds=60.0, n_bytes=2**28)
+    assert limited(int, "1", seconds=60.0, n_bytes=2**28) is None
+    assert limited(int, "1", seconds=60.0, n_bytes=2**28, returns=True) == 1
+
+
+# --- Notices of compiled libraries: that line is kept off the standard error, everything else is not.
+
+
+PROBE = """
+import os
+from pbl_pipeline.models.tflite import without_notice
+try:
+    with without_notice(b"known words"):
+        os.write(2, b"INFO: known words\\nERROR: other words\\n")
+        raise RuntimeError("it failed")
+except RuntimeError as error:
+    os.write(2, f"{error}\\n".encode())
+with without_notice(b"known words"):
+    os.write(2, b"later: known words\\n")
+"""
+
+
+def said(program: str) -> str:
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300).stderr
+
+
+def test_all_else_is_written_also_where_the_block_fails():
+    assert said(PROBE) == "ERROR: other words\nit failed\nlater: known words\n"
+
+
+@pytest.mark.slow
+def test_loading_a_model_says_nothing():
+    try:
+        path = assets.fetch("blazepose_detector")
+    except PblError:
+        pytest.skip("the model is not in the cache")
+    name = "blazepose_detector"
+    program = "from pbl_pipeline import assets\nfrom pbl_pipeline.models import LiteModel\n"
+    program += f"LiteModel({str(path)!r}, assets.ASSETS[{name!r}].sha256)\n"
+    assert said(program) == ""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import random
+import shutil
 import struct
 from collections.abc import Iterator
 from fractions import Fraction
@@ -20,15 +22,21 @@ from pbl_pipeline.video import (
     Frame,
     VideoInfo,
     decode,
+    frames,
+    frames_kept,
     guess_camera,
+    kept,
     load_camera,
     packet_times,
     probe,
     read_first,
     read_frames,
+    release_frames,
     sha256_of,
 )
+from research.benchmarks.hostile import KINDS
 from tests.guard import guarded
+from tests.integration import chain
 from tests.quicktime import box
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -693,3 +701,79 @@ def test_guess_is_the_median_of_the_published_figures(shared_data):
     assert guess_camera((1280, 720)).matrix[0, 0] / 1280 == pytest.approx(np.median(ratios), abs=1e-4)
     assert min(ratios) == pytest.approx(0.6655, abs=3e-4)
     assert max(ratios) == pytest.approx(0.8452, abs=3e-4)
+
+
+# --- Pictures that are kept from `probe` for `read_frames`.
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    return write_video(tmp_path / "a.mp4", numbered_frames(8), constant_rate(8), rotation_deg=90)
+
+
+def pictures(path: Path) -> list[tuple[int, float, np.ndarray]]:
+    return [(f.index, f.time_s, f.image) for f in read_frames(path, 1, 6, 2)]
+
+
+def decodes(monkeypatch: pytest.MonkeyPatch, path: Path) -> bool:
+    opened = []
+    real = frames.Decoder
+    with monkeypatch.context() as patch:
+        patch.setattr(frames, "Decoder", lambda *a: opened.append(a) or real(*a))
+        list(read_frames(path))
+    return bool(opened)
+
+
+def test_kept_pictures_are_those_of_the_file(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+    expected = pictures(video)
+    with frames_kept():
+        probe(video)
+        found = pictures(video)
+        assert not decodes(monkeypatch, video)
+    for (i, at_s, image), (j, other_s, other) in zip(expected, found, strict=True):
+        assert (i, at_s) == (j, other_s)
+        np.testing.assert_array_equal(image, other)
+    assert decodes(monkeypatch, video)
+
+
+def test_nothing_is_kept_unless_asked_for(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+    probe(video)
+    assert decodes(monkeypatch, video)
+
+
+def test_another_file_and_a_changed_one_are_decoded(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+    other = video.with_name("b.mp4")
+    shutil.copy(video, other)
+    with frames_kept():
+        probe(video)
+        assert decodes(monkeypatch, other)
+        other.replace(video)
+        assert decodes(monkeypatch, video)
+
+
+def test_a_released_one_and_one_without_room_are_decoded(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+    with frames_kept():
+        probe(video)
+        release_frames()
+        assert decodes(monkeypatch, video)
+        monkeypatch.setattr(kept, "share_of_memory", lambda: 2e5)
+        probe(video)
+        assert decodes(monkeypatch, video)
+
+
+# --- Video files that lie about themselves: a result or a coded error, whatever their bytes say.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_give_a_result_or_a_coded_error(tmp_path: Path, kind: str):
+    good = chain.small_video(tmp_path, "good", n=40).read_bytes()
+    path, codes = tmp_path / "damaged.mp4", set()
+    for seed in range(60):
+        path.write_bytes(KINDS[kind](good, random.Random(seed)))
+        try:
+            probe(path)
+        except PblError as error:
+            codes.add(error.code)
+    assert codes
+    assert all(code.startswith("VIDEO_") for code in codes)
