@@ -7,6 +7,7 @@ and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 from __future__ import annotations
 
 import dataclasses
+import json
 import pickle
 import zlib
 from collections.abc import Callable
@@ -20,9 +21,9 @@ import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 import pbl_pipeline.pipeline  # binds the real functions now, not the stand-ins at its first import later
 import pbl_pipeline.tracking
-from pbl_pipeline.body import load_body
+from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import SessionFit
+from pbl_pipeline.fit import SessionFit, TrialFit, session_fit
 from pbl_pipeline.gait.events import phase
 from pbl_pipeline.gait.events.network import predict as network
 from pbl_pipeline.gait.events.network.predict import Grid, Phases
@@ -31,6 +32,7 @@ from pbl_pipeline.qc import Check
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import VideoInfo, check_lens, probe
+from tests.exported import with_markers
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walker import observe
 from tests.walking_fit import walking_fit
@@ -44,6 +46,14 @@ def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walke
     shift = zlib.crc32(name.encode()) % 127  # other bytes for other names
     frames = (np.roll(f, shift, axis=1) for f in numbered_frames(n, 72, 128))
     return write_video(folder / f"{name}{suffix}.mp4", frames, constant_rate(n))
+
+
+def camera_file(folder: Path, **more: float) -> Path:
+    """A calibrated lens for small videos, with these fields beside; `k1` of its distortion."""
+    content = {"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "image_size_px": [128, 72]}
+    path = folder / "camera.json"
+    path.write_text(json.dumps({**content, "distortion": [more.pop("k1", 0), 0, 0, 0, 0], **more}))
+    return path
 
 
 def track_people(video_path: Path, params: object = None, info: VideoInfo | None = None) -> Tracking:
@@ -114,6 +124,27 @@ def fit_upright(trials, names, paramset=None, camera_motion="static", height_m=N
         return dataclasses.replace(fit, orientation_source="measured: phone", qpos=qpos, qpos_sd=sd)
 
     return dataclasses.replace(session, trials=tuple(map(upright, session.trials)))
+
+
+def with_all_markers(session: SessionFit) -> SessionFit:
+    """The fit with the markers of its set, which exports need, and the parameters it was given."""
+    points, seen = marker_set("blazepose_33"), {"residual_2d_px": 4.0, "residual_3d_m": 0.03}
+    offset = np.zeros((len(points), 3))
+    places = {"marker_set": points.name, "marker_names": points.names, "site_offset_m": offset}
+    places |= {"params_hash": session.params_hash, "solver": session.solver}
+
+    def marked(fit: TrialFit) -> TrialFit:
+        residuals = {k: np.full((len(fit.time_s), len(points)), v) for k, v in seen.items()}
+        return with_markers(dataclasses.replace(fit, **places, **residuals))
+
+    return dataclasses.replace(session, trials=tuple(map(marked, session.trials)), site_offset_m=offset)
+
+
+def fit_either(trials, names, paramset=None, camera_motion="static", markers=None) -> SessionFit:
+    """Markers and trials of several cameras are fitted by the library, videos of one by the stand-in."""
+    if isinstance(trials[0], Keypoints):
+        return fit_session(trials, names, paramset, camera_motion)
+    return session_fit.fit_session(trials, names, paramset, camera_motion, markers)
 
 
 #: The phases that the event network gave, by its arguments.

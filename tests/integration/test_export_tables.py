@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 
 import pbl_pipeline.fit
 import pbl_pipeline.gait
-from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit
 from schemas import fit, gait, gdi, session
@@ -20,7 +18,6 @@ from schemas.intake import Methods, Sensors, VisitRecord, ingest
 from schemas.reading import fitted_visit, list_fitted, load_visits
 from schemas.reading import visits as reading_visits
 from tests.command import pbl
-from tests.exported import with_markers
 from tests.rows import register
 from workers.populate import populate
 
@@ -29,11 +26,7 @@ from . import chain
 
 def fit_with_markers(trials, names, paramset=None, camera_motion="static") -> SessionFit:
     """The stand-in's fit with the markers of its set."""
-    made, points = chain.fit_session(trials, names, paramset, camera_motion), marker_set("blazepose_33")
-    more = {"marker_set": points.name, "marker_names": points.names, "site_offset_m": np.zeros((33, 3))}
-    seen = {k: np.full((chain.N_FRAMES, 33), v) for k, v in (("residual_2d_px", 4.0), ("residual_3d_m", 0.03))}
-    fits = tuple(with_markers(dataclasses.replace(t, **more, **seen)) for t in made.trials)
-    return dataclasses.replace(made, trials=fits, site_offset_m=np.zeros((33, 3)))
+    return chain.with_all_markers(chain.fit_session(trials, names, paramset, camera_motion))
 
 
 def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

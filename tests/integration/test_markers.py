@@ -11,7 +11,7 @@ import pbl_pipeline.body
 import pbl_pipeline.fit
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import METHODS, fit_session
+from pbl_pipeline.fit import METHODS
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from research.walker.views import observe_markers
@@ -50,16 +50,9 @@ def ingest_markers(path: Path, visit: VisitRecord, table: Path | None = None) ->
     return result
 
 
-def fit_either(trials, names, paramset=None, camera_motion="static", markers=None):
-    """Markers are fitted by the library, videos by the stand-in."""
-    if isinstance(trials[0], WorldMarkers):
-        return fit_session(trials, names, paramset, camera_motion, markers)
-    return chain.fit_session(trials, names, paramset, camera_motion)
-
-
 @pytest.fixture
 def fitted(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_either)
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", chain.fit_either)
 
 
 @pytest.mark.long

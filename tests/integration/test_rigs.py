@@ -14,7 +14,6 @@ import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import fit_session
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
 from research.walker.views import observe_views
@@ -84,13 +83,6 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     return dataclasses.replace(seen, time_s=tracking.time_s)
 
 
-def fit_either(trials, names, paramset=None, camera_motion="static"):
-    """Trials of several cameras are fitted by the library, videos of one by the stand-in."""
-    if isinstance(trials[0], MultiView):
-        return fit_session(trials, names, paramset, camera_motion)
-    return chain.fit_session(trials, names, paramset, camera_motion)
-
-
 def fit_none(trials, names, paramset=None, camera_motion="static"):
     """The movement that was put in, whatever the cameras saw; all of one session are of one kind."""
     assert len({type(t) for t in trials}) == 1
@@ -111,7 +103,7 @@ def errors_of(table) -> list[tuple[int, str]]:
 
 @pytest.mark.long
 def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch, tmp_path: Path):
-    rig.setattr(pbl_pipeline.fit, "fit_session", fit_either)
+    rig.setattr(pbl_pipeline.fit, "fit_session", chain.fit_either)
     visit = ("--subject", "P001", "--session", "2026-03-01")
     assert pbl("ingest", chain.small_video(tmp_path, "walk"), *visit).code == 0
     toml = calibration(tmp_path / "Calib.toml")

@@ -169,11 +169,7 @@ def test_the_lens_of_the_file_and_slow_motion(tmp_path: Path):
 
 def test_the_uncertainty_of_a_calibration_is_stored(tmp_path: Path):
     path = chain.small_video(tmp_path, "walk")
-    camera = tmp_path / "camera.json"
-    camera.write_text(
-        '{"camera_matrix": [[900, 0, 64], [0, 900, 36], [0, 0, 1]], "distortion": [0, 0, 0, 0, 0],'
-        ' "image_size_px": [128, 72], "focal_sd_px": 4.5}'
-    )
+    camera = chain.camera_file(tmp_path, focal_sd_px=4.5)
     ingest([path], VisitRecord("P001", camera_file=camera))
     assert lab.CameraCalibration.fetch1("camera_focal_sd") == pytest.approx(4.5)
     populate(SEEN)

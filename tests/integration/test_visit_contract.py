@@ -25,7 +25,6 @@ import pbl_pipeline.gait.metrics as metrics
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 from pbl_pipeline import pipeline
-from pbl_pipeline.body import marker_set
 from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import METHODS, SessionFit, default_fit, points_of
 from pbl_pipeline.gait import Condition, GaitEvent, Gdi, apply_correction
@@ -40,7 +39,6 @@ from schemas.intake import Methods, ingest
 from schemas.intake import VisitRecord as Whose
 from tests import not_none
 from tests.command import pbl
-from tests.exported import with_markers
 from tests.integration import chain, test_markers, test_rigs, web
 from tests.rows import register, remove_all
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, leaves
@@ -77,19 +75,7 @@ def fit_session(
     markers: Any = None,
 ) -> SessionFit:
     """The stand-in of the chain with the markers of the body, which exports need, and the parameters it was given."""
-    session = chain.fit_upright(trials, names, paramset, camera_motion, height_m)
-    points = marker_set("blazepose_33")
-    seen = {"residual_2d_px": 4.0, "residual_3d_m": 0.03}
-
-    def marked(fit: Any) -> Any:
-        n = len(fit.time_s)
-        more = {k: np.full((n, len(points)), v) for k, v in seen.items()}
-        places = {"marker_names": points.names, "site_offset_m": np.zeros((len(points), 3))}
-        made = {"params_hash": session.params_hash, "solver": session.solver}
-        return with_markers(dataclasses.replace(fit, **places, **made, **more))
-
-    offset = np.zeros((len(points), 3))
-    return dataclasses.replace(session, trials=tuple(map(marked, session.trials)), site_offset_m=offset)
+    return chain.with_all_markers(chain.fit_upright(trials, names, paramset, camera_motion, height_m))
 
 
 def track_people(video_path: Any, params: object = None, info: VideoInfo | None = None) -> Tracking:
