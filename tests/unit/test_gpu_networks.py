@@ -43,6 +43,7 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
     return [np.ascontiguousarray(cv2.resize(s, (size, size))[:, :, ::-1]) for s in squares]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -104,6 +104,7 @@ def test_files_of_an_installation_that_make_no_sense(tmp_path: Path, kind: str, 
         KINDS[kind].use(tmp_path / kind)
 
 
+@pytest.mark.slow
 def test_of_an_hour_the_legs_on_an_even_grid_stay_small(tmp_path: Path):
     files.fit(tmp_path / "a.fit.npz")
     path = changed(tmp_path / "a.fit.npz", last_stamp(3590.0))

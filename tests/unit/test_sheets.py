@@ -113,6 +113,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", HOSTILE)
 def test_hostile_workbooks(tmp_path: Path, what: str):
     part, change, words = HOSTILE[what]

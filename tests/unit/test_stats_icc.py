@@ -110,6 +110,7 @@ def test_perfect_agreement_and_none():
     assert icc(opposite, "1,1").value == pytest.approx(-1)
 
 
+@pytest.mark.slow
 def test_limits_enclose_the_value_of_any_table():
     """Unreliable, small and tied tables: low <= value <= high <= 1 of every kind, or the coded error."""
     g = np.random.default_rng(3)

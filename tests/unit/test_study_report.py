@@ -35,6 +35,8 @@ from pbl_pipeline.study_report import (
 from pbl_pipeline.study_report.statement import statement
 from research import cohort as made
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def study() -> StudyData:

@@ -498,6 +498,7 @@ def test_a_folder_without_a_visit_is_a_coded_error(tmp_path: Path) -> None:
     assert caught.value.key == str(tmp_path / "session.json")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["session.json", "metrics.json"])
 def test_a_value_of_another_type_never_ends_without_a_code(tmp_path: Path, file: str) -> None:
     """Each place of the file with three of these values: what is read is shown, or the error is coded."""
