@@ -16,7 +16,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +29,7 @@ from schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import without_posix
 from tests.database import new_home, remove_home
 from tests.german import REPORT_NAMES, english_of, english_words
+from tests.html_page import Page
 
 pytestmark = pytest.mark.slow
 
@@ -157,25 +157,15 @@ def test_angles_and_video_cover_the_recording(out, demo_files):
     assert float(rows[middle][header.index("hip_flexion_l")]) == pytest.approx(np.degrees(angle), abs=0.01)
 
 
-class _Page(HTMLParser):
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.links: list[str] = []
-
-    def handle_starttag(self, tag, attrs) -> None:
-        self.tags.append(tag)
-        self.links += [v for k, v in attrs if k in ("src", "href") and v is not None]
-
-
 def test_the_report_is_one_file_with_curves_and_pictures(out):
     text = (out / "report.html").read_text()
-    page = _Page()
-    page.feed(text)
+    page = Page(text)
+    assert page.problems == []
     # Pictures are inside, anchors lead within the page: nothing is loaded from elsewhere.
-    assert [link[:40] for link in page.links if not link.startswith(("data:", "#"))] == []
-    assert page.tags.count("img") >= 3
-    assert "svg" in page.tags
+    links = [v or "" for _, a in page.tags for k, v in a.items() if k in ("src", "href")]
+    assert [link[:40] for link in links if not link.startswith(("data:", "#"))] == []
+    assert len(page.all("img")) >= 3
+    assert page.all("svg")
     cadence = json.loads((out / "metrics.json").read_text())["session"]["cadence_steps_per_min"]["mean"]
     assert re.search(rf"\b{cadence:.0f}(\.\d)?\b", text)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from pbl_pipeline.validation import (
     INDEX_COLUMNS,
     JointError,
     KinematicErrors,
-    Table,
     TrialErrors,
     cycle_curves,
     error_frame,
@@ -40,6 +38,7 @@ from pbl_pipeline.validation import (
     write_tables,
 )
 from tests import SHARED
+from tests.html_page import Page
 from tests.walking_fit import foot_events, walking_fit
 
 PAPER = SHARED.parent / "paper" / "pbl_paper.tex.txt"
@@ -131,6 +130,7 @@ def test_a_frame_with_one_row():
     assert tables["joints_by_dataset"].ours("Knee Flexion", "lab handheld") == "2.00"
     assert tables["joints_by_dataset"].cell("Hip Flexion", "lab handheld").n == 0
     assert tables["residuals"].cell("2D residual (px)", "Pearson r").n == 0
+    assert tables["summary"].ours("Joints compared", "lab handheld") == "1"  # a table keeps its decimals
 
 
 def test_the_summary_by_hand():
@@ -325,33 +325,14 @@ def test_the_papers_figures_are_the_papers():
 # --- files
 
 
-class _Page(HTMLParser):
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.asks: list[str] = []
-        self.scripts = 0
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.scripts += tag == "script"
-        self.asks += [v or "" for k, v in attrs if k in ("src", "href") and not (v or "").startswith("#")]
-        if tag != "meta":
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
 EVIL = "<script>alert(1)</script> & 50 % {_}"
 
 
 def test_the_page_is_whole_escaped_and_asks_for_nothing():
     tables = paper_tables(error_frame([_trial("a", {"knee_flexion_r": 2.0}, dataset=EVIL, population=EVIL)]))
-    page = _Page(html(tables))
-    assert page.open == []
-    assert page.asks == []
-    assert page.scripts == 0
+    page = Page(html(tables))
+    assert page.problems == page.all("script") == []
+    assert [v for _, a in page.tags for k, v in a.items() if k in ("src", "href") and not str(v).startswith("#")] == []
     assert "2.79 (0.86)" in html(tables)
     assert "No trial of ours has a value" in html(paper_tables(error_frame([])))
 
@@ -392,12 +373,6 @@ def test_what_is_printed(capsys: pytest.CaptureFixture[str]):
     assert "2.00 [1]" in text
     assert "2.79 (0.86)" in text
     assert re.search(r"without a value of ours: .*view_tests", text)
-
-
-def test_a_table_keeps_its_decimals():
-    tables = paper_tables(error_frame([_trial("a", {"knee_flexion_r": 2.0})]))
-    assert isinstance(tables["summary"], Table)
-    assert tables["summary"].ours("Joints compared", "lab handheld") == "1"
 
 
 # --- curves
