@@ -1,7 +1,5 @@
 """Films a flat board with a known lens: every pixel's ray is met with the board's plane, four rays a pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

@@ -1,7 +1,5 @@
 """Calling `pbl` as its script does, but in this process: exit code and what was printed; programs of a test's own."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Private database servers for tests and benchmarks, each in a home of its own."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -6,8 +6,6 @@ person faces the camera. The distances of the points from the camera and one ang
 the graph, as weights are: both stay what they are in every crop, whatever it is turned, scaled or mirrored.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """A stand-in for a process of `multiprocessing` that has ended as soon as it was started."""
 
-from __future__ import annotations
-
 from multiprocessing import Pipe
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A fit with markers, as exports want it: a walk of a body with scales and marker offsets of its own."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The English that is left on a German page."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -1,7 +1,5 @@
 """How much memory a call takes at most, and a limit that ends one which takes far more."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import resource

@@ -6,8 +6,6 @@ user, environment, volumes, secrets and tmpfs, no capabilities and no new privil
 The base image is Debian with its own Python of the same minor version, in the place of python:3.11-slim-bookworm.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import fnmatch
 import os

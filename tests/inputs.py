@@ -1,7 +1,5 @@
 """Inputs of the fit for tests: small trials, a TRC file, a calibration, an orientation log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

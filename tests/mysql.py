@@ -7,8 +7,6 @@ is that of Debian unstable (no other release of Debian has MySQL), so it needs t
     PBL_TEST_MYSQL_ROOT=/opt/mysql                                     # an unpacked server that is there already
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import fcntl

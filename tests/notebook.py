@@ -3,8 +3,6 @@
 python -m tests.notebook docs/notebooks/*.ipynb
 """
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import io

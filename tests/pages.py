@@ -1,7 +1,5 @@
 """The pages of the documentation as tests read them: their text, links, code blocks and commands."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Films a far scene with a phone that is held by hand, and writes what apps log meanwhile."""
 
-from __future__ import annotations
-
 import csv
 import json
 import zipfile

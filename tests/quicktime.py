@@ -1,7 +1,5 @@
 """Write into a finished MOV or MP4 what phones put there and PyAV cannot: metadata of a track, an edit list."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from pathlib import Path

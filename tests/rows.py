@@ -1,7 +1,5 @@
 """The rows of a test's database: register videos, see every row, remove all that a test can have added."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from contextlib import closing

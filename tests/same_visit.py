@@ -1,7 +1,5 @@
 """Comparing two visits: their fields, texts and exports, with the rounding that files and tables have."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping

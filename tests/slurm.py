@@ -3,8 +3,6 @@
 Debian's packages: `apt-get install slurm-wlm munge`. No service of the machine and no file of /etc is touched.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

@@ -1,7 +1,5 @@
 """Small test videos made with PyAV: exact time stamps, a rotation flag, and any content."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from pathlib import Path

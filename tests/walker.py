@@ -1,7 +1,5 @@
 """The package's walker seen by a level camera that stands still and films in landscape: keypoints, white noise."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A walking body with known joint angles, in the form of a fit: for drawing, export and report."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

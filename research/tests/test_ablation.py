@@ -1,7 +1,5 @@
 """The arithmetic of the ablation (`research/benchmarks/ablation.py`): errors, their parts, and what a row changes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ranges of adults that ship are what the command builds."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The benchmark that compares solvers of the fit."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

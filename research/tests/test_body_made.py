@@ -1,7 +1,5 @@
 """The body and its markers that ship are what `python -m research.body` writes."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

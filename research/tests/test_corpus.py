@@ -1,7 +1,5 @@
 """A corpus of known walks: what a phone sees of them, how detectors err, and whether the tables find known errors."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Parts of errors, angles and pairs of visits, from which the measurement model is estimated, of made passes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Training data of the event model and the calibration of its confidence."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

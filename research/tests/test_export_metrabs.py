@@ -4,8 +4,6 @@ torch is no dependency of the project: without it these tests skip. To run them,
 beside the project and `pytest -m needs_extra research/tests/test_export_metrabs.py`.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Events of 11 laboratory walks against the labels of the laboratory (markers and force plates), of each method."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

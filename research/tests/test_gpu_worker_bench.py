@@ -1,7 +1,5 @@
 """The arithmetic of `research/benchmarks/gpu_worker.py` on spans made by hand."""
 
-from __future__ import annotations
-
 import pytest
 
 from research.benchmarks.gpu_worker import figures

@@ -1,7 +1,5 @@
 """How many heads of recordings are covered."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

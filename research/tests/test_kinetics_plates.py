@@ -1,7 +1,5 @@
 """Forces from markers against force plates (docs/kinetics.md): three walks of children outside the tuning set."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded motions of other laboratories on our body: conventions, units and signs, and the refusal of wrong ones."""
 
-from __future__ import annotations
-
 import csv
 import gzip
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The normative sets that ship are what the commands of `research.norms` build."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The shipped pose prior is what `research.poses` makes of the recordings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Curves of confidence, the truth that they are fitted to, the table and the page of reliability."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Variants of a recording that mean nothing: what they do to the picture."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Intervals hold the truth of simulated cohorts: few studies here, 400 by `research.benchmarks.study_intervals`."""
 
-from __future__ import annotations
-
 import pytest
 
 from research.benchmarks.study_intervals import cases, held

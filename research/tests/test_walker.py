@@ -1,7 +1,5 @@
 """The synthetic walker: is it a normal walk, and is what is said of its noise, camera and clock true?"""
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

@@ -1,7 +1,5 @@
 """Short videos cut from the demo recording: one good, the others what a lab's folder holds besides."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

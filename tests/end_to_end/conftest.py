@@ -1,7 +1,5 @@
 """What the end-to-end tests share: the demo recording and short clips of it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -3,8 +3,6 @@
 One populate for all of them.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

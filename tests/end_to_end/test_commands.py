@@ -2,8 +2,6 @@
 
 In processes that find nothing of POSIX (tests/without_posix.py): what they write is what other systems would get."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -7,8 +7,6 @@ the toes sink. Read so, a contact is right to about one frame. Her near arm is t
 which tells the sides.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import os

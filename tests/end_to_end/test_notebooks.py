@@ -1,7 +1,5 @@
 """The notebooks of the docs run in their order, on one database, and show what they have stored."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

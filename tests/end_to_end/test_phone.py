@@ -1,8 +1,6 @@
 """From the link of a visit to its index: a Chromium films the demo recording, with orientations as sensors. Minutes,
 and two idle cores: a loaded machine loses frames. `pytest -m machine tests/end_to_end/test_phone.py`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path

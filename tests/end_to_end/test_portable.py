@@ -1,7 +1,5 @@
 """Commands where no module and no name of POSIX is to be had; the chain on files so is in test_commands.py."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@
 `pytest -m machine tests/end_to_end/test_wheel.py`.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -4,8 +4,6 @@ The probe, the choice of the subject, events, cycles, measures and index are the
 and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import pickle

@@ -1,7 +1,5 @@
 """What the process that computes a visit for the page runs in tests: the real one, behind stand-ins."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """The tables as most tests of this folder want them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path

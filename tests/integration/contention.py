@@ -1,7 +1,5 @@
 """A process that takes jobs from the same queue as others at the same time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """A decision in a process of its own, begun at the same moment as another one."""
 
-from __future__ import annotations
-
 from multiprocessing.synchronize import Barrier
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Uploads for tests of the drop folder."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tables as older releases had them: each function takes one migration back, with rows as that release wrote them."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The real assets from the package registries this machine uses (137 MB): the pins hold and the files are usable."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

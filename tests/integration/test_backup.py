@@ -1,7 +1,5 @@
 """Backups: what comes back is what was there, and nothing is ever written over."""
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import json

@@ -1,7 +1,5 @@
 """The bridge over the tables: visits by two methods, what compares across the change, and what an upgrade says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

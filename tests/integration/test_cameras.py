@@ -1,7 +1,5 @@
 """A calibration registered once for a phone's lens serves its videos, and a change makes exactly those pending."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

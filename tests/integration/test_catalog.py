@@ -1,7 +1,5 @@
 """What the server has under the prefix of an installation, and nothing of another one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

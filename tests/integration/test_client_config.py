@@ -1,7 +1,5 @@
 """`pbl db config`: DataJoint alone, in the folder of the files, reaches the same database and the same store."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -6,8 +6,6 @@ volumes, secrets, environment.
 The database is MariaDB with TLS, the store moto's S3 server: MySQL 8.4, MinIO and Docker itself are not tested.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

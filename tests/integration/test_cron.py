@@ -1,7 +1,5 @@
 """Regular jobs: uploads that are taken over whole or not at all, the summary, the report of disk and store."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,7 +1,5 @@
 """`pbl detect` on the demo recording and on bad input. Needs the assets; skips where they cannot be had."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 All four: `python -m research.benchmarks.detection`.
 """
 
-from __future__ import annotations
-
 import pytest
 
 from pbl_pipeline.keypoints import METHODS

@@ -3,8 +3,6 @@
 Those of docs/extending.md run in tests/unit/test_extending.py, the notebooks in tests/end_to_end/test_notebooks.py.
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 from collections.abc import Iterator

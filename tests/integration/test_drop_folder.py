@@ -1,7 +1,5 @@
 """A drop folder into which anybody puts anything: the good is taken, the rest is named, and nothing is followed."""
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

@@ -1,7 +1,5 @@
 """The embedded server and the connection to it, on servers of their own."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """`pbl export --subject`: a visit of the tables, with what is stored and nothing computed anew."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

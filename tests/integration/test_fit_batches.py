@@ -1,7 +1,5 @@
 """Batches of fits on two threads: each session once, two batches at a time, and what becomes of them at the end."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A person who is forgotten leaves no row, no job and no file; everybody else stays."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Names and files from outside are data: they reach rows, pages and terminals as text and nothing else."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

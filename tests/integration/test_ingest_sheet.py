@@ -1,7 +1,5 @@
 """`pbl ingest --sheet`: every row or none, and what is refused."""
 
-from __future__ import annotations
-
 import datetime
 import re
 from pathlib import Path

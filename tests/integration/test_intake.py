@@ -1,7 +1,5 @@
 """The contract of registration: whatever names a recording, it is registered once, for one person, with its plans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Natural joins with the visit, as an analyst writes them: a row for each that there is, never every pair."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from pathlib import Path

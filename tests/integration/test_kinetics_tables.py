@@ -1,7 +1,5 @@
 """Forces and joint moments in the tables: what they are computed from, and what makes them pending again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Laboratory recordings (C3D) through cycles, measures and the original index."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`pbl list`, `pbl move` and `pbl method add`, and short names of methods, on a chain of stand-ins."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

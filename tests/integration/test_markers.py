@@ -1,7 +1,5 @@
 """Laboratory markers as recordings of a visit: beside the phone's video, never pooled with it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -3,8 +3,6 @@
 Beside the package's own migrations the tests write some into a folder that the runner reads as well.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A registered keypoint model through the tables: its method row, its keypoints, and what happens when it changes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

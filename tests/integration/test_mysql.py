@@ -5,8 +5,6 @@
 Most of it is the tests of the embedded database again, each file in a process of its own with the other server.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Normative sets built from the tables: a new version each time, nothing registered ever changes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

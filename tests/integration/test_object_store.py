@@ -1,7 +1,5 @@
 """Arrays in an object store: the whole way of `<npy@>` and `<object@>` columns, against a server that speaks S3."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Calls of `pbl` that cannot work: each ends with a code on stderr and exit code 1 (2: wrong usage), no traceback."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """A full database, a full store, a clock that goes back, workers that die: nothing is lost, nothing is left behind."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import errno

@@ -1,8 +1,6 @@
 """Activity and pace of a video decide which measures it is pooled in, and a person's height how long strides are; a
 change computes anew what depends on it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

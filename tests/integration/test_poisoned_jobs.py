@@ -1,7 +1,5 @@
 """A job that cannot succeed ends: deleted where nobody asks for it, else an error row with a code, after 3 attempts."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """De-identified copies of registered videos: made where the setting asks for it, shown where it says so, and removed
 with their person."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

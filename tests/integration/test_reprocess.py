@@ -1,7 +1,5 @@
 """What is deleted takes along all that was computed from it, and comes back by the queue."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

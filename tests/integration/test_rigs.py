@@ -1,7 +1,5 @@
 """Trials that several calibrated cameras film: one fit of all views, beside the phone's and never pooled with it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path

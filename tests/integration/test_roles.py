@@ -1,7 +1,5 @@
 """Accounts of the roles: each can do its work and nothing more."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable, Iterator

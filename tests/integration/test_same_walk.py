@@ -1,8 +1,6 @@
 """One walk, changed in nothing that matters, is no change: the demo recording through the whole chain, each variant a
 visit of its own, and every pair of them compared as the page compares visits."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Passwords from files, and nowhere else to be read; connections that are encrypted when they must be."""
 
-from __future__ import annotations
-
 import datetime
 import os
 import subprocess

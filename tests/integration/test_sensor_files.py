@@ -1,7 +1,5 @@
 """Files that come with a video, in the tables: the phone's log reaches keypoints and fit, the others are kept."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

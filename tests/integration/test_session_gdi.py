@@ -1,8 +1,6 @@
 """The measures of a visit are those of the cycles it stands beneath: the rows of its trials, each once and never older
 ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Slices: frozen visits as frames, whether they are the same again, and the frames of the views."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ where jobs are cancelled.
     apt-get install slurm-wlm munge && pytest -m machine -s tests/integration/test_slurm.py
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Sheets of a study: what is imported, what is refused, and that a second import changes nothing."""
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Iterator
 from pathlib import Path

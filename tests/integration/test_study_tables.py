@@ -1,7 +1,5 @@
 """Visits, scores, cohorts and slices as a DataJoint user meets them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tables, from a file to a visit's measures, on the embedded database."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

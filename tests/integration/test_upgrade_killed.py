@@ -3,8 +3,6 @@
 pytest -m long tests/integration/test_upgrade_killed.py -s         # minutes; prints the statements it was killed at
 """
 
-from __future__ import annotations
-
 import random
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """References and errors in the tables, from `pbl validate add` to the printed tables."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path

@@ -7,8 +7,6 @@ The tolerances are stated once, in `tests.same_visit`: `ROUNDED`, the rounding o
 which the tables store movements. What only the tables know is left out in `of_both`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import importlib.util

@@ -1,7 +1,5 @@
 """The review page over tables: finding visits, and what must not work."""
 
-from __future__ import annotations
-
 import html
 import io
 import re

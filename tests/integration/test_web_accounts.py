@@ -1,7 +1,5 @@
 """Accounts of the review page: passwords, sessions, who guesses, addresses that other machines reach, slow clients."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import signal

@@ -1,7 +1,5 @@
 """Attacks on every address of the review page, by its own list of routes: what is added later is attacked as well."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import socket

@@ -1,7 +1,5 @@
 """The review page in a Chromium of the machine: what only a browser can show. Skips where there is none."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

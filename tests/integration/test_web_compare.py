@@ -1,7 +1,5 @@
 """Comparing in the review page: curves, measures, changes; what is no comparison; videos in step in a browser."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Computing a visit from its page: what is pending, the process, what it shows, and whom it leaves alone."""
 
-from __future__ import annotations
-
 import time
 import types
 from collections.abc import Callable, Iterator

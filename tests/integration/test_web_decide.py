@@ -1,7 +1,5 @@
 """Deciding in the review page: who is measured, a warning accepted; rows, conflicts and rights."""
 
-from __future__ import annotations
-
 import getpass
 import json
 import re

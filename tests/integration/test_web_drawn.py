@@ -1,7 +1,5 @@
 """Overlay and report in the review page: made beside it, served when they are whole, never with a face to be hidden."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

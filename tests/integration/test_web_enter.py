@@ -1,7 +1,5 @@
 """Entering in the review page: the role of a visit and clinical scores, from the click to the row."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Events that a person corrects: the rows, what follows from them, conflicts, and dragging in a browser."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

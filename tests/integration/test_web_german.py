@@ -1,7 +1,5 @@
 """German pages are German to the end: no English word is on one but names."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import itertools

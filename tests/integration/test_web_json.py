@@ -1,7 +1,5 @@
 """The pages of the tables as JSON: who gets them, what is in them and what is not."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

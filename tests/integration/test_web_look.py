@@ -1,7 +1,5 @@
 """A recording in the review page: its video by ranges, the body and the curves as numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

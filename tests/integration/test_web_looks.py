@@ -1,7 +1,5 @@
 """A row for each look at a recording, where that is asked for."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """From an empty database to two visits compared, in a Chromium, with nothing typed into a terminal. The stages that
 need a model's weights are stand-ins; with `-m long` all stages run, on the demo recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

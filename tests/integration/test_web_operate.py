@@ -1,7 +1,5 @@
 """Operating in the review page: queues, errors and another try; who may see what."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """The review page for everybody: axe finds nothing serious on any page, and nothing sticks out, is cut or covered."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Choosing the person to be measured in the video itself, in a Chromium of the machine."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

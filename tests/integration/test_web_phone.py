@@ -1,7 +1,5 @@
 """Filming with a phone: its link, the upload in parts, and what it may not do. Without a browser."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The phone's page in a Chromium that takes a film of numbered frames as its camera. Skips where there is none."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Registering in the browser: a visit, its recordings and what is stated of them, from the form to the row."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 from concurrent.futures import ThreadPoolExecutor

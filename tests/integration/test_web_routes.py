@@ -1,7 +1,5 @@
 """Right and look of every address, in each spelling that the page may take for it: by the page's own list of routes."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Iterator

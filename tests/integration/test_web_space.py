@@ -1,7 +1,5 @@
 """The 3D view of a recording of 30 s in a Chromium of the machine, and what its page weighs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

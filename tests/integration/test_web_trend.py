@@ -1,7 +1,5 @@
 """All visits of a person in time, and the letter of a visit, in the review page."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recordings that are marked as not usable: what is computed without them, what stays, and taking it back."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What `pbl status` asks the server: names and plans of its queries. What it counts is tested where rows are made."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Workers: the queue, what happens when a process, the database or the store goes away, and doing things again."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import datetime

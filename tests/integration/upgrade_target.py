@@ -4,8 +4,6 @@ With a statement's number N the process kills itself so many seconds after it ha
 migrations: before the server has it, while it works, or when it is done.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

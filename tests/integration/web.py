@@ -1,7 +1,5 @@
 """The review page as tests use it: signed in, over the tables of the test."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import socket

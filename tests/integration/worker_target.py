@@ -4,8 +4,6 @@ A recording's name says what it does to the process that probes it: `kills` ends
 `slow` takes seconds. Tracking of an `hour` ends when there is a file of its name and `.go`.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """People who cross, hide and come back, as a detector would report them: for tests of identity."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A walker made of formulas: feet with known event times, anywhere in the world, at any time stamps."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`<name>.angles.csv`, read back as a stranger would."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Assets without network: pip and npm are replaced by copies of small packages made here, pinned like real ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import io

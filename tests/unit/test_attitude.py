@@ -1,7 +1,5 @@
 """The phone's orientation: in the keypoints, and as the log of `--attitude`, against cases worked by hand."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The pelvis of a person who sits or squats, as the marker augmenter has it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import jax.numpy as jnp

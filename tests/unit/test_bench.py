@@ -1,7 +1,5 @@
 """The benchmarks of the fit: their cases, their measures against hand-worked numbers, one real case, one that fails."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """`pbl bench detect`: its clips, its memory figure, and the command on a short video."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -3,8 +3,6 @@
 The tests with models need the assets and skip where those are absent and cannot be fetched.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from pathlib import Path

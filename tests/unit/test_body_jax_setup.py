@@ -1,7 +1,5 @@
 """Compiled programs are kept, other people's settings are honoured, and importing prints nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import copy
 
 import jax

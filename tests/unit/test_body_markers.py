@@ -1,7 +1,5 @@
 """Marker sets: names, places, mirror symmetry, a lab's own table, and what is refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model against the published figures and against how a body moves."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

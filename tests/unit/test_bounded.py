@@ -1,7 +1,5 @@
 """Small files that ask for much: refused with a code, within the memory that is stated."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

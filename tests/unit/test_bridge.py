@@ -1,7 +1,5 @@
 """The bridge between versions: shifts with their intervals, and the comparisons that a change touches."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`pbl calibrate` against a lens that is known: films of a board rendered ray by ray."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Whose intrinsics a video gets, and what its file says of lens and time; on files made with known content."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,7 +1,5 @@
 """The order of the tables, read from their definitions."""
 
-from __future__ import annotations
-
 from schemas import chain
 from workers.registry import STAGES
 

@@ -1,7 +1,5 @@
 """The version that rows and files carry names the commit."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import tomllib

@@ -1,7 +1,5 @@
 """What a confidence is worth: curves, the truth that they are fitted to, the table and the page."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

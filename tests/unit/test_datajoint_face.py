@@ -1,7 +1,5 @@
 """What `schemas` and `workers` take from DataJoint beyond its public face, and that the installed version has it."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import types

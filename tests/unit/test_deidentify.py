@@ -1,7 +1,5 @@
 """Heads covered in pictures and in files: geometry by hand, what a file still says, what is refused, real people."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

@@ -1,7 +1,5 @@
 """One direction of dependency: pbl_pipeline <- schemas <- workers; nothing in the wheel imports research or tests."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import subprocess

@@ -1,7 +1,5 @@
 """The files that bring workers onto machines: valid, without passwords, and calling commands that exist."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess

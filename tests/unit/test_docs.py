@@ -1,7 +1,5 @@
 """The documentation names every code, variable and command there is, and none that is not."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -1,7 +1,5 @@
 """The built site: whole, linked, and complete without a network. One build for all tests, some ten seconds."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 from pathlib import Path

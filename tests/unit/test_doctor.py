@@ -1,7 +1,5 @@
 """`pbl doctor` on made-up machines: what it finds, what it advises, how it ends."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

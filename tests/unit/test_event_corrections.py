@@ -1,7 +1,5 @@
 """Events that a person set: what is refused, and what they become."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

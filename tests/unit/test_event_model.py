@@ -1,7 +1,5 @@
 """The event model on synthetic people it was not trained on, and on what is no walk."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

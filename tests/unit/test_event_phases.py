@@ -1,7 +1,5 @@
 """Parts of the event model: features, grid, filter, walking, training data, calibration."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

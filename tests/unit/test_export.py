@@ -1,7 +1,5 @@
 """Exports read back by other readers, and against truths that no exporter knows."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Motion-BIDS: what the files hold, and what the official validator says of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Forces for OpenSim: the file by hand, and OpenSim's own inverse dynamics on what is exported."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """docs/extending.md does what it says: its code, in a copy of the package, is one file and one line for each method."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

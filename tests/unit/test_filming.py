@@ -1,7 +1,5 @@
 """Whether two visits were filmed alike, and a change of the index between them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

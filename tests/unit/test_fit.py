@@ -1,7 +1,5 @@
 """The fit against the synthetic walker, whose angles are known; the cost terms against hand-worked numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

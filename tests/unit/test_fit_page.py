@@ -1,7 +1,5 @@
 """docs/fit.md states the cost that is minimised: its table has the terms of the list, their parameters and unknowns."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

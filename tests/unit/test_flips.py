@@ -1,7 +1,5 @@
 """Exchanged sides are put back, and legs that cross are left alone: synthetic people seen with a detector's noise."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """Cycles and spatiotemporal measures of a list of events worked by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The coordinate-based events against a walker of known events, and everything that is not walking."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Feet, pelvis angles, curves and metrics of a body that is moved by formulas."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """GDI of three angles against numpy worked another way, and the normative set that ships."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

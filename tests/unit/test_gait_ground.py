@@ -1,7 +1,5 @@
 """Stride length, step length and step width of feet whose places are known."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

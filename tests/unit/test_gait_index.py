@@ -1,7 +1,5 @@
 """The original index of nine angles, the profile score, units and conventions."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cycles whose curves are unlike the others'."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Normative sets from one's own cycles."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The algebra of the Gauss-Newton solver: structured systems, derivatives of markers and of the cost, its terms."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

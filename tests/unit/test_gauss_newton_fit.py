@@ -4,8 +4,6 @@ Bounds are about 1.4 times what was measured. All fits of the module are packed 
 that one program serves each kind of session.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any

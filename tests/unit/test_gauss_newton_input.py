@@ -1,7 +1,5 @@
 """What cannot be fitted is refused with a code before anything is computed, never fitted to nonsense."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """TensorFlow Lite graphs as JAX functions and the process that owns the GPU, here on the CPU: LiteRT's numbers."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """The paper's solver: its kinematics, costs and optimiser against others', its results against the truth."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace

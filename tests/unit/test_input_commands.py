@@ -1,7 +1,5 @@
 """The commands that read the inputs of the fit: what they hand to it. Detection and the fit are stand-ins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

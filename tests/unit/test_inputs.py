@@ -1,7 +1,5 @@
 """Laboratory markers, TRC files, and one trial seen by several cameras."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

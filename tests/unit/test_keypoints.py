@@ -1,7 +1,5 @@
 """Crops, the virtual camera of a crop, and the two-pass run, against synthetic geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares

@@ -1,7 +1,5 @@
 """Forces and moments against closed forms, the motion's own momentum, and what must not be computed."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The vertical force of one camera's motion, weighed against how people's force varies, against closed forms."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 The network comes from a package index; these tests skip where it is absent and cannot be fetched.
 """
 
-from __future__ import annotations
-
 import gzip
 
 import numpy as np

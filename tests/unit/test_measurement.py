@@ -1,7 +1,5 @@
 """The measurement model against closed forms, and the index that score_gdi makes of it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """The registry of methods: from a name, parameters or a stored row to what runs; every stage in the same way."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

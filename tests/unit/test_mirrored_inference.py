@@ -1,7 +1,5 @@
 """Two looks as one answer: at one frame, and shared by frames that follow each other. Walkers of known movement."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

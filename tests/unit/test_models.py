@@ -1,7 +1,5 @@
 """Model folders: what `model.json` must say, what the graph must be, the registry, `pbl models`."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

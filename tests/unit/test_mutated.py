@@ -1,7 +1,5 @@
 """A few files of each kind of `research.benchmarks.mutated`, and those whose fault chance seldom finds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

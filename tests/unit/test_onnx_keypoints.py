@@ -1,7 +1,5 @@
 """Keypoints from ONNX models, against truth: dots at known 3D points through a known, distorted, tilted camera."""
 
-from __future__ import annotations
-
 import functools
 import json
 import threading

@@ -1,7 +1,5 @@
 """Which lens recorded a video, and a calibration turned to how the phone was held."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

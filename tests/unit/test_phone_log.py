@@ -1,7 +1,5 @@
 """Sensor logs of recording apps: read, turned to the camera, and brought to the video's clock."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import zipfile

@@ -1,7 +1,5 @@
 """The chain on files, with the slow stages replaced: what is named, left out and checked first."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is said of a fit whose keypoints have no 3D."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 from typing import Any

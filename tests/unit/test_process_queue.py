@@ -1,7 +1,5 @@
 """Files made in separate processes: complete or absent, and ended with their queue."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

@@ -4,8 +4,6 @@ The fits here take a little over a second of movement each, the least that is ac
 `research/benchmarks/{marker_ik,multiview}.py` print the whole of it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

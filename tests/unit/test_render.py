@@ -1,7 +1,5 @@
 """The overlay: projection, drawing and the video file."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

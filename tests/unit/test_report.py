@@ -1,7 +1,5 @@
 """The report page: what stands in it, that it is whole and asks for nothing, and pages of visits that went wrong."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cores and memory: those of the machine, less what a container or batch system withholds; divided by the processes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

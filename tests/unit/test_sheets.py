@@ -1,7 +1,5 @@
 """Sheets that ask for much or are no sheet: refused with a code, in little memory and time."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import time

@@ -1,7 +1,5 @@
 """Failure has a face: each thing a video can lack, made and told; a clean one passes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

@@ -1,7 +1,5 @@
 """Permutation inference over the gait cycle: exact small cases, agreement with another program, what is refused."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

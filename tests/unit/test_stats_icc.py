@@ -1,7 +1,5 @@
 """Repeatability: Shrout & Fleiss' table, tables with missing ratings, what is refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -3,8 +3,6 @@
 Oracles: pingouin 0.7.0, statsmodels 0.15.0, scipy 1.17.1, whose printed numbers stand here.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The data type of a study and its folder: what is written is read again, what is contradictory is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """The report of a study: its numbers are those of the statistics, and what is not defined is a code, never a number."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import re

@@ -1,7 +1,5 @@
 """Who of several people is measured: what a clinic films, as made tracks."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 Bounds are about 1.5 times what was measured (docs/synth.md).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

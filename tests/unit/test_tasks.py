@@ -1,7 +1,5 @@
 """Measures of tasks against movements whose times are known."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Temporary folders: gone with their process, or with the next command where it was killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

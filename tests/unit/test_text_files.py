@@ -3,8 +3,6 @@
 Ruff's rule for this (PLW1514) is in preview and sees a path only where its type is written beside the call.
 """
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tiles, merging, association over time and the choice of the subject, against hand-worked and synthetic truth."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

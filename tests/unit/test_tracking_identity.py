@@ -1,7 +1,5 @@
 """Nobody becomes somebody else: crossings, hiding, leaving and coming back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The units of the cost: results do not depend on the size of the picture, nor on whom a detector assumes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

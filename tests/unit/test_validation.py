@@ -1,7 +1,5 @@
 """Errors of a fit against a reference, by cases worked by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import json

@@ -1,7 +1,5 @@
 """The paper's tables from error rows: what stands in them, what stays empty, and the files."""
 
-from __future__ import annotations
-
 import csv
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Probe and frames against files whose frames, stamps and damage are known, and against OpenCV as a second decoder."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """A region cut from the decoder's planes is that of the converted picture; what is fetched ahead comes as it is."""
 
-from __future__ import annotations
-
 import threading
 import time
 

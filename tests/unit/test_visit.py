@@ -1,7 +1,5 @@
 """A visit written to its folder and read back: equal in every field, and so are its report and its exports."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

@@ -1,7 +1,5 @@
 """Certificates of `pbl web --tls`: what a browser that trusts the authority accepts."""
 
-from __future__ import annotations
-
 import datetime
 import socket
 import ssl

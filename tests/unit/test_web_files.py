@@ -1,7 +1,5 @@
 """The review page's own files: texts in both languages, scripts of others as published."""
 
-from __future__ import annotations
-
 import ast
 import csv
 import hashlib

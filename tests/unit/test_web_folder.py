@@ -1,7 +1,5 @@
 """`pbl web --folder`: what `pbl run` wrote, shown without a database."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import io

@@ -1,7 +1,5 @@
 """The logic of the review page's scripts, by `node --test`. Skips where there is no node."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

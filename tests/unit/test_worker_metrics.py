@@ -1,8 +1,6 @@
 """The supervisor and its figures: jobs in hand are those of processes that live, whatever these said, however they
 ended; and neither waits for a database that does not answer."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import socket

@@ -1,7 +1,5 @@
 """YOLOX as a registered person detector: decoding by hand, the real model where it is, and bad model folders."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

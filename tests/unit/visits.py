@@ -1,7 +1,5 @@
 """How a body was fitted, for the visits of tests whose fits no solver made."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
