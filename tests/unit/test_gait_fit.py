@@ -559,12 +559,3 @@ def test_joints_in_degrees_are_refused():
     assert (error.value.key, "radians" in error.value.expected) == ("degrees", True)
     round_and_round = make_fit(time, {**walking(time), "pelvis_rotation": 20.0})
     assert gait_metrics([round_and_round]).status == "PASS"
-
-
-@pytest.mark.parametrize("content", [b"", b"not a zip"])
-def test_events_of_a_broken_file(tmp_path, content):
-    path = tmp_path / "x.npz"
-    path.write_bytes(content)
-    result = CliRunner().invoke(events_command, [str(path), "--out", str(tmp_path / "e.csv")])
-    assert isinstance(result.exception, PblError)
-    assert result.exception.code == "FILE_FORMAT"
