@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import csv
 import dataclasses
 import re
@@ -17,11 +16,9 @@ import pandas as pd
 import pytest
 from click.testing import CliRunner
 
-from pbl_pipeline.charts import SERIES
 from pbl_pipeline.cli.study import study as command
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.render import SIDE_COLOUR
 from pbl_pipeline.stats import correlation, icc, srm
 from pbl_pipeline.study import StudyData, read_study, write_study
 from pbl_pipeline.study_report import (
@@ -35,7 +32,6 @@ from pbl_pipeline.study_report import (
     visit_table,
     write_study_report,
 )
-from pbl_pipeline.study_report.figures import AFTER, BEFORE, GROUP_COLOURS
 from pbl_pipeline.study_report.page_tables import short_of
 from pbl_pipeline.study_report.statement import statement
 from research import cohort as made
@@ -450,15 +446,3 @@ def test_tables_have_the_layout_of_the_paper(results, study):
     table = all_tables(study, results)["table2"]
     assert [text for text, _ in table.head()[0] if text.strip()] == ["Repeatability", "Validity", "Responsiveness"]
     assert [text for text, _ in table.head()[1]][1:5] == ["Measure", "ICC2", "ICC2k", "r mJOA"]
-
-
-def test_orange_and_blue_are_the_sides_and_nothing_else():
-    def hue(colour: str) -> tuple[float, float]:
-        hue, _, saturation = colorsys.rgb_to_hls(*(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)))
-        return 360 * hue, saturation
-
-    for colour in {*GROUP_COLOURS, BEFORE, AFTER, *(c for c, _ in SERIES)}:
-        own, saturation = hue(colour)
-        for side in ("left", "right"):
-            apart = abs((own - hue(SIDE_COLOUR[side])[0] + 180) % 360 - 180)
-            assert apart > 30 or saturation < 0.15, colour
