@@ -132,7 +132,7 @@ def mean_curves(study: StudyData, angle: str) -> pd.DataFrame:
     keys = [rows["subject"], rows["role"], rows["group"]]
     points = list(CURVE_POINTS)
     unknown = rows[points].isna().groupby(keys, sort=False).any()
-    # Tables hold no curve of a side that has unknown points: of one leg alone there is no mean of both.
+    # Tables hold only curves without unknown points; the curve of one leg alone is not the mean of both.
     one_sided = rows["side"].groupby(keys, sort=False).nunique() < curves["side"].nunique()
     return rows[points].groupby(keys, sort=False).mean().mask(unknown.apply(lambda c: c | one_sided))
 

@@ -144,7 +144,7 @@ class BorderMeter:
         """Return how many lines of a screen are around what moves; 0 where they are too few, or what moves is not
         between them."""
         greys = (self._sum / max(self._n, 1), self._first, self._last)
-        sides = [(greys, self._moved), ([g.T for g in greys], self._moved.T)] if self._n else []
+        sides = [(greys, self._moved), ([np.ascontiguousarray(g.T) for g in greys], self._moved.T)] if self._n else []
         found = [(_lines(pictures), moved.sum(axis=1)) for pictures, moved in sides]
         around = (
             moved[int(at[0] * len(moved)) : round(at[-1] * len(moved)) + 1].sum() >= _ENCLOSED * moved.sum() > 0

@@ -1,7 +1,7 @@
 """A drawn cohort of 80 people through the tables: its report is the same from the cohort, a slice and a folder.
 
 Its visits have no recordings. Each is registered as a recording of markers, and the tables' own makes write what the
-library returns for it; in place of the library's events, cycles, measures and index stand those that were drawn.
+library returns for it, where its events, cycles, measures and index are replaced by those that were drawn.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def from_tables(module_tables: Path, module_patch: pytest.MonkeyPatch, drawn: St
     recordings = []
     for i, (name, visit) in enumerate(results.visits.items()):
         path = module_tables / f"{name}.npz"
-        dataclasses.replace(walk, time_s=walk.time_s + 1e-6 * i).save(path)  # bytes of its own
+        dataclasses.replace(walk, time_s=walk.time_s + 1e-6 * i).save(path)  # other bytes
         recordings.append(LaboratoryMarkers(path, VisitRecord(visit["subject"], visit["visit"])))
     assert {r.status for r in register(recordings)} == {"registered"}
     path = module_tables / "visits.csv"
