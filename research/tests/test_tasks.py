@@ -1,4 +1,4 @@
-"""Times of synthetic tasks and of the shared clip are within their bar."""
+"""Times of synthetic tasks and of the shared clip are within their bar (four minutes of processor time)."""
 
 from __future__ import annotations
 
