@@ -57,6 +57,10 @@ def _library_words(language: str, english: str) -> str | None:
     own = catalogue().get(f"library.{english}", {}).get(language)
     if own is not None:
         return own
+    for at in (m.start() for m in re.finditer(r" \(", english) if english.endswith(")")):
+        # A check and in brackets the recording that it is of.
+        if (own := catalogue().get(f"library.{english[:at]}", {}).get(language)) is not None:
+            return own + english[at:]
     if language == "en":
         found = ((pattern.fullmatch(english), said) for pattern, said in _patterns(language))
         return next((_filled(language, match, said) for match, said in found if match), english)

@@ -141,16 +141,18 @@ def unit_of(name: str) -> str:
 
 #: Ends of the names of checks and what stands in brackets for them, and words that are not spelled as they stand there.
 _CHECK_UNITS = {"cm": "cm", "px": "px", "s": "s", "deg": "\N{DEGREE SIGN}", "percent": "%", "m": "m"}
-_SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI"}
+_SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI", "trial": "recording"}
 
 
 def check_words(name: str) -> str:
-    """ "residual_3d_cm" -> "Residual 3D (cm)"."""
+    """ "residual_3d_cm" -> "Residual 3D (cm)"; the name of a recording behind it stays, in brackets."""
+    name, _, recording = name.partition(" ")
     words = name.split("_")
     unit = _CHECK_UNITS.get(words[-1]) if len(words) > 1 else None
     words = [_SPELLED.get(w, w) for w in (words[:-1] if unit else words)]
     text = " ".join(words) + (f" ({unit})" if unit else "")
-    return text[:1].upper() + text[1:]
+    named = f" {recording}" if recording.startswith("(") else f" ({recording})"
+    return text[:1].upper() + text[1:] + (named if recording else "")
 
 
 def number(value: float | None, decimals: int) -> str:

@@ -89,7 +89,7 @@ class Measure:
 INDEX = Measure("", 82, 97, 8, 4, 7, 5, 6, 1.0)
 MEASURES = {
     "gdi": INDEX,
-    "cadence_steps_per_min": Measure("1/min", 98, 112, 9, 4, 5, 3, 6, 0.5),
+    "cadence_steps_per_min": Measure("steps/min", 98, 112, 9, 4, 5, 3, 6, 0.5),
     "double_support_time_s": Measure("s", 0.42, 0.28, 0.08, 0.035, 0.06, -0.04, 0.05, -0.6),
     "speed_m_per_s": Measure("m/s", 0.95, 1.3, 0.18, 0.07, 0.06, 0.06, 0.1, 0.7),
 }

@@ -144,7 +144,7 @@ def check_score(value: Any, instrument: Mapping[str, Any], key: object = None) -
     bounds = " and ".join(f"at {w} {b:g}" for w, b in (("least", low), ("most", high)) if b is not None)
     raise PblError(
         "SCORE_RANGE",
-        found=f"{instrument['instrument']} of {value!r}",
+        found=f"{instrument['instrument']} of {f'{value:.10g}' if isinstance(value, float) else repr(value)}",
         expected=f"{kind}{' of ' if bounds else ''}{bounds} {instrument['instrument_unit']}".rstrip(),
         next_step="correct the score at its source; leave out one that was not taken",
         key=key,

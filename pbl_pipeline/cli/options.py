@@ -10,6 +10,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
+from pbl_pipeline.texts import LANGUAGES
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, Points
@@ -28,6 +29,9 @@ HEIGHT = click.option(
 )
 MASS = click.option(
     "--mass-kg", type=float, help="Measured body mass, such as 68.5: forces can then be shown in newtons."
+)
+LANGUAGE = click.option(
+    "--language", type=click.Choice(LANGUAGES), default=LANGUAGES[0], show_default=True, help="Of the report."
 )
 
 KEYPOINTS = click.option(

@@ -14,6 +14,7 @@ from .options import (
     DEVICE,
     HEIGHT,
     KEYPOINTS,
+    LANGUAGE,
     MASS,
     PEOPLE,
     Person,
@@ -51,6 +52,7 @@ from .options import (
 @MASS
 @click.option("--activity", help="What the person does in all VIDEOS: tug, sit_to_stand, squat (else: walking).")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
+@LANGUAGE
 def run(
     videos: tuple[Path, ...],
     out: Path,
@@ -68,6 +70,7 @@ def run(
     mass_kg: float | None,
     activity: str | None,
     subject: str,
+    language: str,
 ) -> None:
     """Put VIDEOS, the trials of one session, through the whole chain.
 
@@ -115,7 +118,7 @@ def run(
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")
-    paths = write_results(out, visit)
+    paths = write_results(out, visit, language=language)
     if (judged := visit.judged) is not None:
         click.echo(judged.table())
     for origin in sorted({r.keypoints.origin for r in visit.fitted if r.keypoints and r.keypoints.origin}):

@@ -99,10 +99,10 @@ def colours_of(groups: Sequence[str]) -> dict[str, str]:
     return {g: GROUP_COLOURS[i % len(GROUP_COLOURS)] for i, g in enumerate(groups)}
 
 
-def draw_means(rows: pd.DataFrame, roles: Sequence[str], groups: Sequence[str], unit: str) -> Drawing:
+def draw_means(rows: pd.DataFrame, roles: Sequence[str], groups: Sequence[str], label: str) -> Drawing:
     """Mean and interval by visit, a line per group; rows of `visit_means` of one measure."""
     frame: Any = rows
-    axes = _axes(_SIZE, unit)
+    axes = _axes(_SIZE, label)
     _categories(axes, roles)
     for k, group in enumerate(groups):
         own = frame[frame["group"] == group].set_index("role")
@@ -112,10 +112,10 @@ def draw_means(rows: pd.DataFrame, roles: Sequence[str], groups: Sequence[str], 
     return _drawing(axes)
 
 
-def draw_pairs(both: pd.DataFrame, names: tuple[str, str], unit: str) -> Drawing:
+def draw_pairs(both: pd.DataFrame, names: tuple[str, str], label: str) -> Drawing:
     """A line per person from before to after, their means with 95 % intervals beside them."""
     values = both[["pre", "post"]].to_numpy(float)
-    axes = _axes(_NARROW, unit)
+    axes = _axes(_NARROW, label)
     _categories(axes, names)
     axes.plot([0, 1], values.T, color=_PERSON, lw=0.9, alpha=float(np.clip(3.5 / np.sqrt(len(values)), 0.15, 0.7)))
     axes.plot([0, 1], values.mean(axis=0), color=_INK, lw=2)
@@ -134,6 +134,7 @@ def draw_scatter(
     x, y = (np.concatenate([p[i] for p in parts.values()]) for i in (0, 1))
     axes = _axes(_SIZE, names[1])
     axes.set_xlabel(names[0])
+    axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
     for (px, py), colour in zip(parts.values(), colours, strict=True):
         axes.scatter(px, py, 14, facecolors="white", edgecolors=colour)
     if line and len(x) > 2 and np.ptp(x) > 0:
@@ -143,9 +144,9 @@ def draw_scatter(
     return _drawing(axes)
 
 
-def draw_groups(parts: Mapping[str, np.ndarray], unit: str, colours: Mapping[str, str] | None = None) -> Drawing:
+def draw_groups(parts: Mapping[str, np.ndarray], label: str, colours: Mapping[str, str] | None = None) -> Drawing:
     """Values by group: a dot per person, a box of the quartiles with the median."""
-    axes = _axes(_SIZE, unit)
+    axes = _axes(_SIZE, label)
     _categories(axes, [f"{name}\nn = {len(v)}" for name, v in parts.items()])
     generator = np.random.default_rng(0)
     for i, (name, own) in enumerate(parts.items()):
@@ -158,9 +159,9 @@ def draw_groups(parts: Mapping[str, np.ndarray], unit: str, colours: Mapping[str
     return _drawing(axes)
 
 
-def draw_curves(result: CurveResult, colours: tuple[str, str], unit: str) -> Drawing:
+def draw_curves(result: CurveResult, colours: tuple[str, str], label: str) -> Drawing:
     """Mean curves with one standard deviation each way; where they differ, a shaded phase and a bar at the foot."""
-    axes = _axes(_SIZE, unit)
+    axes = _axes(_SIZE, label)
     axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100], xlabel="gait cycle (%)")
     if isinstance(result.test, CurveTest):
         for phase in result.test.phases:

@@ -28,7 +28,7 @@ from .figures import (
     draw_pairs,
     draw_scatter,
 )
-from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of, unit_of
+from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of
 from .results import StudyResults, reason, score_classes, study_results
 from .statement import statement
 from .visit_values import INDEX, pairs, plan, score_column
@@ -162,13 +162,13 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
     if not measure:
         return
     at: Any = results.table[results.table["role"] == results.plan.change_from]
-    title, unit = title_of(study, measure), unit_of(study, measure)
+    title = title_of(study, measure)
     where = f"visit {results.plan.change_from}"
     for score, labels in score_classes(study, results.plan, at).items():
         by_class = {str(c): at.loc[labels == c, measure].dropna().to_numpy(float) for c in labels.cat.categories}
         if by_class := {c: v for c, v in by_class.items() if len(v)}:
             note = f"{where}; {_tests(results, measure, score)}"
-            drawing = draw_groups(by_class, unit)
+            drawing = draw_groups(by_class, title)
             yield Figure(_file("5B", score), f"B  {title} by class of {short_of(score)}", note, drawing)
     ordinal = {score_column(study, i): bool(o) for i, o in study.instruments[["instrument", "ordinal"]].to_numpy()}
     colours = colours_of(results.plan.groups)
@@ -186,7 +186,7 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
     values = {g: v for g, v in values.items() if len(v)}
     if len(values) > 1:
         note = f"{where}; {_tests(results, measure, 'group')}"
-        yield Figure("5D_groups", f"D  {title} by group", note, draw_groups(values, unit, colours))
+        yield Figure("5D_groups", f"D  {title} by group", note, draw_groups(values, title, colours))
 
 
 def _correlations(results: StudyResults, measure: str, score: str) -> str:
@@ -234,7 +234,7 @@ def _mean_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
             groups = [g for g in plan.groups if g in set(own["group"])]
             counts = "; ".join(f"{g} n {', '.join(map(str, own.loc[own['group'] == g, 'n']))}" for g in groups)
             colours = {g: c for g, c in colours_of(plan.groups).items() if g in groups}
-            drawing = draw_means(own, plan.roles, plan.groups, unit_of(study, name))
+            drawing = draw_means(own, plan.roles, plan.groups, title_of(study, name))
             yield Figure(
                 _file("visits", name), title_of(study, name), f"mean, 95 % interval; {counts}", drawing, colours
             )
@@ -249,7 +249,7 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
             continue
         row = frame[(frame["name"] == name) & (frame["statistic"] == "effect_size")].iloc[0]
         test = row["message"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
-        drawing = draw_pairs(both, (plan.change_from, plan.change_to), unit_of(study, name))
+        drawing = draw_pairs(both, (plan.change_from, plan.change_to), title_of(study, name))
         yield Figure(
             _file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", drawing
         )
@@ -273,11 +273,11 @@ def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> 
         prefix, letter = ("curves", "") if of_change else ("5A", "A  ")
         who = f"{c.names[1]} to {c.names[0]}" if of_change else f"{c.names[0]} and {c.names[1]}"
         name = c.angle if of_change else f"{c.angle}_{c.names[1]}"
-        unit = "\N{DEGREE SIGN}" if unit_of(study, c.angle) == "deg" else unit_of(study, c.angle)
         legend = {c.names[1]: colours[0], c.names[0]: colours[1]}
-        title = f"{letter}{title_of(study, c.angle)}, {who}"
+        angle = title_of(study, c.angle)
+        drawing = draw_curves(c, colours, angle)
         yield Figure(
-            _file(prefix, name), title, f"mean, one sd; {n}{left}; {test}", draw_curves(c, colours, unit), legend
+            _file(prefix, name), f"{letter}{angle}, {who}", f"mean, one sd; {n}{left}; {test}", drawing, legend
         )
 
 

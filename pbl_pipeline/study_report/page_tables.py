@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pbl_pipeline import words
 from pbl_pipeline.latex import tex_escape
 from pbl_pipeline.study import StudyData
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS
 
 from .results import ALPHA, StudyResults, reason
 from .visit_values import INDEX, score_column
@@ -20,6 +21,7 @@ from .visit_values import INDEX, score_column
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
 _NONE = "\N{EN DASH}"
+_INDICES = {INDEX: "GDI", "gps_deg": "Gait Profile Score"}
 _STARS = "* p < 0.05, not corrected for the number of tests"
 #: Of a table that shows it.
 _HOLM = "p, Holm: corrected for those"
@@ -89,18 +91,20 @@ def _labels(body: pd.DataFrame) -> int:
 
 def title_of(study: StudyData, name: str) -> str:
     """A measure, score or angle as people read it, with its unit."""
-    unit = unit_of(study, name)
-    return f"{short_of(name)} ({unit})" if unit else short_of(name)
+    unit, short = unit_of(study, name), short_of(name)
+    return f"{short} ({unit})" if unit and not short.endswith(f"({unit})") else short
 
 
 def short_of(name: str) -> str:
-    """Without its unit."""
-    if name == INDEX:
-        return "GDI"
-    angles = ANGLES | FOOT_ANGLES | PELVIS_ANGLES
-    if name in MEASURES:
-        return MEASURES[name][0]
-    return angles[name][0] if name in angles else name.replace("_", " ")
+    """Without its unit, unless that is what tells it from another, as in 10MWT_s and 10MWT_m_per_s."""
+    names = MEASURES | TASKS | ANGLES | FOOT_ANGLES | PELVIS_ANGLES
+    if name in names:
+        return names[name][0]
+    if name in _INDICES:
+        return _INDICES[name]
+    unit = words.unit_of(name)
+    stem = name.removesuffix("_" + unit.replace("/", "_per_")) if unit else name
+    return stem.replace("_", " ") + (f" ({unit})" if stem != name else "")
 
 
 def unit_of(study: StudyData, name: str) -> str:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import CURVE_POINTS, FIRST_ROLES, StudyData
-from pbl_pipeline.words import MEASURES
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES
 
 INDEX = "gdi"
 _KEY = ["subject", "visit"]
@@ -93,7 +93,8 @@ def plan(study: StudyData, change_from: str = "", change_to: str = "", change_gr
     group = _known(change_group or given.change_group or max(names, key=lambda g: paired[g]), tuple(names), "group")
     scores = tuple(c for i in study.instruments["instrument"] if (c := score_column(study, i)) in table)
     fixed = {*_KEY, "role", "days", "group", *scores}
-    angles = tuple(dict.fromkeys(study.curves["variable"]))
+    there = dict.fromkeys(study.curves["variable"])
+    angles = tuple(a for a in dict.fromkeys((*ANGLES, *FOOT_ANGLES, *PELVIS_ANGLES, *there)) if a in there)
     measures = tuple(c for c in table.columns if c not in fixed)
     return Plan(roles, (group, *(g for g in names if g != group)), measures, scores, angles, start, end, group)
 
@@ -127,11 +128,13 @@ def mean_curves(study: StudyData, angle: str) -> pd.DataFrame:
     """(visits that count, 101) mean of the sides of a visit, by subject, role and group; NaN where one is unknown."""
     curves: Any = study.curves[study.curves["variable"] == angle]
     visits: Any = study.visits[study.visits["included"]]
-    rows = curves.merge(visits[[*_KEY, "role", "group"]], on=_KEY)
+    rows = visits[[*_KEY, "role", "group"]].merge(curves, on=_KEY, how="left")
     keys = [rows["subject"], rows["role"], rows["group"]]
     points = list(CURVE_POINTS)
     unknown = rows[points].isna().groupby(keys, sort=False).any()
-    return rows[points].groupby(keys, sort=False).mean().mask(unknown)
+    # Tables hold only curves without unknown points; the curve of one leg alone is not the mean of both.
+    one_sided = rows["side"].groupby(keys, sort=False).nunique() < curves["side"].nunique()
+    return rows[points].groupby(keys, sort=False).mean().mask(unknown.apply(lambda c: c | one_sided))
 
 
 def cycle_values(study: StudyData, to_compare: Plan, measure: str) -> pd.DataFrame:

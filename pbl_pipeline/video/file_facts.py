@@ -90,11 +90,22 @@ _LEAST_WIDTH, _LEAST_EXTENT = 0.03, 0.5
 _AT_EDGE, _BESIDE, _OUTSIDE = 0.3, 0.05, 0.2
 
 
+#: A line of a screen (the edge of a window, of a bar) is a step of so many grey levels between two rows of pixels, and
+#: of so much of the step over six rows, in so much of so long a part of a row: a camera's edge is blurred and tilted.
+_STEP_LEVELS, _OF_STEP, _STRAIGHT, _LONG = 10, 0.6, 0.9, 0.4
+#: Lines this near to the picture's edge are padding of a file; so many around so much of what moves are a screen's.
+_PADDING, _LEAST_LINES, _ENCLOSED = 0.015, 4, 0.9
+
+
 class BorderMeter:
-    """Where a video's picture has another grey than its edges, at a reduced size: ever, and how often by far."""
+    """Where a video's picture has another grey than its edges, at a reduced size: ever, and how often by far; its mean
+    at its own size, and where it moves."""
 
     def __init__(self) -> None:
         self._n = 0
+        self._sum: np.ndarray = np.empty(0, np.float32)
+        self._first = self._last = self._before = np.empty(0)
+        self._moved: np.ndarray = np.empty(0)
         self._colours: np.ndarray = np.empty(0)
         self._ever: np.ndarray = np.empty(0, bool)
         self._often: np.ndarray = np.empty(0, np.int64)
@@ -108,6 +119,13 @@ class BorderMeter:
             # Of the first and last row, and of the first and last column: a border keeps its colour.
             self._colours = np.array([np.median(grey[[0, -1]]), np.median(grey[:, [0, -1]])])[:, None, None]
             self._ever, self._often = np.zeros((2, *grey.shape), bool), np.zeros((2, *grey.shape), np.int64)
+            self._sum, self._moved = np.zeros((frame.height, frame.width), np.float32), np.zeros(grey.shape)
+            self._before = grey
+        self._last = frame.reformat(format="gray").to_ndarray()
+        self._first = self._last if not self._n else self._first
+        self._sum += self._last
+        self._moved += np.abs(grey - self._before) > _EDGE_LEVELS
+        self._before = grey
         off = np.abs(grey - self._colours)
         self._n += 1
         self._ever |= off > _LEVELS
@@ -121,6 +139,45 @@ class BorderMeter:
         # Half of the time: what moves over a flat background is not the picture.
         usual = self._often >= 0.5 * self._n
         return _at_ends(usual[0], self._ever[0]) or _at_ends(usual[1].T, self._ever[1].T)
+
+    def lines(self) -> int:
+        """Return how many lines of a screen are around what moves; 0 where they are too few, or what moves is not
+        between them."""
+        greys = (self._sum / max(self._n, 1), self._first, self._last)
+        sides = [(greys, self._moved), ([np.ascontiguousarray(g.T) for g in greys], self._moved.T)] if self._n else []
+        found = [(_lines(pictures), moved.sum(axis=1)) for pictures, moved in sides]
+        around = (
+            moved[int(at[0] * len(moved)) : round(at[-1] * len(moved)) + 1].sum() >= _ENCLOSED * moved.sum() > 0
+            for at, moved in found
+            if len(at) > 1
+        )
+        n = sum(len(at) for at, _ in found)
+        return n if n >= _LEAST_LINES and any(around) else 0
+
+
+def _lines(greys: Sequence[np.ndarray]) -> np.ndarray:
+    """Places of the horizontal lines of a screen in (H, W) grey levels, as fractions of H; of neighbours one.
+
+    greys: the mean of all pictures, and the first and the last, where an edge of what moves is elsewhere.
+    """
+    height, width = greys[0].shape
+    n, rows = max(1, int(_LONG * width)), []
+    for first in range(0, height - 5, 256):  # in parts, for the memory
+        parts = [grey[first : first + 261].astype(np.float32) for grey in greys]
+        for sign in (1, -1):
+            hits = np.logical_and.reduce([_steps(sign * part, k) for part, k in zip(parts, (1, 0.5, 0.5), strict=True)])
+            count = np.pad(np.cumsum(hits, axis=1, dtype=np.int32), ((0, 0), (1, 0)))
+            straight = (count[:, n:] - count[:, :-n]).max(axis=1) >= _STRAIGHT * n
+            rows += (first + 3 + np.flatnonzero(straight)).tolist()
+    found = np.unique(rows)
+    at = found[np.diff(found, prepend=-9) > 3] / height
+    return at[(at > _PADDING) & (at < 1 - _PADDING)]
+
+
+def _steps(grey: np.ndarray, part: float) -> np.ndarray:
+    """(H - 5, W) where (H, W) grey levels rise from one row to the next by a part of what the line of a screen does."""
+    step, over = grey[3:-2] - grey[2:-3], grey[5:] - grey[:-5]
+    return (step >= part * _STEP_LEVELS) & (step >= part * _OF_STEP * over)
 
 
 def _at_ends(usual: np.ndarray, ever: np.ndarray) -> tuple[float, float] | None:
@@ -189,6 +246,14 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
                 "VIDEO_SCREEN",
                 found=f"borders of {widths[0]:.0%} and {widths[1]:.0%} of the picture at two opposite sides, which "
                 "never change",
+                expected="the whole picture of a camera",
+                next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
+                key=path,
+            )
+        if n_lines := borders.lines():
+            raise PblError(
+                "VIDEO_SCREEN",
+                found=f"{n_lines} exactly straight lines around what moves, as of a screen's windows and bars",
                 expected="the whole picture of a camera",
                 next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
                 key=path,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pbl_pipeline.texts import LANGUAGES
+from pbl_pipeline.cli.options import LANGUAGE
 
 from ._kind import kind_option
 
@@ -16,9 +16,7 @@ from ._kind import kind_option
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
 @kind_option
-@click.option(
-    "--language", type=click.Choice(LANGUAGES), default=LANGUAGES[0], show_default=True, help="Of the report."
-)
+@LANGUAGE
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
 def report(
     subject: str, label: str | None, fit_method: str | None, fit_set_kind: str | None, language: str, out: Path

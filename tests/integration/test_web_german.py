@@ -71,35 +71,44 @@ def test_a_visit_without_walking_says_so_once_and_shows_its_task(clinic: None, p
     assert "Stride time" in walked
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/visits",
-        "/visits?quality=nonsense",
-        *(f"/visits/{n}" for n in range(1, 8)),
-        *(f"/visits/{n}/letter" for n in range(1, 8)),
-        "/visits/1/trend",
-        "/visits/1/trend?measure=step_time_s",
-        "/visits/1/enter",
-        "/visits/new",
-        "/visits/1/facts",
-        "/visits/1/upload",
-        *(f"/recordings/{n}" for n in range(1, 8)),
-        "/compare?v=1&v=2",
-        "/compare?v=1",
-        "/instruments",
-        "/operate",
-        "/visits/99",
-        "/recordings/99",
-        "/nowhere",
-    ],
-)
+PAGES = [
+    "/visits",
+    "/visits?quality=nonsense",
+    *(f"/visits/{n}" for n in range(1, 8)),
+    *(f"/visits/{n}/letter" for n in range(1, 8)),
+    "/visits/1/trend",
+    "/visits/1/trend?measure=step_time_s",
+    "/visits/1/enter",
+    "/visits/new",
+    "/visits/1/facts",
+    "/visits/1/upload",
+    *(f"/recordings/{n}" for n in range(1, 8)),
+    "/compare?v=1&v=2",
+    "/compare?v=1",
+    "/instruments",
+    "/operate",
+    "/visits/99",
+    "/recordings/99",
+    "/nowhere",
+]
+
+
+@pytest.mark.parametrize("path", PAGES)
 def test_a_german_page_has_no_english_word(clinic: None, english: set[str], path: str):
     browser = web.client(role="reviewer,operator")
     browser.headers["accept-language"] = "de"
     page = browser.get(path)
     assert 'lang="de"' in page.text
     assert not english_of(page.text, english, NAMES)
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_no_page_names_a_command_or_its_option(clinic: None, path: str):
+    browser = web.client(role="reviewer,operator")
+    for language in texts.LANGUAGES:
+        page = browser.get(path, headers={"accept-language": language}).text
+        shown = re.sub(r"(?s)<(script|style)\b.*?</\1>|<!--.*?-->|<[^>]+>", " ", page)
+        assert not re.findall(r"\bpbl [a-z]+[^<]{0,40}|(?<![\w-])--[a-z][\w-]+", shown)
 
 
 def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english: set[str]):

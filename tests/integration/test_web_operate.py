@@ -119,6 +119,8 @@ def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
     assert "No worker runs; what is being computed now was started on a page or by a command" in page
     assert "2026-01-02 03:04:05" in page
     assert f'href="/recordings/{three_gone[0]}"' not in page  # an operator does not look
+    german = web.client("operator").get("/operate", headers={"accept-language": "de"}).text
+    assert german.count("Lesen des Videos <code") >= 2  # among the stages and what is being computed
 
 
 def test_from_the_click_to_the_queue_in_a_browser(three_gone: list[int], chromium: Any):

@@ -14,6 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.report import write_report
 from pbl_pipeline.visit import Recording, Visit
+from tests.german import REPORT_NAMES, english_of, english_words
 from tests.integration import chain
 from tests.walking_fit import walking_fit
 
@@ -60,6 +61,20 @@ def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_
     with pytest.raises(PblError, match=r"^NORM_UNKNOWN: "):
         pipeline.run_visit([chain.small_video(tmp_path, "walk", n=120)], tmp_path / "out", norm="no-such-norm")
     assert not fitted
+
+
+@pytest.mark.slow
+def test_the_report_of_a_run_is_german_where_that_is_asked_for(
+    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
+    monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
+    paths = [str(chain.small_video(tmp_path, f"walk_{name}")) for name in "ab"]
+    done = CliRunner().invoke(run, [*paths, "--out", str(tmp_path / "out"), "--language", "de"], catch_exceptions=False)
+    assert done.exit_code == 0
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "Person im Bild (s) (walk_a)" in page
+    assert not english_of(page, english_words(), REPORT_NAMES + r"|walk_[ab](\.mp4)?|Scale|stand-in|test")
 
 
 @pytest.mark.slow

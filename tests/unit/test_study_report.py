@@ -30,6 +30,7 @@ from pbl_pipeline.study_report import (
     visit_table,
     write_study_report,
 )
+from pbl_pipeline.study_report.page_tables import short_of
 from pbl_pipeline.study_report.statement import statement
 from research import cohort as made
 
@@ -215,6 +216,26 @@ def test_too_few_persons_are_said_once_below_a_table():
     assert set(tables["srm"].body["SRM"]) == {"\N{EN DASH} (a)"}
     for table in tables.values():
         assert "STATS_INPUT" not in table.body.to_string() + table.latex("")
+
+
+def test_the_curves_of_one_leg_alone_and_of_none_are_left_out(study):
+    """Tables hold no curve that has unknown points, a folder one with empty points: both are left out and counted."""
+    whole: Any = study.curves.dropna()
+    assert len(whole) < len(study.curves)
+    fewer = dataclasses.replace(study, curves=whole)
+    ours, theirs = (mean_curves(s, "knee_flexion").isna().any(axis=1) for s in (fewer, study))
+    assert ours.any()
+    assert (ours == theirs).all()
+    by_name = dataclasses.replace(study, curves=whole.sort_values("variable"))  # as tables have them
+    assert plan(by_name).angles == plan(study).angles == tuple(made.ANGLES)
+    first = whole[["subject", "visit", "variable"]].duplicated(keep=False)
+    none = dataclasses.replace(study, curves=whole[first & (whole["subject"] != "S001")])
+    assert mean_curves(none, "knee_flexion").loc["S001"].isna().all(axis=None)
+
+
+def test_instruments_of_one_test_in_two_units_are_told_apart():
+    assert (short_of("10MWT_s"), short_of("10MWT_m_per_s"), short_of("6MWT")) == ("10MWT (s)", "10MWT (m/s)", "6MWT")
+    assert short_of("gps_deg") == "Gait Profile Score"
 
 
 def test_curves_with_unknown_points_are_left_out_and_counted(study, results):

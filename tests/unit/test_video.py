@@ -340,6 +340,25 @@ def on_a_screen(image: np.ndarray, top: int, bottom: int, side: int, grey: int) 
     return screen
 
 
+def on_a_desktop(image: np.ndarray, i: int, wall: np.ndarray, dark: bool) -> np.ndarray:
+    """A picture in a player's window before a picture on a desktop; the clock, the progress and the cursor move."""
+    screen, (bar, text) = wall.copy(), ((45, 200) if dark else (230, 60))
+    screen[60:80, 150:330] = screen[320:340, 150:330] = bar
+    screen[66:74, 156:220], screen[328:331, 160 : 170 + 4 * i] = text, text
+    screen[80:320, 150:330] = image
+    screen[-24:], screen[-16:-8, -40 : -30 + i % 10] = 30, 220
+    screen[20 + 5 * i : 30 + 5 * i, 340 + 2 * i : 346 + 2 * i] = 255
+    return screen
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_a_window_on_a_desktop_is_named_as_a_screen(tmp_path, dark):
+    wall = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(384, 420, 3)), (0, 0), 12) * 800 + 120
+    wall = wall.clip(0, 255).astype(np.uint8)
+    frames = (on_a_desktop(image, i, wall, dark) for i, image in enumerate(scene(30)))
+    assert code_of(write_video(tmp_path / "v.mp4", frames, constant_rate(30), crf=26)) == "VIDEO_SCREEN"
+
+
 def scene(n: int) -> Iterator[np.ndarray]:
     """A person before a wall that is dark above: a flat background, and noise of the camera."""
     rng = np.random.default_rng(3)
@@ -372,7 +391,18 @@ def test_a_dark_room_a_doorway_and_a_flat_picture_are_no_screen_recording(tmp_pa
     def flat(image: np.ndarray) -> np.ndarray:
         return np.where(image == 200, image, 90).astype(np.uint8)
 
-    for change in (np.copy, dark, doorway, flat):
+    def rail(image: np.ndarray) -> np.ndarray:
+        image = cv2.GaussianBlur(image, (0, 0), 1.5)
+        image[20:26] = image[150:154] = 10  # the person walks across one of them
+        return image
+
+    def steps(image: np.ndarray) -> np.ndarray:
+        shelves = np.repeat(np.arange(0, 60, 10), 4)[:, None, None] * 4  # tilted by a third of a degree
+        image[:24] = shelves
+        turn = cv2.getRotationMatrix2D((90, 120), 0.33, 1.0)
+        return cv2.GaussianBlur(cv2.warpAffine(image, turn, (180, 240), borderMode=cv2.BORDER_REPLICATE), (0, 0), 0.8)
+
+    for change in (np.copy, dark, doorway, flat, rail, steps):
         frames = (change(image) for image in scene(30))
         assert probe(write_video(tmp_path / "v.mp4", frames, constant_rate(30))).n_frames == 30
 

@@ -118,6 +118,20 @@ def test_what_the_library_says_is_in_every_language():
     assert not dead, "\n".join(dead)
 
 
+def test_one_german_word_for_one_thing():
+    for name, by_language in texts.catalogue().items():
+        assert "Besuch" not in by_language["de"], name  # a visit is a Termin
+
+
+def test_a_check_of_one_of_several_recordings_has_its_name_in_german():
+    for check, expected in {
+        "residual_3d_cm (walk_a)": "Abweichung in 3D (cm) (walk_a)",
+        "walking (walk (1))": "Gehen (walk (1))",
+        "trial walk_a": "Aufnahme (walk_a)",
+    }.items():
+        assert texts.library("de", words.check_words(check)) == expected
+
+
 def test_a_page_in_english_has_no_codes_either():
     reason = "no trial of walking at the pace 'self_selected' (there are: sit_to_stand; walking, fast)"
     said = "no recording of walking at the pace self-selected (there are: sit to stand; walking, fast)"

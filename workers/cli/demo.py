@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from pbl_pipeline.cli.options import LANGUAGE
 from pbl_pipeline.errors import PblError
 
 SUBJECT, SESSION, PROJECT = "DEMO", "sports2d-demo", "demo"
@@ -17,8 +18,9 @@ SUBJECT, SESSION, PROJECT = "DEMO", "sports2d-demo", "demo"
 @click.command(epilog="Example: pbl demo --out pbl_demo")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("pbl_demo"), show_default=True)
 @click.option("--no-database", is_flag=True, help="On files alone, as `pbl run` does; needs no database server.")
+@LANGUAGE
 @click.pass_context
-def demo(context: click.Context, out: Path, no_database: bool) -> None:
+def demo(context: click.Context, out: Path, no_database: bool, language: str) -> None:
     """Set up what the default needs, put the demo recording through every table, show the rows and write the report.
 
     Safe to repeat: what is there already is not computed again. The database is stopped at the end if it was not
@@ -28,7 +30,8 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
         from pbl_pipeline.cli.run import run
 
         files = _fetched()
-        context.invoke(run, videos=(files["demo_video"],), camera=files["demo_camera"], out=out, subject=SUBJECT)
+        video, lens = files["demo_video"], files["demo_camera"]
+        context.invoke(run, videos=(video,), camera=lens, out=out, subject=SUBJECT, language=language)
         return
     if os.environ.get("DJ_HOST"):
         raise PblError(
@@ -44,7 +47,7 @@ def demo(context: click.Context, out: Path, no_database: bool) -> None:
     begin = time.monotonic()
     was_running = embedded.status().running
     try:
-        _run(out)
+        _run(out, language)
     finally:
         if not was_running:
             embedded.stop(say=click.echo, on_demand=True)
@@ -57,7 +60,7 @@ def _fetched() -> dict[str, Path]:
     return {name: assets.fetch(name) for name in assets.needed()}
 
 
-def _run(out: Path) -> None:
+def _run(out: Path, language: str) -> None:
     import schemas
     from schemas import connection
     from schemas.intake import VisitRecord, ingest
@@ -88,7 +91,7 @@ def _run(out: Path) -> None:
         raise click.exceptions.Exit(130)
     _step(5, "result")
     here = {"subject": SUBJECT, "session_label": SESSION}
-    paths = write_visit(here, out)
+    paths = write_visit(here, out, language)
     summary_rows = frames.session_summary(here)
     click.echo(rows_text(summary_rows, frames.trial_summary(here)))
     click.echo()

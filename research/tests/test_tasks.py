@@ -1,0 +1,18 @@
+"""Times of synthetic tasks and of the shared clip are within their bar (four minutes of processor time)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from research.benchmarks.tasks import main
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_times_of_tasks_are_within_a_tenth_of_a_second(shared_data: Path):
+    done = CliRunner().invoke(main, [])
+    assert done.exit_code == 0, done.output
+    assert "bar 0.1 s: PASS" in done.output
