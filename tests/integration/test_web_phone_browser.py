@@ -69,7 +69,7 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
     args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
             f"--use-file-for-fake-video-capture={path}"]  # fmt: skip
     executable = shutil.which("chromium") or shutil.which("google-chrome")
-    browser = chromium.browser_type.launch(executable_path=executable, args=args)
+    browser = getattr(chromium, "browser_type", chromium).launch(executable_path=executable, args=args)
     yield browser
     browser.close()
 
