@@ -134,7 +134,7 @@ def film(page: Any, n: int) -> np.ndarray:
     page.wait_for_selector(".after:not([hidden])")
     times_s = np.array(json.loads(page.locator("main").get_attribute("data-times")), float) / 1e6
     page.locator(".keep").click()
-    arrived(page)
+    arrived(page, seconds=180)
     return times_s - times_s[0]
 
 

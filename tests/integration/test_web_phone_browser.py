@@ -145,11 +145,11 @@ def film(page: Any, seconds: float = 3.0) -> None:
     page.wait_for_selector(".after:not([hidden])")
 
 
-def arrived(page: Any, n: int = 1) -> None:
+def arrived(page: Any, n: int = 1, seconds: float = 30) -> None:
     page.wait_for_function(
         "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === n",
         arg=n,
-        timeout=30_000,
+        timeout=1000 * seconds,
     )
 
 
