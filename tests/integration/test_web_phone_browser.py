@@ -425,6 +425,15 @@ def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int)
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
 
 
+def test_frames_of_the_shown_video_count_by_their_capture_and_not_by_when_they_are_shown(camera: Any, visit: int):
+    """A browser that hands out no frames of the track."""
+    with filming(camera, visit, script="() => { delete globalThis.MediaStreamTrackProcessor; }") as page:
+        film(page)
+        times_us = json.loads(page.locator("main").get_attribute("data-times"))
+        assert len(times_us) > 10
+        assert float(page.locator("main").get_attribute("data-start")) == pytest.approx(times_us[0] / 1000, abs=0.01)
+
+
 #: In the page: a camera that delivers a frame, by which the encoder is chosen, and one more.
 ONE_FRAME = """
 () => {
