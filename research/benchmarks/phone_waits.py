@@ -56,7 +56,9 @@ def film(takes: int) -> None:
 
     import schemas
     from pbl_pipeline import assets
+    from schemas import computed_tables, gdi
     from schemas.capture import PhoneRecording
+    from schemas.jobs import jobs_of
     from tests.end_to_end.test_phone import clocks_s, take, trial_of
     from tests.rows import remove_all
 
@@ -66,11 +68,16 @@ def film(takes: int) -> None:
             folder = home / f"take-{i}"
             folder.mkdir()
             walked = take(playwright.chromium, Path(assets.fetch("demo_video")), folder)
+            about, load = PhoneRecording().fetch1("phone_about"), os.getloadavg()[0]
+            lost, whole = about["dropped"], about["frames"] + about["dropped"]
+            if len(gdi.SessionGdi & "session_gdi IS NOT NULL") < 2:
+                why = [row["error_message"] for t in computed_tables() for row in jobs_of(t).errors.to_dicts()]
+                click.echo(f"take {i + 1}, load {load:.1f}: no index, {lost} of {whole} frames lost; {'; '.join(why)}")
+                remove_all()
+                continue
             phone, file = (trial_of(label) for label in ("2026-01-10", "2026-02-01"))
             ahead, off = (1000 * s for s in clocks_s(walked))
-            about, load = PhoneRecording().fetch1("phone_about"), os.getloadavg()[0]
             index, other = phone["session_gdi"], file["session_gdi"]
-            lost, whole = about["dropped"], about["frames"] + about["dropped"]
             click.echo(
                 f"take {i + 1}, load {load:.1f}: index {index:.2f}, as a file {other:.2f}: {index - other:+.2f} points "
                 f"({phone['session_gdi_n']} and {file['session_gdi_n']} cycles); log {ahead:+.0f} ms ahead of the "

@@ -275,7 +275,7 @@ def test_a_long_time_out_of_sight_has_no_boxes(tmp_path):
 
 @pytest.mark.parametrize("first", range(6))
 def test_a_track_begins_and_ends_with_the_person_wherever_the_recording_begins(tmp_path, first):
-    """The schedule of looks counts from the recording's first frame; somebody else stands there all the time."""
+    """The schedule of looks counts from the recording's first frame; another person stands there all the time."""
 
     def frames():
         for i in range(first, 90):
