@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -63,6 +64,7 @@ class Problem:
     `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: tilt
     and list of the pelvis (rad) as the marker augmenter has them, and `c_pelvis`, 1 where it has. `sample_*`: the
     phone's orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
+    `clock_sd_s`: of its clock's offset where the log's makers know it, 0 elsewhere.
     M is 0 where no camera of the session turns.
     """
 
@@ -87,6 +89,7 @@ class Problem:
     pelvis: Float[Array, "F 2"]
     c_pelvis: Float[Array, " F"]
     has_phone: Float[Array, " N"]
+    clock_sd_s: Float[Array, " N"]
     sample_quat_wxyz: Float[Array, "N M 4"]
     sample_start_s: Float[Array, " N"]
     sample_step_s: Float[Array, ""]
@@ -133,7 +136,7 @@ class TrialArrays:
     plain confidences, `xy_px` and `camera_matrix` in pixels of the file.
 
     `used` (T,) bool: frames that count. phone_time_s (P,) on the video's clock, phone_quat_wxyz (P, 4): orientation of
-    the one camera where it moves, else None.
+    the one camera where it moves, else None; `phone_clock_sd_s` as in `Keypoints`.
     """
 
     time_s: np.ndarray
@@ -150,6 +153,7 @@ class TrialArrays:
     pixel_px: np.ndarray
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
+    phone_clock_sd_s: float = math.nan
 
 
 #: Interval (s) of the phone's orientation as the solvers see it, and how far beyond the trial it is kept (s): the
@@ -268,6 +272,7 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "pelvis": np.zeros((frames, 2)),
         "c_pelvis": np.zeros(frames),
         "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
+        "clock_sd_s": np.pad([np.nan_to_num(t.phone_clock_sd_s) for t in trials], (0, n - len(trials))),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,
         "sample_step_s": np.asarray(SAMPLE_S),

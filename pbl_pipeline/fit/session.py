@@ -240,6 +240,7 @@ def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str =
         pixel_px=np.stack([pixel_px(k, pixel) for k in views], axis=1),
         phone_time_s=None if phone is None else phone[0],
         phone_quat_wxyz=None if phone is None else phone[1],
+        phone_clock_sd_s=views[0].phone_clock_sd_s,
     ), source
 
 

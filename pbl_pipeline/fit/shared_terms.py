@@ -24,7 +24,9 @@ def _detector(at: At) -> Array:
 
 
 def _clock(at: At) -> Array:
-    return 0.5 * jnp.sum((at.state.clock_s / at.weights["clock_sd_s"]) ** 2) / frame_count(at.problem)
+    stated = at.problem.clock_sd_s
+    sd_s = jnp.where(stated > 0, stated, at.weights["clock_sd_s"])
+    return 0.5 * jnp.sum((at.state.clock_s / sd_s) ** 2) / frame_count(at.problem)
 
 
 def _floor(at: At) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ _NEEDED = (
 #: Fields that files of other programs may lack.
 _ASSUMED = ("distortion", "camera_source", "box_px")
 _OPTIONAL = (
-    *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "confidence_curve", "origin"),
-    *("picture_time_s", "picture_luma", "picture_detail", "crop_px"),
+    *("focal_rel_sd", "sides_changed", "phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s"),
+    *("confidence_curve", "origin", "picture_time_s", "picture_luma", "picture_detail", "crop_px"),
 )
 _NO_SOURCE = "not stated in the keypoints file"
 _format_error = functools.partial(PblError, "FILE_FORMAT", next_step="see docs/files.md, section keypoints.npz")
@@ -71,6 +72,7 @@ class Keypoints:
     #: to judge.
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
+    phone_clock_sd_s: float = math.nan  # as in `Attitude`
     #: Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
     confidence_curve: str = ""
     picture: Picture | None = None  # how light and sharp the picture of the person is, or None where no video was seen
@@ -122,19 +124,28 @@ class Keypoints:
                 expected="both or neither",
                 next_step="see docs/files.md, section keypoints.npz",
             )
+        if self.phone_clock_sd_s < 1e-4:
+            raise _format_error(f"phone_clock_sd_s {self.phone_clock_sd_s:g}", "at least 1e-4 s, or none")
         time_s, quat_wxyz = check_attitude(self.phone_time_s, self.phone_quat_wxyz)
         object.__setattr__(self, "phone_time_s", time_s)
         object.__setattr__(self, "phone_quat_wxyz", quat_wxyz)
 
     def with_attitude(self, attitude: Attitude) -> Keypoints:
         """The same keypoints with the phone's orientation."""
-        return dataclasses.replace(self, phone_time_s=attitude.time_s, phone_quat_wxyz=attitude.quat_wxyz)
+        return dataclasses.replace(
+            self,
+            phone_time_s=attitude.time_s,
+            phone_quat_wxyz=attitude.quat_wxyz,
+            phone_clock_sd_s=attitude.clock_sd_s,
+        )
 
     def save(self, path: str | Path) -> None:
         """Write `keypoints.npz` (the fields of docs/files.md)."""
         optional: dict[str, Any] = {}
         if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
             optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
+        if np.isfinite(self.phone_clock_sd_s):
+            optional["phone_clock_sd_s"] = np.asarray(self.phone_clock_sd_s, np.float64)
         if np.isfinite(self.camera.focal_rel_sd):
             optional["focal_rel_sd"] = np.asarray(self.camera.focal_rel_sd, np.float64)
         if self.confidence_curve:
@@ -184,6 +195,8 @@ class Keypoints:
         arrays |= {k: s for k, s in {"distortion": (5,), "box_px": (n, 4)}.items() if k in data}
         if "focal_rel_sd" in data:
             arrays["focal_rel_sd"] = ()
+        if "phone_clock_sd_s" in data:
+            arrays["phone_clock_sd_s"] = ()
         if "sides_changed" in data:
             arrays["sides_changed"] = (n, 3)
         if "crop_px" in data:
@@ -208,6 +221,7 @@ class Keypoints:
             assumed=assumed,
             phone_time_s=data.get("phone_time_s"),
             phone_quat_wxyz=data.get("phone_quat_wxyz"),
+            phone_clock_sd_s=float(data.get("phone_clock_sd_s", np.nan)),
             confidence_curve=text_of(path, data, "confidence_curve") if "confidence_curve" in data else "",
             picture=Picture.from_arrays(path, data),
             origin=text_of(path, data, "origin") if "origin" in data else "",

@@ -50,7 +50,7 @@ def detector_params(name: str) -> TrackingParams:
 
 #: A family is a person detector: a function from `TrackingParams` to a `PersonDetector`.
 METHODS: Stage[TrackingParams] = Stage("tracking", "detector", "blazepose-tiles", RegisteredDetectors())
-METHODS.register("blazepose-tiles", 3, TrackingParams(cut_windows=True), blazepose)
+METHODS.register("blazepose-tiles", 4, TrackingParams(cut_windows=True, exact_ends=True), blazepose)
 METHODS.register_family("yolox", TrackingParams, yolox)
 
 #: A family is a way to choose: a function as `choose_walker`.

@@ -27,6 +27,8 @@ class TrackingParams:
     finds that it is the same one; such a gap stays without boxes.
     cut_windows: a detector is shown windows cut from the planes of the decoded picture, square also at its edge (black
     beyond it); otherwise each is a part of the converted picture.
+    exact_ends: a track begins and ends with the first and the last frame in which the person is found; otherwise with
+    the first and last look of the schedule, up to a fifth of a second later and earlier.
     min_hits: a person must be seen surely (`sure_score` of the association) this often, and over `min_track_s`, or
     the track is dropped as false.
     """
@@ -43,3 +45,4 @@ class TrackingParams:
     uncross: UncrossParams = dataclasses.field(default_factory=UncrossParams)
     join: JoinParams = dataclasses.field(default_factory=JoinParams)
     cut_windows: bool = later(False)
+    exact_ends: bool = later(False)

@@ -8,9 +8,13 @@ same and nobody else's are alike. Not to join costs a choice by hand; to join wr
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
+
+from pbl_pipeline.video import Frame
 
 from .appearance import appearance_similarity, mean_appearance, with_appearance
 from .associate import AssociationParams, Trail, measure, pair_cost
@@ -35,30 +39,100 @@ def backtrack(
 
     Ends where the person is not found any more, or where it would become one of `others`, who were seen there.
     """
-    back = Trail.of(trail.frames[0], -trail.times[0], trail.detections[0])
-    misses = 0
-    for index, time_s, scene in reversed(kept):
-        if time_s >= trail.times[0]:
-            continue
-        found = detect_in(detector, scene, [window_around(back.predict(-time_s), window_sizes)])
-        taken = [d for t in others for d in t.detections[_at(t, index)]]
-        free = [d for d in found if not any(_same(d, o) for o in taken)]
+
+    def taken(index: int, _: float) -> list[np.ndarray]:
+        return [measure(d) for t in others for d in t.detections[_at(t, index)]]
+
+    before = [k for k in reversed(kept) if k[1] < trail.times[0]]
+    return _with_sightings(trail, before, taken, detector, window_sizes, params)
+
+
+def with_exact_ends(
+    trails: Sequence[Trail],
+    time_s: np.ndarray,
+    frames: Callable[[int, int], Iterable[Frame]],
+    within_s: float,
+    detector: PersonDetector,
+    window_sizes: float,
+    params: AssociationParams,
+) -> list[Trail]:
+    """The trails from the first frame in which the person is found to the last, up to `within_s` beyond both ends.
+
+    Parameters
+    ----------
+    time_s
+        Stamps of all frames.
+    frames
+        Those from one number until before another.
+    """
+    out, wanted = list(trails), defaultdict(list)
+    for i, t in enumerate(trails):
+        first, last = t.frames[0], t.frames[-1]
+        begin, end = np.searchsorted(time_s, [time_s[first] - within_s - 1e-6, time_s[last] + within_s + 1e-6])
+        for part in (range(int(begin), first), range(last + 1, int(end))):
+            for index in part:
+                wanted[index].append((i, part))
+    scenes: dict[tuple[int, range], list[tuple[int, float, Scene]]] = defaultdict(list)
+    for frame in frames(min(wanted), max(wanted) + 1) if wanted else ():
+        for i, part in wanted.get(frame.index, ()):
+            scenes[i, part].append((frame.index, frame.time_s, frame))
+            if frame.index == part[-1]:
+                shown, others = scenes.pop((i, part)), [*out[:i], *out[i + 1 :]]
+                shown = shown if frame.index > out[i].frames[0] else shown[::-1]
+                taken = functools.partial(_between, others)
+                out[i] = _with_sightings(out[i], shown, taken, detector, window_sizes, params)
+    return out
+
+
+def _between(trails: Sequence[Trail], _: int, at_s: float) -> list[np.ndarray]:
+    """Where (`measure`) those are at a time who were seen before and after it."""
+    out = []
+    for t in trails:
+        if t.times[0] <= at_s <= t.times[-1]:
+            k = min(int(np.searchsorted(t.times, at_s, side="right")), len(t.times) - 1)
+            a, b = (measure(t.detections[j]) for j in (max(k - 1, 0), k))
+            part = (at_s - t.times[max(k - 1, 0)]) / max(t.times[k] - t.times[max(k - 1, 0)], 1e-9)
+            out.append(a + min(part, 1.0) * (b - a))
+    return out
+
+
+def _with_sightings(
+    trail: Trail,
+    shown: Sequence[tuple[int, float, Scene]],
+    taken: Callable[[int, float], Sequence[np.ndarray]],
+    detector: PersonDetector,
+    window_sizes: float,
+    params: AssociationParams,
+) -> Trail:
+    """The trail with sightings in frames (index, time_s, picture): those before it, backwards, or those after it.
+    `taken`: where others are in a frame, by its number and time."""
+    if not shown:
+        return trail
+    sign, end = (-1.0, 0) if shown[0][1] < trail.times[0] else (1.0, -1)
+    more, misses = Trail.of(trail.frames[end], sign * trail.times[end], trail.detections[end]), 0
+    for index, time_s, scene in shown:
+        at = sign * time_s
+        found = detect_in(detector, scene, [window_around(more.predict(at), window_sizes)])
+        others = taken(index, time_s)
+        free = [d for d in found if not any(_same(measure(d), o) for o in others)]
         # As forwards: the gate widens with time, but not for detections that are not sure.
-        wider = params.gate_per_s * (-time_s - back.last_time)
+        wider = params.gate_per_s * (at - more.last_time)
         gates = [params.gate + (wider if d.score >= params.sure_score else 0.0) for d in free]
-        excess = [pair_cost(back, -time_s, d, params) - g for d, g in zip(free, gates, strict=True)]
+        excess = [pair_cost(more, at, d, params) - g for d, g in zip(free, gates, strict=True)]
         if excess and min(excess) <= 0:
-            seen = free[int(np.argmin(excess))]
-            back.add(index, -time_s, with_appearance(seen, scene), params.memory_s)
+            best = free[int(np.argmin(excess))]
+            more.add(index, at, with_appearance(best, scene), params.memory_s)
             misses = 0
             continue
         misses += 1
         if misses > MAX_MISSES:
             break
-    frames, times = back.frames[:0:-1], [-t for t in back.times[:0:-1]]
-    velocity = -back.velocity if len(trail.frames) == 1 else trail.velocity
+    frames, times, seen = more.frames[1:], [sign * t for t in more.times[1:]], more.detections[1:]
+    if sign > 0:
+        return Trail([*trail.frames, *frames], [*trail.times, *times], [*trail.detections, *seen], trail.velocity)
+    velocity = -more.velocity if len(trail.frames) == 1 else trail.velocity
     return Trail(
-        [*frames, *trail.frames], [*times, *trail.times], [*back.detections[:0:-1], *trail.detections], velocity
+        [*frames[::-1], *trail.frames], [*times[::-1], *trail.times], [*seen[::-1], *trail.detections], velocity
     )
 
 
@@ -67,9 +141,8 @@ def _at(trail: Trail, index: int) -> slice:
     return slice(row, row + 1) if row < len(trail.frames) and trail.frames[row] == index else slice(0, 0)
 
 
-def _same(a, b) -> bool:
-    """Whether two detections of one frame are of one person: nearer than a quarter of a body."""
-    here, there = measure(a), measure(b)
+def _same(here: np.ndarray, there: np.ndarray) -> bool:
+    """Whether two detections of one frame (`measure`) are of one person: nearer than a quarter of a body."""
     return bool(np.hypot(*(here[:2] - there[:2])) < 0.25 * np.exp((here[2] + there[2]) / 2))
 
 

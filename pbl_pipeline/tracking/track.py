@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +24,7 @@ from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
 from .methods import METHODS
 from .params import TrackingParams
-from .reidentify import backtrack, join_trails
+from .reidentify import backtrack, join_trails, with_exact_ends
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking, WindowDetector
 
@@ -56,8 +57,13 @@ def track_people(
     finder: PersonDetector = method.function(params) if detector is None else detector
     info = info or probe(video_path)
     size = (info.width_px, info.height_px)
-    trails = _follow(video_path, params, finder, info)
-    people = join_trails(undo_swaps([t for t in trails if _is_real(t, params)], params.uncross), size, params.join)
+    trails = [t for t in _follow(video_path, params, finder, info) if _is_real(t, params)]
+    if params.exact_ends:
+        frames = functools.partial(read_frames, video_path)
+        longest = max(params.watch.search_interval_s, params.watch.rest_interval_s)
+        sizes = params.watch.window_sizes
+        trails = with_exact_ends(trails, info.time_s, frames, longest, finder, sizes, params.association)
+    people = join_trails(undo_swaps(trails, params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
     _check_upright(persons, video_path)

@@ -45,6 +45,7 @@ class Attitude:
     #: (P, 4) R_nc, camera to world, as unit quaternions (w, x, y, z); neighbours have the same sign.
     quat_wxyz: np.ndarray
     source: str = ""  # where it comes from, and how its clock was brought to the video's
+    clock_sd_s: float = math.nan  # standard deviation of the offset between the clocks that is left; NaN: not known
 
     def __post_init__(self) -> None:
         time_s, quat_wxyz = check_attitude(self.time_s, self.quat_wxyz, self.source or None)

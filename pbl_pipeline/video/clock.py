@@ -11,7 +11,9 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
+import math
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +24,7 @@ from pbl_pipeline.errors import PblError
 
 from .attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
 from .frames import read_frames
-from .phone_log import UTC_CLOCK, VIDEO_CLOCK, PhoneLog
+from .phone_log import PICTURES_CLOCK, UTC_CLOCK, VIDEO_CLOCK, PhoneLog
 from .sensor_logger import read_phone_log
 from .types import VideoInfo
 
@@ -82,6 +84,9 @@ LEAST_CORRELATION, LEAST_LEAD, _PEAK_S = 0.5, 0.15, 0.3
 #: each against 3 and 6 s of rendered film, the best place correlates by 0.64 at most and leads by 0.12 at most; the
 #: right log by 0.97 and by 0.26.
 CERTAIN_CORRELATION = 0.75
+#: How far a log that is nearly on the video's clock may be off it (s), as in the fit, and standard deviation of what is
+#: left where the pictures tell: on rendered films 2 ms at most; the fit's own estimate has 7 (docs/phone_capture.md).
+NEARLY_S, PICTURES_SD_S = 0.5, 0.005
 #: Steps (s) of the search, coarse and fine, and of the log's rate of turn.
 _COARSE_S, _FINE_S, _STEP_S = 0.02, 0.002, 0.005
 #: A phone that turns by less than this (deg, standard deviation) is on a stand: the shift does not matter.
@@ -102,8 +107,17 @@ class Match:
         return self.correlation >= LEAST_CORRELATION and self.correlation - self.rival >= LEAST_LEAD
 
 
-def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Path) -> tuple[float, str]:
-    """Seconds to add to the log's times so that 0 is the first frame of `video`, and in words how they were found.
+class Aligned(NamedTuple):
+    """Seconds to add to a log's times so that 0 is the first frame of its video, in words how they were found, and
+    their standard deviation (s), NaN where the fit looks for what is left."""
+
+    shift_s: float
+    how: str
+    sd_s: float = math.nan
+
+
+def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Path) -> Aligned:
+    """Bring a log's clock to that of its `video`.
 
     quat_wxyz (P, 4): the log's orientation, camera to world.
 
@@ -111,10 +125,15 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
     or nothing tells which part of the log is the video's.
     """
     duration = _duration(video)
-    if log.clock == VIDEO_CLOCK:
+    if log.clock in (VIDEO_CLOCK, PICTURES_CLOCK):
         if _cover(log, 0.0, duration, 0.0) == 0.0:
             raise _not_from_zero(log, duration, path)
-        return 0.0, "on the video's clock"
+        if log.clock == PICTURES_CLOCK and not _still(quat_wxyz):
+            match = match_pictures(log.time_s, quat_wxyz, video, [(-NEARLY_S, NEARLY_S)])
+            if match.decides and match.correlation >= CERTAIN_CORRELATION:
+                how = f"{_by_pictures(match)}, which moved it by {1000 * match.shift_s:.0f} ms"
+                return Aligned(match.shift_s, how, PICTURES_SD_S)
+        return Aligned(0.0, "on the video's clock")
     stated = _stated(log, video, duration)
     if stated:
         shifts = [s for s in stated if _cover(log, s, duration, STATED_WITHIN_S) >= LEAST_COVER]
@@ -125,12 +144,13 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
         ranges = [_anywhere(log, duration, path)]
         shifts = [-float(log.time_s[0])]
     if _still(quat_wxyz):
-        return shifts[0], "the phone stood still, so its clock does not matter"
+        return Aligned(shifts[0], "the phone stood still, so its clock does not matter")
     match = match_pictures(log.time_s, quat_wxyz, video, ranges)
     if match.decides:
-        return match.shift_s, f"clock by the pictures' movement (correlation {match.correlation:.2f})"
+        return Aligned(match.shift_s, _by_pictures(match))
     if stated and max(shifts) - min(shifts) <= STATED_WITHIN_S:
-        return shifts[0], "clock by the time of recording in the file, within 1 s: the pictures do not tell it better"
+        how = "clock by the time of recording in the file, within 1 s: the pictures do not tell it better"
+        return Aligned(shifts[0], how)
     raise PblError(
         "PHONE_LOG",
         found="a log of which nothing tells what part belongs to the video (the movement of the pictures correlates by "
@@ -143,7 +163,7 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
 
 def _against_the_file(
     log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, shift: float, duration: float, path: Path
-) -> tuple[float, str]:
+) -> Aligned:
     """By the file's time of recording the log is of another time (`shift`), which the pictures may disprove: files lose
     that time when they are converted, and clocks are set to other zones."""
     if not _still(quat_wxyz) and _cover(log, -float(log.time_s[0]), duration, 0.0) >= LEAST_COVER:
@@ -151,9 +171,12 @@ def _against_the_file(
         if match.decides and match.correlation >= CERTAIN_CORRELATION:
             off = abs(match.shift_s - shift)
             apart = f"{off / 3600:.1f} h" if off < 86400 else f"{off / 86400:.1f} days"
-            how = f"clock by the pictures' movement (correlation {match.correlation:.2f})"
-            return match.shift_s, f"{how}, {apart} from the time of recording in the file"
+            return Aligned(match.shift_s, f"{_by_pictures(match)}, {apart} from the time of recording in the file")
     raise _other_time(log, video, shift, duration, path)
+
+
+def _by_pictures(match: Match) -> str:
+    return f"clock by the pictures' movement (correlation {match.correlation:.2f})"
 
 
 def _anywhere(log: PhoneLog, duration: float, path: Path) -> tuple[float, float]:
@@ -290,5 +313,6 @@ def attitude_of(log: PhoneLog, path: Path, video: VideoInfo | None = None) -> At
         turns = Rotation.from_quat(quat, scalar_first=True) * camera_in_device(turned)
         quat = turns.as_quat(scalar_first=True)
     check_roll(path, quat, log.frame)
-    shift_s, how = (0.0, "") if video is None else align_clock(log, np.asarray(quat), video, path)
-    return Attitude(log.time_s + shift_s, quat, f"{path.name} ({log.form})" + (f": {how}" if how else ""))
+    clock = Aligned(0.0, "") if video is None else align_clock(log, np.asarray(quat), video, path)
+    source = f"{path.name} ({log.form})" + (f": {clock.how}" if clock.how else "")
+    return Attitude(log.time_s + clock.shift_s, quat, source, clock.sd_s)

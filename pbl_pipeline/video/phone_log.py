@@ -22,11 +22,12 @@ from pbl_pipeline.errors import os_errors_as
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
-#: Clocks of a log: the video's own; UTC (`start_utc_s` is known); its own, begun some time before the video.
-VIDEO_CLOCK, UTC_CLOCK, OWN_CLOCK = "video", "utc", "own"
+#: Clocks of a log: the video's own; nearly that, so that the pictures decide; UTC (`start_utc_s` is known); its own,
+#: begun some time before the video.
+VIDEO_CLOCK, PICTURES_CLOCK, UTC_CLOCK, OWN_CLOCK = "video", "pictures", "utc", "own"
 QUATERNION = ("qw", "qx", "qy", "qz")
 _COLUMNS = ("time_s", *QUATERNION)
-_SETTINGS = ("frame", "rotation_deg", "start_utc")
+_SETTINGS = ("frame", "rotation_deg", "start_utc", "clock")
 #: Further sensors: their columns in a CSV, and the unit of their values.
 SENSORS = {
     "accelerometer": (("ax", "ay", "az"), "m/s^2"),
@@ -185,7 +186,10 @@ def _log(
     time, quat = check_attitude(columns[0], np.stack(columns[1:], axis=1), path)
     frame, rotation_deg = _frame(path, settings)
     start = _utc(path, settings.get("start_utc"))
-    clock = VIDEO_CLOCK if start is None else UTC_CLOCK
+    clock = str(settings.get("clock", VIDEO_CLOCK))
+    if clock not in (VIDEO_CLOCK, PICTURES_CLOCK):
+        raise log_error(f"clock {clock!r}", f"{VIDEO_CLOCK} or {PICTURES_CLOCK}", key=path)
+    clock = clock if start is None else UTC_CLOCK
     return PhoneLog(time, quat, frame, rotation_deg, clock, start, sensors, form, device)
 
 

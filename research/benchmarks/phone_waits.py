@@ -2,15 +2,21 @@
 
     python -m research.benchmarks.phone_waits                    # 1,000 recordings wait, two processes, five by phone
     python -m research.benchmarks.phone_waits --videos 20 --phones 1
+    python -m research.benchmarks.phone_waits --takes 6          # none wait: what the page films against the same file
 
 A separate database holds as many recordings as `--videos`: different files with the demo's walk, 7 s at 1080p.
 `pbl worker` computes them for real. Once it detects keypoints, recordings are registered as the page of a phone does
 when its upload has ended, one after the other; each is of another visit.
+
+`--takes` films the walk of `tests/end_to_end/test_phone.py` in Chromium so often instead, a minute or two each on two
+idle cores, and prints of each take the index against that of the same clip as a file (bar 1 point), by how much the
+page's log is ahead of the pictures and the error of the fit's clock (bar 10 ms), and the frames lost (bar 1 %).
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 import time
@@ -44,12 +50,52 @@ def wait_for(known: Callable[[], bool], begin: float) -> float:
     return time.monotonic() - begin
 
 
+def film(takes: int) -> None:
+    """Print index, clocks and lost frames of so many takes."""
+    from playwright.sync_api import sync_playwright
+
+    import schemas
+    from pbl_pipeline import assets
+    from schemas import computed_tables, gdi
+    from schemas.capture import PhoneRecording
+    from schemas.jobs import jobs_of
+    from tests.end_to_end.test_phone import clocks_s, take, trial_of
+    from tests.rows import remove_all
+
+    with installation() as home, sync_playwright() as playwright:
+        schemas.activate()
+        for i in range(takes):
+            folder = home / f"take-{i}"
+            folder.mkdir()
+            walked = take(playwright.chromium, Path(assets.fetch("demo_video")), folder)
+            about, load = PhoneRecording().fetch1("phone_about"), os.getloadavg()[0]
+            lost, whole = about["dropped"], about["frames"] + about["dropped"]
+            if len(gdi.SessionGdi & "session_gdi IS NOT NULL") < 2:
+                why = [row["error_message"] for t in computed_tables() for row in jobs_of(t).errors.to_dicts()]
+                click.echo(f"take {i + 1}, load {load:.1f}: no index, {lost} of {whole} frames lost; {'; '.join(why)}")
+                remove_all()
+                continue
+            phone, file = (trial_of(label) for label in ("2026-01-10", "2026-02-01"))
+            ahead, off = (1000 * s for s in clocks_s(walked))
+            index, other = phone["session_gdi"], file["session_gdi"]
+            click.echo(
+                f"take {i + 1}, load {load:.1f}: index {index:.2f}, as a file {other:.2f}: {index - other:+.2f} points "
+                f"({phone['session_gdi_n']} and {file['session_gdi_n']} cycles); log {ahead:+.0f} ms ahead of the "
+                f"pictures, the fit's clock off by {off:+.1f} ms; {lost} of {whole} frames lost"
+            )
+            remove_all()
+
+
 @click.command()
 @click.option("--videos", default=1000, show_default=True, help="Recordings that wait.")
 @click.option("--processes", default=2, show_default=True, help="Of the worker.")
 @click.option("--phones", default=5, show_default=True, help="Recordings that come from a phone meanwhile.")
-def main(videos: int, processes: int, phones: int) -> None:
+@click.option("--takes", default=0, show_default=True, help="Takes to film, instead of all that.")
+def main(videos: int, processes: int, phones: int, takes: int) -> None:
     """Print the seconds from the end of an upload to the verdict and to the index, medians and the longest."""
+    if takes:
+        film(takes)
+        return
     import schemas
     from schemas import gdi, keypoints, video
     from schemas.intake import VisitRecord, register

@@ -67,7 +67,7 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
     args = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
             f"--use-file-for-fake-video-capture={path}"]  # fmt: skip
     executable = shutil.which("chromium") or shutil.which("google-chrome")
-    browser = chromium.browser_type.launch(executable_path=executable, args=args)
+    browser = getattr(chromium, "browser_type", chromium).launch(executable_path=executable, args=args)
     yield browser
     browser.close()
 
@@ -143,11 +143,11 @@ def film(page: Any, seconds: float = 3.0) -> None:
     page.wait_for_selector(".after:not([hidden])")
 
 
-def arrived(page: Any, n: int = 1) -> None:
+def arrived(page: Any, n: int = 1, seconds: float = 30) -> None:
     page.wait_for_function(
         "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === n",
         arg=n,
-        timeout=30_000,
+        timeout=1000 * seconds,
     )
 
 
@@ -421,6 +421,15 @@ def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int)
         page.locator(".keep").click()
         arrived(page)
     assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+
+
+def test_frames_of_the_shown_video_count_by_their_capture_and_not_by_when_they_are_shown(camera: Any, visit: int):
+    """A browser that hands out no frames of the track."""
+    with filming(camera, visit, script="() => { delete globalThis.MediaStreamTrackProcessor; }") as page:
+        film(page)
+        times_us = json.loads(page.locator("main").get_attribute("data-times"))
+        assert len(times_us) > 10
+        assert float(page.locator("main").get_attribute("data-start")) == pytest.approx(times_us[0] / 1000, abs=0.01)
 
 
 #: In the page: a camera that delivers a frame, by which the encoder is chosen, and one more.

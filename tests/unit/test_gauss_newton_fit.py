@@ -220,6 +220,13 @@ def test_a_phone_in_the_hand_and_its_clock(seed):
     assert_near(trial, walk(seed), deg=2.8, m=0.04)
 
 
+def test_a_clock_that_is_known_stays(tmp_path):
+    seen = look(SEEDS[0], camera_motion="handheld")
+    dataclasses.replace(seen.keypoints, phone_clock_sd_s=0.001).save(tmp_path / "keypoints.npz")
+    trial = fit_session([Keypoints.load(tmp_path / "keypoints.npz")], ["a"], PARAMSET, "handheld").trials[0]
+    assert abs(trial.phone_clock_offset_s) < 0.005 < abs(seen.clock_offset_s)
+
+
 def test_four_cameras():
     scale, offset = person(9)
     trial = observe_views(walk(9), TIME_S, scale=scale, site_offset_m=offset)

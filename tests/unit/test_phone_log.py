@@ -263,6 +263,24 @@ def test_a_log_on_the_videos_clock_is_not_moved(tmp_path, info):
     assert "start_utc" in error.next_step
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.043, -0.2])
+def test_the_pictures_bring_a_log_that_is_nearly_on_the_videos_clock(tmp_path, info, late_s):
+    at = np.arange(-0.5, SECONDS + 0.5, 0.01)
+    quat = dict(zip(("qw", "qx", "qy", "qz"), device_quat(hand(BEGIN_S + at)).T.tolist(), strict=True))
+    log = {"frame": "device", "clock": "pictures", "time_s": (at + late_s).tolist(), **quat}
+    (path := tmp_path / "log.json").write_text(json.dumps(log))
+    moved = load_attitude(path, info)
+    assert moved.time_s[0] == pytest.approx(at[0], abs=0.004)
+    assert moved.clock_sd_s == 0.005
+    assert "by the pictures' movement" in moved.source
+    path.write_text(json.dumps(log | {"clock": "video"}))
+    stays = load_attitude(path, info)
+    assert stays.time_s[0] == at[0] + late_s
+    assert np.isnan(stays.clock_sd_s)
+    path.write_text(json.dumps(log | {"clock": "sun"}))
+    assert "sun" in error_of(load_attitude, path, info).found
+
+
 def test_a_log_in_another_time_zone(tmp_path, folder, info):
     """The pictures tell that it is the right log; of one that moves otherwise the zone is named."""
     log = load_attitude(folder, recorded(info, BEGIN_S, zone_h=-5.5))

@@ -39,6 +39,8 @@ test("the log is on the video's clock, without what is far from it", () => {
   assert.deepEqual([time_s.indexOf(-0.1), time_s.indexOf(0.0205), time_s.indexOf(0.1)].map((i) => qw[i]), [2, 3, 4]);
   assert.ok(time_s[0] > -0.5);
   assert.equal(logOf(new Map(), 0, 1, PHONE), null);
+  const rows = [[1000, 1, 0, 0, 0], [1100, 1, 0, 0, 0]];
+  assert.equal(logOf(new Map([["orientation", { names: NAMES, rows }]]), 1000, 1100, PHONE)?.clock, "pictures");
 });
 
 test("readings of which a busy page hears late, or twice, stand in their order", () => {

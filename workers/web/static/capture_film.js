@@ -21,22 +21,24 @@ async function lock(track) {
       await track.applyConstraints({ advanced: [{ [mode]: "manual", ...Object.fromEntries(values.map((name) => [name, now[name]])) }] }).catch(() => {});
 }
 
-/** The frames of a camera as they come, with the time of the page at which each came. @param {HTMLVideoElement} video @param {MediaStreamTrack} track */
+/** The frames of a camera as they come; `captured`: time of the page at which the last was captured, where the frame itself does not say it. @param {HTMLVideoElement} video @param {MediaStreamTrack} track */
 function frames(video, track) {
   const Processor = /** @type {any} */ (globalThis).MediaStreamTrackProcessor;
   if (Processor) {
     const reader = new Processor({ track, maxBufferSize: 8 }).readable.getReader();
-    return { next: async () => (await reader.read()).value, end: () => reader.cancel().catch(() => {}) };
+    return { captured: undefined, next: async () => (await reader.read()).value, end: () => reader.cancel().catch(() => {}) };
   }
   let ended = false;
-  const next = () => new Promise((/** @type {(f: any) => void} */ done) => {
+  const source = { captured: /** @type {number|undefined} */ (undefined), next: () => Promise.resolve(), end: () => { ended = true; } };
+  source.next = () => new Promise((/** @type {(f: any) => void} */ done) => {
     const wait = setTimeout(() => done(undefined), 1500);
     video.requestVideoFrameCallback((now, about) => {
       clearTimeout(wait);
+      source.captured = about.captureTime;
       done(ended ? undefined : new VideoFrame(video, { timestamp: Math.round(1000 * (about.captureTime ?? 1000 * about.mediaTime)) }));
     });
   });
-  return { next, end: () => { ended = true; } };
+  return source;
 }
 
 /** @param {any} frame @param {number} rate */
@@ -116,7 +118,7 @@ export class Take {
       if (gap < 1.5 * usual) usual += 0.1 * (gap - usual);
       else if (gap > 0) usual += 0.02 * (gap - usual);  // a camera that slows down in the dark
       last = time;
-      const captured = frame.metadata?.().captureTime;
+      const captured = frame.metadata?.().captureTime ?? source.captured;
       apart = captured === undefined ? Math.min(apart, 1000 * now - time) : 1000 * captured - time;
       if (encoder.encodeQueueSize > MOST_WAITING) this.dropped += 1;
       else {

@@ -20,7 +20,7 @@ export function up([w, x, y, z]) {
  * @param {Map<string, {names: string[], rows: number[][]}>} samples @param {number} startMs @param {number} endMs @param {Record<string, string>} phone */
 export function logOf(samples, startMs, endMs, phone) {
   /** @type {Record<string, any>} */
-  const log = { frame: "device", phone };
+  const log = { frame: "device", clock: "pictures", phone };
   for (const [sensor, { names, rows }] of samples) {
     const kept = inOrder(rows, sensor === "orientation" ? endMs : -Infinity).filter((row) => row[0] > startMs - 500 && row[0] < endMs + 500);
     if (kept.length < 2) continue;
