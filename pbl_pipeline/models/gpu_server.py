@@ -136,7 +136,7 @@ class _Served:
                     self._drop(key.data)
                     continue
                 with self._changed:
-                    if self._images is not images or len(self._owners) != at:  # the batch was taken meanwhile
+                    if self._images is not images:  # the batch was taken meanwhile
                         self._images[0] = images[at]
                     self._owners.append(key.data)
                     self._changed.notify()
