@@ -112,8 +112,8 @@ def work(options: Options, pipe: Connection) -> None:
     import schemas
 
     if registry.FIT not in registry.GROUPS[options.resource]:
-        # A context on the GPU takes half a gigabyte and seconds, which pay for fits and, in one process of their own, for
-        # the networks of detection; not for the small programs of gait events.
+        # A context on the GPU takes half a gigabyte and seconds: that pays for fits and for the networks of detection,
+        # which have a process of their own, not for the small programs of gait events.
         import jax
 
         jax.config.update("jax_platforms", "cpu")
