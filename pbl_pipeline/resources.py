@@ -39,6 +39,9 @@ def return_large_blocks() -> bool:
 CORES = "PBL_CORES"
 #: Variables by which numerical libraries choose their number of threads when loaded: OpenMP, BLAS, XLA, OpenCV.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
+#: By this the GNU C library asks the kernel for large pages: of the time to keep a decoded picture, 1.1 of 1.4 ms went
+#: into one fault for each 4 KB (docs/benchmarks.md).
+_LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 #: Where the kernel shows control groups, and to which of them a process belongs.
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
@@ -66,13 +69,12 @@ def share_of_memory() -> float:
 
 @contextlib.contextmanager
 def shared_cores(processes: int) -> Iterator[None]:
-    """Let each of several processes that are started in this block use its share of the cores only. Variables of the
-    libraries that are set already stay."""
-    before = {name: os.environ.get(name) for name in (CORES, *_THREADS)}
+    """Let each of several processes that are started in this block use its share of the cores only, and large pages of
+    memory. Variables of the libraries that are set already stay."""
     share = str(max(1, cores() // processes))
-    os.environ[CORES] = share
-    for name in _THREADS:
-        os.environ.setdefault(name, share)
+    defaults = dict.fromkeys(_THREADS, share) | _LARGE_PAGES
+    before = {name: os.environ.get(name) for name in (CORES, *defaults)}
+    os.environ |= defaults | {name: value for name, value in before.items() if value is not None} | {CORES: share}
     try:
         yield
     finally:

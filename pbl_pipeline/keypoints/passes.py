@@ -13,7 +13,7 @@ import queue
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Thread
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -119,10 +119,12 @@ class ParallelInference:
     """Detectors at work in threads, one in each. Use as a context: leaving it drops what has not begun."""
 
     def __init__(self, detectors: Sequence[KeypointDetector], camera: Camera) -> None:
-        self._idle: queue.SimpleQueue[KeypointDetector] = queue.SimpleQueue()
+        self._idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
         for detector in detectors:
             self._idle.put(detector)
         self._camera = camera
+        # Asked once: to look through a protocol's members takes as long as cutting a crop.
+        self._by_crop, self._mirrors = (isinstance(detectors[0], kind) for kind in (CropDetector, MirrorDetector))
         self._pool = ThreadPoolExecutor(len(detectors), "keypoints")
         self.n_detectors = len(detectors)
 
@@ -139,12 +141,12 @@ class ParallelInference:
     def _detect(self, frame: Frame, roi_px: np.ndarray, inspection: Inspection) -> PersonKeypoints:
         detector, quick = self._idle.get(), inspection is Inspection.QUICK
         try:
-            if isinstance(detector, CropDetector):
-                crop = frame.cut(*detector.crop_of(roi_px))
-                if inspection in (Inspection.PLAIN, Inspection.MIRRORED) and isinstance(detector, MirrorDetector):
-                    return detector.detect_once(crop, roi_px, self._camera, mirrored=inspection is Inspection.MIRRORED)
-                return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
-            return detector.detect(frame.image, roi_px, self._camera, quick=quick)
+            if not self._by_crop:
+                return detector.detect(frame.image, roi_px, self._camera, quick=quick)
+            crop = frame.cut(*detector.crop_of(roi_px))
+            if self._mirrors and inspection in (Inspection.PLAIN, Inspection.MIRRORED):
+                return detector.detect_once(crop, roi_px, self._camera, mirrored=inspection is Inspection.MIRRORED)
+            return detector.detect_crop(crop, roi_px, self._camera, quick=quick)
         finally:
             self._idle.put(detector)
 

@@ -109,7 +109,9 @@ class _Served:
         self._program, self._device = program, device
         self._selector = selectors.DefaultSelector()
         self._changed = threading.Condition()
-        self._images, self._owners = self._empty(), list[socket.socket]()
+        # One batch is filled while the other is computed; new memory for each would cost more than receiving it.
+        self._images, self._spare = (np.zeros((program.batch, *program.image_shape), np.uint8) for _ in range(2))
+        self._owners = list[socket.socket]()
         self.n_connections = 0
         for work in (self._collect, self._compute):
             threading.Thread(target=work, daemon=True).start()
@@ -122,9 +124,6 @@ class _Served:
         """End all connections."""
         for connection in [key.data for key in self._selector.get_map().values()]:
             self._drop(connection)
-
-    def _empty(self) -> np.ndarray:
-        return np.zeros((self._program.batch, *self._program.image_shape), np.uint8)
 
     def _collect(self) -> None:
         """Receive pictures into the batch that is computed next."""
@@ -157,7 +156,7 @@ class _Served:
             with self._device:
                 with self._changed:  # what came while others computed, too
                     images, owners = self._images, self._owners
-                    self._images, self._owners = self._empty(), []
+                    self._images, self._owners = self._spare, []
                     self._changed.notify()
                 try:
                     found = self._program(images)
@@ -165,6 +164,7 @@ class _Served:
                     sys.stderr.write(f"the GPU does not compute: {error}\n")
                     sys.stderr.flush()
                     os._exit(1)
+            self._spare = images
             for owner, outputs in zip(owners, found, strict=False):
                 try:
                     owner.sendall(outputs.data)

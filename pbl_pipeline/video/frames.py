@@ -141,8 +141,10 @@ def _to_bgr(colorspace: int, full_range: bool) -> np.ndarray:
     return np.column_stack([matrix, -matrix @ black])
 
 
+@functools.cache
 def _from_upright(turn: Orientation, width: int, height: int) -> np.ndarray:
-    """(2, 3) matrix from pixel centres of the upright picture to those of the stored one, `width` x `height`."""
+    """(2, 3) matrix from pixel centres of the upright picture to those of the stored one, `width` x `height`; not to be
+    written to."""
     upright_width, upright_height = turn.size(width, height)
     x = [-1.0, 0.0, upright_width - 1.0] if turn.flip_x else [1.0, 0.0, 0.0]
     y = [0.0, -1.0, upright_height - 1.0] if turn.flip_y else [0.0, 1.0, 0.0]

@@ -19,8 +19,8 @@ def cut_image(image: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -
 def cut_samples(samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], border: float) -> np.ndarray:
     """Bilinear, after averaging blocks of 2^n x 2^n samples where the region's pixels lie that far apart: a pixel that
     stands for fifty and shows one of them would flicker."""
-    step = np.sqrt(abs(np.linalg.det(matrix[:, :2])))
-    block = 1 << max(0, math.floor(math.log2(max(step, 1.0))))
+    (a, b, _), (c, d, _) = matrix.tolist()
+    block = 1 << max(0, math.floor(math.log2(max(math.sqrt(abs(a * d - b * c)), 1.0))))
     if block > 1:
         samples, left, top = _needed(samples, matrix, size_px, block)
         if not samples.size:  # the region lies beyond the picture: any place there will do
@@ -41,20 +41,22 @@ def _needed(
     """The samples around the region, in whole blocks, and where they begin (x, y)."""
     width, height = size_px
     corners = matrix @ np.array([[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1], [1, 1, 1, 1]])
-    starts = np.floor(corners.min(axis=1) / block - 1).astype(int) * block
-    ends = np.ceil(corners.max(axis=1) / block + 2).astype(int) * block
-    (left, top), (right, bottom) = np.maximum(starts, 0), np.maximum(ends, 0)
-    return samples[top:bottom, left:right], int(left), int(top)
+    left, top = (max(math.floor(n / block - 1) * block, 0) for n in corners.min(axis=1).tolist())
+    right, bottom = (max(math.ceil(n / block + 2) * block, 0) for n in corners.max(axis=1).tolist())
+    return samples[top:bottom, left:right], left, top
 
 
+@functools.cache
 def coarser(x: int, y: int) -> np.ndarray:
-    """(2, 3) matrix from pixel centres to the centres of blocks of x by y of them."""
+    """(2, 3) matrix from pixel centres to the centres of blocks of x by y of them; not to be written to."""
     return np.array([[1 / x, 0.0, (1 / x - 1) / 2], [0.0, 1 / y, (1 / y - 1) / 2]])
 
 
 def square(matrix: np.ndarray) -> np.ndarray:
     """A matrix (2, 3) as one (3, 3) that others can follow."""
-    return np.vstack([matrix, [0.0, 0.0, 1.0]])
+    out = np.eye(3)
+    out[:2] = matrix
+    return out
 
 
 @dataclasses.dataclass(frozen=True)
