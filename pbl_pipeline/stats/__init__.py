@@ -1,4 +1,4 @@
-"""Statistics of a study, from repeatability to sample size (docs/statistics.md).
+"""Statistics of a study, from repeatability to responsiveness (docs/statistics.md).
 
 Pure functions on arrays and columns of data frames (matched by position, not by index). What comes as `pre, post` is
 compared as post - pre, what comes as `a, b` as a - b. Chance is drawn from `seed`. Values that cannot support a
@@ -15,7 +15,6 @@ from ._change import (
     bland_altman,
     cohens_dz,
     effect_size,
-    median_of_medians,
     niqr,
     srm,
     wilcoxon,
@@ -35,5 +34,4 @@ from ._groups import (
     shapiro_wilk,
 )
 from ._icc import ICC_INTERVALS, ICC_KINDS, Icc, icc, minimal_detectable_change, ratings_table
-from ._sample_size import DESIGNS, SampleSize, sample_size
 from .types import Estimate

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,25 +28,6 @@ def niqr(values: Any) -> float:
         raise refuse(f"{len(array)} value(s)", "at least 2", "a spread needs several trials")
     low, high = np.percentile(array, [25, 75])
     return float(NIQR_FACTOR * (high - low))
-
-
-def median_of_medians(errors: Sequence[Any]) -> tuple[float, float]:
-    """Median absolute error: the median within each trial, then over the trials; and the nIQR over the trials.
-
-    Raises `PblError` STATS_INPUT: a trial without errors, NaN, fewer than two trials.
-
-    Parameters
-    ----------
-    errors
-        Of each trial its errors, signed or not, (N_i,) in any unit. Two trials at least.
-    """
-    medians = []
-    for i, trial in enumerate(errors):
-        absolute = np.abs(numbers(trial, f"trial {i}"))
-        if not len(absolute):
-            raise refuse(f"trial {i} without errors", "one at least", "leave that trial out and report it")
-        medians.append(np.median(absolute))
-    return float(np.median(medians)) if medians else np.nan, niqr(medians)
 
 
 #: Bland and Altman's multiple of the standard deviation: 95 % of normal differences.
