@@ -262,7 +262,7 @@ class Worker:
             scope = self.only()
             found = refresh.refresh_scope(scope)
             self.found.add(found)
-            if found.queued or found.freed or found.planned:
+            if found.queued or found.freed:
                 return True
             held = [(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None]
             return None if any(len(jobs) for jobs in held) else False

@@ -100,7 +100,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         lately = None if everything else recent()
         if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
             lately = None
-        out = _refresh(chain.computed_tables(), lately)
+        out = _look(lately)
         if lately is None:
             _note_full_look()
         return out
@@ -120,17 +120,7 @@ def recent() -> Scope:
 def refresh_scope(scope: Scope) -> Refreshed:
     """`refresh` for some recordings alone, beside whoever looks at all: what of them can be computed is queued, what
     nobody asks for any more is taken out of the queues."""
-    out = Refreshed()
-    for table in chain.computed_tables():
-        out.freed += recover.free_dead(table)
-        if table is fit.SessionFit:
-            out.planned = plan(scope.sessions)
-        where = scope.where(table)
-        if where is not None:
-            out.swept += queue.sweep(table, f"status != 'reserved' AND {where}")
-            if n := queue.fill(table, where=where):
-                out.queued[table.__name__] = n
-    return out
+    return _look(scope, own=True)
 
 
 def queue_visit(session_id: int) -> None:
@@ -143,23 +133,26 @@ def queue_visit_of(video_id: int) -> None:
     queue_visit(int((video.Video & {"video_id": video_id}).fetch1("session_id")))
 
 
-def _refresh(tables: Sequence[Any], lately: Scope | None) -> Refreshed:
+def _look(scope: Scope | None, own: bool = False) -> Refreshed:
+    """Fill the queues with what of a scope (None: of all) can be computed. `own`: other recordings are left as they
+    are; else choices that a decision made outdated are dropped, and all queues are swept."""
     from schemas.tracking import drop_outdated_choices
 
-    out = Refreshed()
+    out, tables = Refreshed(), chain.computed_tables()
     for table in tables:
         out.freed += recover.free_dead(table)
-    out.dropped = Counter(drop_outdated_choices())
+    if not own:
+        out.dropped = Counter(drop_outdated_choices())
     for table in tables:
         if table is fit.SessionFit:
-            out.planned = plan(None if lately is None else lately.sessions)
+            out.planned = plan(None if scope is None else scope.sessions)
             out.queued += Counter({table.__name__: out.planned})
-        where = None if lately is None else lately.where(table)
-        if lately is not None and where is None:
+        where = None if scope is None else scope.where(table)
+        if where is not None or scope is None:
+            out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
+            out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
+        elif not own:
             out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
-            continue
-        out.swept += queue.sweep(table)
-        out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
     return out
 
 
