@@ -71,9 +71,8 @@ def check_fields(path: Path, title: str, sizes: dict[str, int], optional: tuple[
 
 def test_keypoints_are_as_described(detected):
     sizes = {"T": 90, "J": 33}
-    undocumented = check_fields(
-        detected, "<name>.keypoints.npz", sizes, optional=("phone_time_s", "phone_quat_wxyz", "xyz_world_m", "origin")
-    )
+    optional = ("phone_time_s", "phone_quat_wxyz", "phone_clock_sd_s", "xyz_world_m", "origin")
+    undocumented = check_fields(detected, "<name>.keypoints.npz", sizes, optional)
     assert undocumented <= {"root_relative"}  # named in the row of xyz_cam_m
     with np.load(detected) as f:
         assert f["time_s"][0] == 0

@@ -339,7 +339,8 @@ def test_report_indices_are_known_frames(walk) -> None:
 
 def test_fit_without_one_frame_gives_the_bare_video(walk, clip, tmp_path: Path) -> None:
     nothing = dataclasses.replace(walk, qpos=np.full_like(walk.qpos, np.nan))
-    assert probe(render_overlay(clip[0], nothing, tmp_path / "o.mp4")).n_frames == N
+    # Not by `probe`: without a body nothing but drawn, exactly straight lines is left, as on a screen.
+    assert len(list(read_frames(render_overlay(clip[0], nothing, tmp_path / "o.mp4")))) == N
 
 
 def test_keypoints_are_drawn_at_their_pixels(walk, clip) -> None:
