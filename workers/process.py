@@ -111,13 +111,6 @@ def work(options: Options, pipe: Connection) -> None:
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
 
-    if registry.FIT not in registry.GROUPS[options.resource]:
-        # A context on the GPU takes half a gigabyte and seconds: that pays for fits and for the networks of detection,
-        # which have a process of their own, not for the small programs of gait events.
-        import jax
-
-        jax.config.update("jax_platforms", "cpu")
-
     from . import heartbeat, loop, selftest
 
     stop = threading.Event()

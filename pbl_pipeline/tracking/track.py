@@ -60,9 +60,9 @@ def track_people(
     trails = [t for t in _follow(video_path, params, finder, info) if _is_real(t, params)]
     if params.exact_ends:
         frames = functools.partial(read_frames, video_path)
-        longest = max(params.watch.search_interval_s, params.watch.rest_interval_s)
-        sizes = params.watch.window_sizes
-        trails = with_exact_ends(trails, info.time_s, frames, longest, finder, sizes, params.association)
+        watch = params.watch
+        within_s = max(watch.search_interval_s, watch.rest_interval_s)
+        trails = with_exact_ends(trails, info.time_s, frames, within_s, finder, watch.window_sizes, params.association)
     people = join_trails(undo_swaps(trails, params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))

@@ -82,6 +82,9 @@ class Decoder:
     With `exact`, threads share one frame instead of taking one each. FFmpeg's H.264 decoder hands a frame on before
     another thread has found the damage in it, so that only then damage is certain to be seen (measured: with two frame
     threads a third of the runs missed a broken last picture). Frames and stamps of a sound file are the same.
+
+    Of an HEVC recording FFmpeg decodes damaged pictures without a word (0 of 24 changed files were noticed, 19 of 24 in
+    H.264): there only a lost end is seen.
     """
 
     def __init__(self, path: Path, threads: int | None = None, exact: bool = False) -> None:

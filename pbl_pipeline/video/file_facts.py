@@ -241,19 +241,15 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
             if len(stamps) % EVERY == 0:
                 borders.add(frame)
             stamps.append(pts)
-        if (widths := borders.widths()) is not None:
+        widths = borders.widths()
+        n_lines = borders.lines() if widths is None else 0
+        if widths is not None or n_lines:
             raise PblError(
                 "VIDEO_SCREEN",
-                found=f"borders of {widths[0]:.0%} and {widths[1]:.0%} of the picture at two opposite sides, which "
+                found=f"{n_lines} exactly straight lines around what moves, as of a screen's windows and bars"
+                if widths is None
+                else f"borders of {widths[0]:.0%} and {widths[1]:.0%} of the picture at two opposite sides, which "
                 "never change",
-                expected="the whole picture of a camera",
-                next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
-                key=path,
-            )
-        if n_lines := borders.lines():
-            raise PblError(
-                "VIDEO_SCREEN",
-                found=f"{n_lines} exactly straight lines around what moves, as of a screen's windows and bars",
                 expected="the whole picture of a camera",
                 next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
                 key=path,

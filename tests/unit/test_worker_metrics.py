@@ -181,7 +181,7 @@ class Bucket:
 
 
 class Written(Bucket):
-    """Somebody's bytes are in the bucket after each write."""
+    """Another writer's bytes are in the bucket after each write."""
 
     def __init__(self, content: bytes) -> None:
         super().__init__()
