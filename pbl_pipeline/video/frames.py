@@ -18,6 +18,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.sidedata.sidedata import SideDataContainer
 from av.video.reformatter import VideoReformatter
 
 from .decode import Decoder, check_file
@@ -66,7 +67,9 @@ def orientation_of(frame: av.VideoFrame) -> Orientation:
     The matrix [[a, b, u], [c, d, v], [x, y, w]] sends the stored point (p, q), p to the right and q down, to
     (a p + c q, b p + d q). Angles that are not multiples of 90 degrees are rounded to one (`exact` is then False).
     """
-    data = frame.side_data.get("DISPLAYMATRIX")
+    # `frame.side_data` would keep a reference back to the frame: only the collector of cycles frees such a frame, and
+    # until then FFmpeg keeps the memory of all pictures of the video.
+    data = SideDataContainer(frame).get("DISPLAYMATRIX")
     if data is None:
         return Orientation()
     a, b, _, c, d = (np.frombuffer(bytes(data), np.int32)[:5] / 65536.0).tolist()

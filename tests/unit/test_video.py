@@ -1,6 +1,7 @@
 """Probe and frames against files whose frames, stamps and damage are known, and against OpenCV as a second decoder."""
 
 import dataclasses
+import gc
 import hashlib
 import json
 import random
@@ -787,6 +788,23 @@ def test_a_released_one_and_one_without_room_are_decoded(monkeypatch: pytest.Mon
         monkeypatch.setattr(kept, "share_of_memory", lambda: 2e5)
         probe(video)
         assert decodes(monkeypatch, video)
+
+
+def test_released_pictures_do_not_wait_for_the_collector_of_cycles(video: Path) -> None:
+    def n_pictures() -> int:
+        return sum(isinstance(o, av.VideoFrame) for o in gc.get_objects())
+
+    gc.collect()
+    before = n_pictures()
+    gc.disable()
+    try:
+        with frames_kept():
+            probe(video)
+            pictures(video)
+            assert n_pictures() > before
+        assert n_pictures() == before
+    finally:
+        gc.enable()
 
 
 # --- Video files that lie about themselves: a result or a coded error, whatever their bytes say.
