@@ -23,7 +23,7 @@ _DASH = {"right": "none", "left": "7 3"}  # sides differ in print without colour
 _CYCLE_SIZE, _CYCLE_MARGIN = (280, 200), (36, 8, 8, 22)
 #: The plot of `compare_chart` in its view box: left, top, right and bottom; from left to right it is 0 to 100 %.
 CYCLE_PLOT = (_CYCLE_MARGIN[0], _CYCLE_MARGIN[1], _CYCLE_SIZE[0] - _CYCLE_MARGIN[2], _CYCLE_SIZE[1] - _CYCLE_MARGIN[3])
-#: Colour and dash of lines that are compared. They differ in grey, too, and none is that of a side (`SIDE_COLOUR`).
+#: Colour and dash of lines that are compared. They also differ in grey, and none is that of a side (`SIDE_COLOUR`).
 SERIES = (
     ("#22262b", "none"),
     ("#00835f", "7 3"),
