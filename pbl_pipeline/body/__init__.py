@@ -10,10 +10,10 @@ from pbl_pipeline import jax_setup
 jax_setup.configure()
 
 from pbl_pipeline.body._capsules import (  # noqa: E402
-    CapsuleFrames,
+    BodyFrames,
     Capsules,
     CapsuleShapes,
-    capsule_frames,
+    body_frames,
     capsule_shapes,
     capsules,
     stature_m,

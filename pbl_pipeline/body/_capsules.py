@@ -42,7 +42,7 @@ class CapsuleShapes:
 
 
 @dataclasses.dataclass(frozen=True)
-class CapsuleFrames:
+class BodyFrames:
     """`position_m` (T, B, 3) and `rotation` (T, B, 3, 3), body to world (z up); NaN where qpos is NaN."""
 
     position_m: np.ndarray
@@ -65,7 +65,7 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
 
     Ellipsoids are drawn as capsules side by side (see `_strands`). Kinematics by C MuJoCo, in double precision.
     """
-    shapes, at = capsule_shapes(body, scale), capsule_frames(body, qpos, scale)
+    shapes, at = capsule_shapes(body, scale), body_frames(body, qpos, scale)
 
     def world(points: np.ndarray) -> np.ndarray:
         return at.position_m[:, shapes.body] + np.einsum("tgij,gj->tgi", at.rotation[:, shapes.body], points)
@@ -100,7 +100,7 @@ def capsule_shapes(body: Body, scale: np.ndarray) -> CapsuleShapes:
     )
 
 
-def capsule_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> CapsuleFrames:
+def body_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> BodyFrames:
     """Where the bodies are at the poses `qpos` (T, 40) with scale multipliers (8,), by C MuJoCo in double precision."""
     own_scale = np.asarray(scale, np.float64)[body.scale_index]
     model = copy.copy(body.mj_model)
@@ -114,7 +114,7 @@ def capsule_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> CapsuleFr
             data.qpos[:] = pose
             mujoco.mj_kinematics(model, data)
             xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-    return CapsuleFrames(xpos, xmat)
+    return BodyFrames(xpos, xmat)
 
 
 @functools.cache

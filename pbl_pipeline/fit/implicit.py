@@ -93,7 +93,7 @@ class Data(eqx.Module):
 def solve_sessions(
     sessions: Sequence[Session], params: ImplicitAdamParams, starts: Sequence[State]
 ) -> list[Solution | PblError]:
-    """Fit sessions one after the other, from the paramset's own start; an error in the place of one that has none."""
+    """Fit sessions one after the other, from the paramset's own start; an error takes the place of a failed one."""
     out: list[Solution | PblError] = []
     for session in sessions:
         try:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import CapsuleShapes, capsule_frames, capsule_shapes, capsules, load_body
+from pbl_pipeline.body import CapsuleShapes, body_frames, capsule_shapes, capsules, load_body
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.checks import SD_WARN_DEG
 from pbl_pipeline.keypoints import Keypoints
@@ -49,7 +49,7 @@ def body_track(fit: TrialFit) -> BodyTrack:
     """
     body = load_body()
     check_body(fit, body)
-    at, shapes = capsule_frames(body, fit.qpos, fit.scale), capsule_shapes(body, fit.scale)
+    at, shapes = body_frames(body, fit.qpos, fit.scale), capsule_shapes(body, fit.scale)
     known = np.flatnonzero(np.asarray(np.isfinite(at.position_m).all(axis=(1, 2)), bool))
     n, parent = len(body.body_names), np.asarray(body.parent_index)
     quat = np.full((len(at.position_m), n, 4), np.nan)

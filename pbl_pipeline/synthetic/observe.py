@@ -5,17 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import mujoco  # pyright: ignore[reportMissingTypeStubs]
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body, marker_set
+from pbl_pipeline.body import SCALE_NAMES, MarkerSet, body_frames, load_body, marker_set
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
 from .camera import PhoneSensor, phone_log, picture_px
 from .noise import Noise
-from .physique import scaled_model
 
 
 def true_markers(
@@ -28,16 +26,9 @@ def true_markers(
     body, markers = load_body(), as_marker_set(markers)
     scale = np.ones(len(SCALE_NAMES)) if scale is None else np.asarray(scale, np.float64)
     offset = 0.0 if site_offset_m is None else np.asarray(site_offset_m, np.float64)
-    model = scaled_model(scale)
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    xpos, xmat = np.empty((len(qpos), len(body.body_names), 3)), np.empty((len(qpos), len(body.body_names), 9))
-    for t, q in enumerate(np.asarray(qpos, np.float64)):
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:]
-    at = markers.body_index
+    frames, at = body_frames(body, qpos, scale), markers.body_index
     local = scale[body.scale_index[at]][:, None] * (markers.position_m + offset)
-    return xpos[:, at] + np.einsum("tjab,jb->tja", xmat.reshape(*xmat.shape[:2], 3, 3)[:, at], local)
+    return frames.position_m[:, at] + np.einsum("tjab,jb->tja", frames.rotation[:, at], local)
 
 
 def as_marker_set(markers: str | MarkerSet) -> MarkerSet:

@@ -1,4 +1,4 @@
-"""Why a solver ended."""
+"""Reason why a solver ended."""
 
 from __future__ import annotations
 
