@@ -45,7 +45,7 @@ def _telling(items: Iterable[T], total: int | None, told: Callable[[int, int | N
 
 @contextmanager
 def bar(label: str, total: int | None = None, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """A bar for work that is not an iteration; yields `update(n=1, note="", total=None)`, where a total is a new one."""
+    """A bar for work that is not an iteration; yields `update(n=1, note="", total=None)`; `total` changes the total."""
     with tqdm(desc=label, total=total, unit=unit, disable=not _enabled, **_style()) as b:
 
         def update(n: int = 1, note: str = "", total: int | None = None) -> None:

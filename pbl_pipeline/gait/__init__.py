@@ -1,7 +1,7 @@
 """Gait: feet, events, cycles, spatiotemporal measures and the Gait Deviation Index, of three angles or nine.
 
-Each step is a function of its own with a frozen result: `feet_from_fit` or `feet_from_keypoints`, `detect_events`,
-`find_cycles`, `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
+Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keypoints`, `detect_events`, `find_cycles`,
+`spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
 """
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles

@@ -1,4 +1,4 @@
-"""Normative gait: what a cycle is compared with."""
+"""Normative gait, with which cycles are compared."""
 
 from ._schwartz import GRAVITY, GaitNorm, gait_norm, harmonic_sum
 from .norm import (
