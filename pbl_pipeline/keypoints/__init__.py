@@ -1,4 +1,4 @@
-"""Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
+"""Keypoints of the tracked person from any detector, views of several cameras, and markers of a laboratory."""
 
 from .blazepose import BlazePoseLandmarks
 from .detect import detect_keypoints

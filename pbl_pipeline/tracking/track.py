@@ -135,8 +135,8 @@ def _confirmed(
 ) -> Detection | None:
     """Detect a new person again, in a window around a detection that fits no known person; None if that fails.
 
-    A single window anywhere cannot distinguish a new person from a poor view of a known one, who may be cut or too small
-    in it. A window around the person must find her again, at about the same position, away from known people.
+    A single window anywhere cannot distinguish a new person from a poor view of a known one, who may be cut or small in
+    it. A window around the person must find her again, at about the same position, away from known people.
     """
     known = [t.predict(time_s) for t in live]
     if any(_near(measure(new), k) for k in known):
