@@ -92,7 +92,7 @@ def _exactly(value: Any, kind: type) -> Any:
     """Return `value` if it has this type already; an int passes for a float, as people and databases write 1.0 as 1."""
     wanted = (int, float) if kind is float else kind
     if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
-        raise TypeError(f"{value!r} is not a {kind.__name__}")
+        raise TypeError(f"{value!r} is not of type {kind.__name__}")
     return kind(value)
 
 
