@@ -1,4 +1,4 @@
-"""A visit with everything that was computed of it, and its folder of files.
+"""A visit with all its results, and its folder of files.
 
 `pipeline.run_visit` makes a `Visit` from videos, `load_visit` reads it from its folder, and `schemas.load_visit` from
 the tables. Report, overlay, exports and web pages take a `Visit` and compute nothing themselves.
