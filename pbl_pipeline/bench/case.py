@@ -20,7 +20,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.validation import JOINTS_PAPER
 
 from .data import read_keypoints, read_truth, sessions
-from .machine import machine, peak_rss
+from .machine import peak_rss, write_result
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, SessionFit, TrialFit
@@ -84,13 +84,8 @@ def main(judge: Judge | None = None) -> None:
     """Measure the case of the command line and write its result; `judge` instead of `accuracy_of`."""
     spec = json.loads(sys.argv[1])
     case = {k: spec["case"][k] for k in ("method", "batch", "repeat", "camera_motion")}
-    try:
-        result = measure(Path(spec["folder"]), spec["stage"], spec["started"], **case, judge=judge or accuracy_of)
-    except PblError as error:
-        result = {"error": error.code, "error_text": error.text()}
-    except Exception as error:  # noqa: BLE001 - the table shows what went wrong in a case and goes on
-        result = {"error": type(error).__name__, "error_text": str(error)}
-    Path(spec["result"]).write_text(json.dumps(result | machine()), encoding="utf-8")
+    folder, judge = Path(spec["folder"]), judge or accuracy_of
+    write_result(spec["result"], lambda: measure(folder, spec["stage"], spec["started"], **case, judge=judge))
 
 
 def measure(
@@ -124,7 +119,7 @@ def measure(
         seconds.append(time.perf_counter() - begin)
     for group in groups[1:]:
         fits |= _fitted({session: read_keypoints(session) for session in group}, chosen, camera_motion)
-    # Before anything else is computed, so that it is the fit's own.
+    # Before anything else is computed, so that it is that of the fit.
     out |= {"warm_seconds": min(seconds), "warm_seconds_each": seconds, "n_sessions": len(fits)} | memory()
     good = {session: fit for session, fit in fits.items() if not isinstance(fit, PblError)}
     out |= _failures(fits) | (judge(good) if good else {})
@@ -144,7 +139,6 @@ def memory() -> dict[str, Any]:
 
 def accuracy_of(fits: Mapping[Path, SessionFit]) -> dict[str, Any]:
     """Return the mean over all trials of `trial_accuracy` as `accuracy`."""
-
     pairs = [p for session, fit in fits.items() for p in zip(fit.trials, read_truth(session), strict=True)]
     return {"accuracy": summary([trial_accuracy(trial, truth) for trial, truth in pairs])}
 
@@ -152,7 +146,7 @@ def accuracy_of(fits: Mapping[Path, SessionFit]) -> dict[str, Any]:
 def _fitted(
     trials: Mapping[Path, Sequence[Keypoints]], method: Method[Params], camera_motion: str
 ) -> dict[Path, SessionFit | PblError]:
-    """The fits of some sessions, of several together; an error of one session is its result."""
+    """Fit some sessions, several together; an error of one session is its result."""
     from pbl_pipeline import fit
 
     names = {session: [f"trial{k}" for k in range(len(of))] for session, of in trials.items()}
@@ -175,9 +169,7 @@ def _failures(fits: Mapping[Path, SessionFit | PblError]) -> dict[str, Any]:
 
 
 def _against_one(session: Path, together: SessionFit | PblError, trials: Any, *how: Any) -> dict[str, Any]:
-    """The largest difference (rad) of a session of a batch to the same session fitted alone."""
-    import numpy as np
-
+    """Largest difference (rad) between a session fitted in a batch and the same session fitted alone."""
     alone = _fitted({session: trials[session]}, *how)[session]
     if isinstance(alone, PblError) or isinstance(together, PblError):
         return {}

@@ -132,10 +132,10 @@ def visit_kinetics(
     mass_kg: float | None = None,
     aid: str = "",
 ) -> Kinetics:
-    """Return the kinetics of a visit's trials, `gait` being what was measured of each of `fits`.
+    """Return the kinetics of a visit's trials; `gait`: the measures of each of `fits`.
 
-    `mass_kg`: the person's mass, kept with the result. `aid`: the walking aid as it was stated; with one that may carry
-    weight there are no forces.
+    `mass_kg`: the person's mass, stored with the result. `aid`: the stated walking aid; with one that may carry weight
+    forces are not computed.
     """
     trials = tuple(trial_kinetics(f, g, method.params, aid=aid) for f, g in zip(fits, gait, strict=True))
     pooled = [t for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None]

@@ -21,9 +21,9 @@ from jaxtyping import Float
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.body import SCALE_NAMES, load_body
+from pbl_pipeline.body import SCALE_NAMES, load_body, scaled_model
 
-from .physique import SOLE_M, scaled_model
+from .physique import SOLE_M
 from .plan import GRID_STEP_S, Plan, Step, pelvis_joints
 
 #: Points of the sole in the frames of their bodies (right side; m, unscaled): those that the contact holds.
@@ -218,7 +218,7 @@ class _Soles:
 
     def __init__(self, scale: Float[np.ndarray, " 8"]) -> None:
         body = load_body()
-        self._model = scaled_model(scale)
+        self._model = scaled_model(body, scale)
         self._data = mujoco.MjData(self._model)
         self.names, ids, local, size = [], [], [], []
         for side, sign in (("r", 1.0), ("l", -1.0)):
