@@ -1,7 +1,7 @@
 """Bounded reading of untrusted files, whatever size they claim to have.
 
-A small file can unpack to gigabytes, and a few bytes of text become large objects. Whatever its content, a file that is
-read here takes less than 1 GiB of memory; `MAX_ARRAYS` takes the most, because callers copy the numbers once or twice.
+A small file can unpack to gigabytes, and a few bytes of text become large objects. Any file that is read here takes
+less than 1 GiB of memory; `MAX_ARRAYS` takes the most, because callers copy the numbers once or twice.
 
 All functions raise OSError if a file cannot be opened or read, and ValueError, with a message, if its content is
 refused. The reader of each format adds the error code.

@@ -75,7 +75,7 @@ CODES: dict[str, str] = {
     "BACKUP_INVALID": "a backup is incomplete or was changed",
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
     "WORKER_CRASH": "a job took its worker's process down more than once",
-    "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
+    "DECIDED_MEANWHILE": "another person decided, or it was computed again, since the page was loaded",
     "WEB_NOT_MADE": "a file that the review page was making was not finished",
     "WEB_REFUSED": "a request to the review page may not be answered: no session, no right, or a form of another page",
     "WEB_PORT": "the review page cannot listen on that port",

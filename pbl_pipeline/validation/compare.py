@@ -329,12 +329,12 @@ CURVE_COLUMNS = ("trial", "cycle", "side", "joint", "percent", "fit_deg", "refer
 def cycle_curves(
     fit: TrialFit, reference: Reference, cycles: Iterable[GaitCycle], errors: KinematicErrors | None = None
 ) -> pd.DataFrame:
-    """Each joint of fit and reference at 0, 1, ..., 100 % of each gait cycle, side by side, in degrees.
+    """Each joint of fit and reference at 0, 1, ..., 100 % of each gait cycle, in degrees.
 
-    One row per cycle, joint and phase (`CURVE_COLUMNS`). Both are read at the same moments: those of the cycle in the
-    video, less the lag for the reference. A cycle holds the joints of its own side and those of the middle; `joint` is
+    One row per cycle, joint and phase (`CURVE_COLUMNS`). Both are taken at the same times: those of the cycle in the
+    video, minus the lag for the reference. A cycle has the joints of its side and those of the middle; `joint` is
     without side. Cubic splines through the samples; a cycle in which fit or reference lacks a joint for longer than
-    0.1 s has no pair for that joint. Angles of the pelvis against the world are left out: the worlds differ.
+    0.1 s has no pair for that joint. Angles of the pelvis in the world are omitted: the worlds differ.
 
     Raises `PblError` REFERENCE_INPUT, GAIT_INPUT as `compare`.
 
