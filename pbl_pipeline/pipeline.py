@@ -183,7 +183,7 @@ def measured(
     return dataclasses.replace(visit.with_measures(measures), kinetics=kinetics)
 
 
-def write_results(out: Path, visit: Visit, title: str = "Gait report", language: str = LANGUAGES[0]) -> list[Path]:
+def write_results(out: Path, visit: Visit, language: str = LANGUAGES[0]) -> list[Path]:
     """Write all results of a visit into `out` and return the paths, the report first.
 
     The files of `visit.save_visit`, `<name>.overlay.mp4` of each recording whose video is known, and `report.html`
@@ -197,7 +197,7 @@ def write_results(out: Path, visit: Visit, title: str = "Gait report", language:
         overlays = [out / f"{r.name}.{OVERLAY}" for r in filmed]
         for recording, path in zip(filmed, overlays, strict=True):
             draw_overlay(recording, path)
-        report = write_visit_report(out / REPORT, shown, title, language)
+        report = write_visit_report(out / REPORT, shown, language=language)
     return [report, *(p for p in overlays if p.exists()), *save_visit(visit, out)]
 
 

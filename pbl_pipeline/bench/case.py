@@ -27,25 +27,22 @@ if TYPE_CHECKING:
     from pbl_pipeline.keypoints import Keypoints
     from pbl_pipeline.methods import Method
 
-#: The joints of the paper's validation (Statistics): hips, knees, ankles, lumbar, neck, shoulders without rotation,
-#: elbows.
+#: Joints of the paper's validation (Statistics): hips, knees, ankles, lumbar, neck, shoulders without rotation, elbows.
 PAPER_JOINTS = tuple(joint_of(angle)[0] for angle in JOINTS_PAPER)
 MAIN_JOINTS = tuple(j for j in PAPER_JOINTS if j.startswith(("hip_", "knee_", "ankle_", "lumbar_")))
 
 
-def joint_errors_deg(
-    fitted_rad: np.ndarray, true_rad: np.ndarray, joint_names: Sequence[str], wanted: Sequence[str] = PAPER_JOINTS
-) -> dict[str, float]:
-    """Median absolute error (deg) over the frames of one trial of each joint; frames without a result do not count.
+def joint_errors_deg(fitted_rad: np.ndarray, true_rad: np.ndarray, joint_names: Sequence[str]) -> dict[str, float]:
+    """Median absolute error (deg) of each of `PAPER_JOINTS` over the frames of one trial that have a result.
 
-    fitted_rad, true_rad : (T, 40) in the order of `joint_names`. NaN where no frame has a result.
+    fitted_rad, true_rad : (T, 40) in the order of `joint_names`. NaN if no frame has a result.
     """
     known = np.all(np.isfinite(fitted_rad), axis=1)
     if not known.any():
-        return dict.fromkeys(wanted, float("nan"))
+        return dict.fromkeys(PAPER_JOINTS, float("nan"))
     names = list(joint_names)
     error = np.rad2deg(np.abs(fitted_rad[known] - true_rad[known]))
-    return {n: float(np.median(error[:, names.index(n)])) for n in wanted}
+    return {n: float(np.median(error[:, names.index(n)])) for n in PAPER_JOINTS}
 
 
 def mean_over(errors: dict[str, float], joints: Sequence[str]) -> float:

@@ -237,10 +237,8 @@ def find_cycles(
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 
 
-def cycle_curves(
-    series: AngleSeries, side: str, start_s: float, end_s: float, percent: np.ndarray = REPORT_PERCENT
-) -> tuple[dict[str, np.ndarray], str]:
-    """Curves of one side at `percent` of the time from `start_s` to `end_s`, in degrees, and the reason if missing.
+def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -> tuple[dict[str, np.ndarray], str]:
+    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if missing.
 
     Interpolation is monotone cubic (PCHIP) between the frames' own time stamps. Frames missing for longer than
     `MAX_CURVE_GAP_S` inside the cycle, or at its ends, give no curves.
@@ -256,7 +254,7 @@ def cycle_curves(
     if np.max(np.diff(time[first : last + 1])) > MAX_CURVE_GAP_S:
         return {}, f"frames are missing for more than {MAX_CURVE_GAP_S:g} s"
     part = slice(max(0, first - 2), last + 3)
-    at = start_s + percent / 100.0 * (end_s - start_s)
+    at = start_s + REPORT_PERCENT / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
     return dict(zip(table, curves.T, strict=True)), ""
 

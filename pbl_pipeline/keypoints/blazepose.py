@@ -96,12 +96,11 @@ class BlazePoseLandmarks:
         model_path: str | Path,
         agree_mm: float = 100.0,
         agree_width_mm: float = 20.0,
-        num_threads: int = 1,
         sha256: str = MODEL_SHA256,
         quick_path: str | Path | None = None,
     ) -> None:
         def load(path: str | Path, sha256: str) -> Network:
-            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=num_threads)
+            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=1)
 
         self._model = load(model_path, sha256)
         self._quick = load(quick_path, MODEL_SHA256) if quick_path else self._model

@@ -125,7 +125,8 @@ class StudyData:
                 raise invalid(f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side", name)
         _check_units(self.measures, "measures", "measure")
         _check_units(self.curves, "curves", "variable")
-        _check_index(self.measures)
+        if ((self.measures["measure"] == "gdi") & (self.measures["side"] == "both")).any():
+            raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
         _check_scores(self.scores, self.instruments)
 
     @property
@@ -218,11 +219,6 @@ def _check_units(frame: Any, name: str, what: str) -> None:
     units = frame.groupby(what, sort=False)["unit"].nunique()
     if len(odd := units[units > 1]):
         raise invalid(f"{what} {odd.index[0]} in {odd.iloc[0]} units", "one unit", "convert the values", name)
-
-
-def _check_index(measures: Any) -> None:
-    if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
-        raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
 
 
 def _check_scores(scores: Any, instruments: Any) -> None:

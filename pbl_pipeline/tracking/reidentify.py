@@ -204,7 +204,8 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
             continue
         alike, best = ranked[0]
         # Others who left before, and those who are in view at the same time and so certainly another person.
-        present = [t for t in trails if t not in best and any(_together(t, mine) for mine in (trail, *best))]
+        spans = [(mine.times[0], mine.times[-1]) for mine in (trail, *best)]
+        present = [t for t in trails if t not in best and any(t.times[0] <= b and a <= t.times[-1] for a, b in spans)]
         rivals = [a for a, _ in ranked[1:]] + [
             appearance_similarity(appearance(t), appearance(trail)) for t in present if t is not trail
         ]
@@ -214,10 +215,6 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
         else:
             people.append([trail])
     return [_whole(*p) for p in people]
-
-
-def _together(a: Trail, b: Trail) -> bool:
-    return a.times[0] <= b.times[-1] and b.times[0] <= a.times[-1]
 
 
 def _appearance(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:

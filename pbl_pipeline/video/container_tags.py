@@ -158,7 +158,7 @@ def read_tags(path: Path) -> Tags:
     speeds: tuple[float, ...] = ()
     for name, box in _boxes(moov):
         if name == b"trak":
-            if not speeds and not tracks and _is_video(box):
+            if not speeds and not tracks and _find(box, b"mdia", b"hdlr")[8:12] == b"vide":
                 tracks, speeds = _items(box), _speeds(box)
         elif name == b"meta":
             items |= _meta(box)
@@ -197,10 +197,6 @@ def _find(data: memoryview, *names: bytes) -> memoryview:
     for wanted in names:
         data = next((box for name, box in _boxes(data) if name == wanted), data[:0])
     return data
-
-
-def _is_video(trak: memoryview) -> bool:
-    return _find(trak, b"mdia", b"hdlr")[8:12] == b"vide"
 
 
 def _items(data: memoryview, depth: int = _DEEPEST) -> dict[str, str]:
