@@ -48,7 +48,7 @@ class Asset:
 
     @property
     def path(self) -> Path:
-        """Where the file is kept on this machine, present or not."""
+        """Path of the file on this machine, present or not."""
         return folder() / (self.file or Path(self.member).name)
 
 
@@ -82,7 +82,7 @@ def needed() -> list[str]:
 
 
 def folder() -> Path:
-    """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
+    """Folder of the assets: `assets` in the user's cache folder (PBL_CACHE), created when absent.
 
     Raises `PblError` ASSET_MISSING: the folder cannot be made.
     """

@@ -167,7 +167,7 @@ def cycle_chart(
     foot_off_percent
         side -> mean percent of the cycle at which the foot leaves the ground.
     norm
-        percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+        percent (Q,), mean (Q,), sd (Q,) in degrees; None if there is none.
     faint
         The side whose curves are less certain.
     unit, least
@@ -210,7 +210,7 @@ def compare_chart(
         Mean (P,) and sd (P,) in degrees, drawn as `SERIES` has it at the same place; NaN where the sd is not known,
         None for a visit without this curve. At most `len(SERIES)`.
     norm
-        percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+        percent (Q,), mean (Q,), sd (Q,) in degrees; None if there is none.
     reference
         Place of the curve that is drawn thicker.
     faint

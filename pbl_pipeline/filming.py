@@ -1,4 +1,4 @@
-"""How the walks of a visit were filmed, and how that differs between two visits: compare only visits filmed alike."""
+"""Filming conditions of the walks of a visit, and their differences between two visits, which must be filmed alike."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _VIEWS = {"right": "left", "left": "right"}  # the camera is on the other side o
 
 @dataclasses.dataclass(frozen=True)
 class Filming:
-    """How the pooled walks of a visit were filmed. Each field is sorted, and empty if it is not known.
+    """Filming conditions of the pooled walks of a visit. Each field is sorted, and empty if it is not known.
 
     views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: as stated of
     the visit, none where nothing is; paces: of the walks; height: whether the body height was stated ("stated" or

@@ -114,7 +114,7 @@ class Provider(Protocol[P_co]):
         ...
 
     def params(self, name: str) -> P_co | None:
-        """The parameters of the method of that name as it is now; None where this machine has none of that name.
+        """The parameters of the method of that name as it is now; None if this machine has none of that name.
 
         Raises `PblError` where it has one that cannot be used.
         """
@@ -238,7 +238,7 @@ class Stage(Mapping[str, Method[P]]):
         return [*self, *(self._provider.names() if self._provider else ())]
 
     def registered(self, name: str) -> Method[P] | None:
-        """The registered method of that name or key; None where there is none."""
+        """The registered method of that name or key; None if there is none."""
         return ({m.key: m for m in self.values()} | self._methods).get(name)
 
     def _named(self, name: str) -> Method[P]:

@@ -27,7 +27,7 @@ def enable(on: bool = True) -> None:
 
 
 def enabled() -> bool:
-    """Whether bars are drawn."""
+    """True if bars are drawn."""
     return _enabled
 
 

@@ -83,10 +83,10 @@ def deidentify_how() -> str:
 
 
 def audit_looks() -> bool:
-    """Whether each viewing of a recording in the review page has to leave a row."""
+    """True if each viewing of a recording in the review page has to leave a row."""
     return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")
 
 
 def offline() -> bool:
-    """Whether nothing may be fetched."""
+    """True if nothing may be fetched."""
     return os.environ.get("PBL_OFFLINE", "") not in ("", "0")

@@ -16,7 +16,7 @@ FPS = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What is observed: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz."""
+    """Simulated data: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz."""
 
     n_trials: int = 1
     n_sessions: int = 3

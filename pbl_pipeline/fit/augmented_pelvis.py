@@ -60,7 +60,7 @@ def with_augmented_pelvis(
 
 
 def folds(body: Body, qpos: Float[np.ndarray, "T Q"]) -> bool:
-    """Whether the person sits or squats for a part of the time."""
+    """True if the person sits or squats for a part of the time."""
     knees = -qpos[:, [body.joint_names.index(n) for n in ("knee_angle_r", "knee_angle_l")]].max(axis=1)
     return bool(np.mean(knees > FOLDED_RAD) > FOLDED_SHARE)
 

@@ -57,7 +57,7 @@ class Draw(eqx.Module):
 
 
 class Data(eqx.Module):
-    """What does not change: F frames and N trials with M phone samples each, all padded.
+    """Constants of the problem: F frames and N trials with M phone samples each, all padded.
 
     code: the encoded times of all frames, then of all phone samples (row F + i M + k). order: numbers of the frames
     that count, trial after trial; first, count: where each trial's lie in it. phone_count: samples that count, the

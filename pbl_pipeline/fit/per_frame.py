@@ -224,7 +224,7 @@ def floors_of(body: Body, sd_floor: Sequence[tuple[str, float]]) -> np.ndarray:
 
 
 def suspicious(session: Session, qpos: Float[np.ndarray, "F Q"]) -> bool:
-    """Whether the body may face the wrong way, unseen in pixels alone: knees then stay at their straight end."""
+    """True if the body may face the wrong way, unseen in pixels alone: knees then stay at their straight end."""
     if pixels_alone(session.problem):
         return True
     used = np.asarray(session.problem.weight) > 0

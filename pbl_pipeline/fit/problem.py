@@ -95,7 +95,7 @@ class Problem:
 
     @property
     def moving(self) -> bool:
-        """Whether a camera turns and its orientation was measured."""
+        """True if a camera turns and its orientation was measured."""
         return self.sample_quat_wxyz.shape[-2] > 0
 
     def split(self, x: Any) -> tuple[Any, Any, Any]:
@@ -317,6 +317,6 @@ def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:
 
 
 def pixels_alone(problem: Problem) -> bool:
-    """Whether one camera without 3D points is the only observation."""
+    """True if one camera without 3D points is the only observation."""
     none = lambda c: not np.any(np.asarray(c) > 0)  # noqa: E731
     return none(problem.c_3d) and none(problem.c_world) and problem.c_2d.shape[1] == 1

@@ -170,7 +170,7 @@ def _mean_seen(confidence: np.ndarray) -> np.ndarray:
 
 
 def has_3d(trial: Keypoints) -> bool:
-    """Whether the trial has any 3D points."""
+    """True if the trial has any 3D points."""
     frames = zip(trial.xyz_cam_m, trial.confidence, strict=True)  # one by one: mostly the first one decides
     return any(np.isfinite(x[c > 0]).any() for x, c in frames)
 

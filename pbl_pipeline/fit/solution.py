@@ -59,7 +59,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the solver ended at a minimum."""
+        """True if the solver ended at a minimum."""
         return self.result.converged
 
 

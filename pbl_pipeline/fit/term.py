@@ -47,7 +47,7 @@ class Phone(NamedTuple):
 
 class At(NamedTuple):
     """Arguments of the terms: the frames of a problem, the parameters, the unknowns, and the markers and
-    soles where the unknowns put them in the world (m). `phone`: None where no camera turns."""
+    soles where the unknowns put them in the world (m). `phone`: None if no camera turns."""
 
     problem: Problem
     weights: Weights
@@ -142,7 +142,7 @@ class Term:
         return weight_of(self, at) * self.frames(at)
 
     def empty(self, at: At) -> bool:
-        """Whether the problem has no data for the term."""
+        """True if the problem has no data for the term."""
         return jnp.size(self.count(at)) == 0
 
     def _of_frames(self, at: At, cost: Float[Array, "F ..."]) -> Float[Array, " F"]:

@@ -43,7 +43,7 @@ class NormalBands:
     licence: str
 
     def words(self) -> str:
-        """How the bands were matched, as the end of a sentence."""
+        """Matching of the bands, as the end of a sentence."""
         if not self.matched:
             return "at the speed that they choose"
         limit = (

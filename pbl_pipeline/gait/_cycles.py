@@ -67,7 +67,7 @@ def without_missed_steps(cycles: Sequence[GaitCycle], feet: FootTrajectories | N
 
 
 def foot_passes(feet: FootTrajectories, start_s: float, end_s: float) -> int | None:
-    """Return how often the feet pass each other from `start_s` to `end_s`; None where they are hardly seen.
+    """Return how often the feet pass each other from `start_s` to `end_s`; None if they are hardly seen.
 
     Counted about the middle of the range of the heels' distance along the heading, so that a foot that is always
     placed behind the other one passes it as well.

@@ -30,7 +30,7 @@ UNSEEN = "too few frames of the standing foot"
 
 
 def is_metric(fit: TrialFit) -> bool:
-    """Whether the metres of a fit were measured: by several calibrated cameras or a laboratory's markers."""
+    """True if the metres of a fit were measured: by several calibrated cameras or a laboratory's markers."""
     return fit.orientation_source == "measured: calibration"
 
 
@@ -75,7 +75,7 @@ def cycle_lengths(
 def where_feet_stand(cycles: Sequence[GaitCycle], slides: Sequence[float | None]) -> list[GaitCycle]:
     """Return the cycles of a trial, without lengths where its standing feet slide (`MAX_SLIDE`).
 
-    `slides`: of each cycle what `cycle_lengths` returned, None where it has no lengths.
+    `slides`: of each cycle what `cycle_lengths` returned, None if it has no lengths.
     """
     known = [s for s in slides if s is not None]
     if not known or np.median(known) <= MAX_SLIDE:

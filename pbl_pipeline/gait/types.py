@@ -110,7 +110,7 @@ class Condition:
 
     @property
     def walks(self) -> bool:
-        """Whether the activity is walking."""
+        """True if the activity is walking."""
         return self.activity == UNKNOWN or any(word in self.activity for word in _WALKING)
 
     @property
@@ -121,7 +121,7 @@ class Condition:
         return SELF_SELECTED if self.pace == UNKNOWN else self.pace
 
     def pooled(self, pace: str) -> bool:
-        """Whether a method with this pace pools the trial."""
+        """True if a method with this pace pools the trial."""
         return bool(self.pool) and pace in (ANY_PACE, self.pool)
 
     def __str__(self) -> str:
@@ -147,7 +147,7 @@ class Exclusion:
     failed_checks: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether there is a reason."""
+        """True if there is a reason."""
         return self != Exclusion()
 
     @property
@@ -225,7 +225,7 @@ class GaitCycle:
 
     @property
     def used(self) -> bool:
-        """Whether the cycle takes part in the measures."""
+        """True if the cycle takes part in the measures."""
         return not self.exclusion
 
     @property
@@ -235,17 +235,17 @@ class GaitCycle:
 
     @property
     def odd_length(self) -> bool:
-        """Whether the cycle is left out because of its length."""
+        """True if the cycle is left out because of its length."""
         return self.exclusion.length_ratio is not None
 
     @property
     def odd_curves(self) -> bool:
-        """Whether the cycle is left out because of its curves."""
+        """True if the cycle is left out because of its curves."""
         return self.exclusion.curve_distance_deg is not None
 
     @property
     def check_failed(self) -> bool:
-        """Whether the cycle is left out because a check of its recording failed."""
+        """True if the cycle is left out because a check of its recording failed."""
         return bool(self.exclusion.failed_checks)
 
     @property

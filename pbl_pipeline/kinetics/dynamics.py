@@ -37,22 +37,16 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """Forces that a motion needs, per kilogram of the person, at N times; world frame, z up.
+    """Forces of a motion, per kilogram of the person, at N times; world frame, z up."""
 
-    force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
-    (N/kg, Nm/kg). centre_m (N, 3): of mass. generalised (N, Q): what each joint value would need if
-    that force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B,
-    3, 3).
-    """
-
-    force_n: np.ndarray
-    moment_nm: np.ndarray
-    centre_m: np.ndarray
-    generalised: np.ndarray
-    axis: np.ndarray
-    anchor_m: np.ndarray
-    xpos: np.ndarray
-    xmat: np.ndarray
+    force_n: np.ndarray  # (N, 3) external force without gravity, N/kg
+    moment_nm: np.ndarray  # (N, 3) its moment about the world's origin, Nm/kg
+    centre_m: np.ndarray  # (N, 3) centre of mass
+    generalised: np.ndarray  # (N, Q) generalised forces if that force acted on the pelvis, Nm/kg and N/kg
+    axis: np.ndarray  # (N, Q, 3) of each joint
+    anchor_m: np.ndarray  # (N, Q, 3) of each joint
+    xpos: np.ndarray  # (N, B, 3)
+    xmat: np.ndarray  # (N, B, 3, 3)
 
 
 def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz: float) -> list[Motion]:

@@ -73,18 +73,13 @@ FRICTION = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class GroundReaction:
-    """Of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known.
+    """Ground reaction of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known."""
 
-    contact (N, 2): 1 on the floor, 0 in the air. force_n (N, 2, 3), 0 in the air; centre_m (N, 2, 3): of pressure, NaN
-    in the air. residual_n, residual_nm (N, 3): of what the motion needs, the force and the moment about the centre of
-    mass that no foot carries.
-    """
-
-    contact: np.ndarray
-    force_n: np.ndarray
-    centre_m: np.ndarray
-    residual_n: np.ndarray
-    residual_nm: np.ndarray
+    contact: np.ndarray  # (N, 2) 1 on the floor, 0 in the air
+    force_n: np.ndarray  # (N, 2, 3) 0 in the air
+    centre_m: np.ndarray  # (N, 2, 3) of pressure, NaN in the air
+    residual_n: np.ndarray  # (N, 3) force that no foot carries
+    residual_nm: np.ndarray  # (N, 3) moment about the centre of mass that no foot carries
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ CADENCE = "cadence_plausible"
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A named check. `value` and `threshold` are in the unit that `check` names; None where none applies."""
+    """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 
     check: str
     outcome: str

@@ -225,7 +225,7 @@ _FONT_NAME = "sans"  # OpenCV carries this font itself
 
 
 class Event(Protocol):
-    """What is drawn of a gait event: `side` "left" or "right", `event` "foot_down" or "foot_up"."""
+    """Fields of a gait event that are drawn: `side` "left" or "right", `event` "foot_down" or "foot_up"."""
 
     @property
     def time_s(self) -> float: ...

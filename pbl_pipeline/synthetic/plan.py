@@ -161,18 +161,18 @@ class Step:
 
     @property
     def heel_s(self) -> tuple[float, float]:
-        """When the heel is on the floor."""
+        """Time with the heel on the floor."""
         return self.down_s + 0.12 * self.forefoot * self.nominal_s, self.up_s - HEEL_OFF_BEFORE * self.nominal_s
 
     @property
     def ball_s(self) -> tuple[float, float]:
-        """When the ball of the foot is on the floor."""
+        """Time with the ball of the foot on the floor."""
         flat = 0.0 if self.forefoot > 0 else FLAT_AFTER
         return self.down_s + flat * self.nominal_s, self.up_s - BALL_OFF_BEFORE * self.nominal_s
 
     @property
     def toe_s(self) -> tuple[float, float]:
-        """When the toes are on the floor: they leave it last."""
+        """Time with the toes on the floor, which leave it last."""
         return self.ball_s[0], self.up_s
 
 

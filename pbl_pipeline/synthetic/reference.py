@@ -165,7 +165,7 @@ def reference(
 
 
 def _shape(rng) -> tuple[float, ...]:
-    """How a person's curve differs in shape: a harmonic sum without a mean, in standard deviations of the norm."""
+    """Difference of a person's curve in shape: a harmonic sum without a mean, in standard deviations of the norm."""
     return (0.0, *(within(rng, 0.0, SHAPE_SHARE) for _ in range(2 * SHAPE_HARMONICS)))
 
 

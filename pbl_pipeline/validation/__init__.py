@@ -1,4 +1,4 @@
-"""How far a fit is from a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
+"""Comparison of a fit with a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
 
 from .align import align_path, best_lag
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched

@@ -125,7 +125,7 @@ class KinematicErrors:
 
     @property
     def lag_at_limit(self) -> bool:
-        """Whether the best lag is the largest that was tried: the true one may be larger."""
+        """True if the best lag is the largest that was tried: the true one may be larger."""
         return self.max_lag_s > 0 and abs(self.lag_s) >= self.max_lag_s - 1e-9
 
     def joint(self, name: str) -> JointError:
@@ -383,7 +383,7 @@ def save_curves(frame: pd.DataFrame, path: str | Path) -> Path:
 
 
 def _curve(time_s: np.ndarray, angle_deg: np.ndarray, at_s: np.ndarray) -> np.ndarray | None:
-    """(101,) degrees at `at_s`, or None where samples are missing for longer than `MAX_GAP_S` or at an end."""
+    """(101,) degrees at `at_s`, or None if samples are missing for longer than `MAX_GAP_S` or at an end."""
     known = np.isfinite(angle_deg)
     time, angle = np.asarray(time_s, float)[known], np.asarray(angle_deg, float)[known]
     first, last = np.searchsorted(time, at_s[0], side="right") - 1, np.searchsorted(time, at_s[-1], side="left")

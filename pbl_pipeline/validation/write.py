@@ -38,7 +38,7 @@ def paper_cells(table: str) -> dict[str, dict[str, str]]:
 
 
 def paper_where(table: str) -> str:
-    """Where in the paper a table's figures stand; empty where it has none."""
+    """Place of a table's figures in the paper; "" if it has none."""
     return paper_figures().get(table, {}).get("where", "")
 
 
@@ -77,7 +77,7 @@ class Table:
 
     @property
     def where(self) -> str:
-        """Where in the paper the figures beside ours stand; empty where there are none."""
+        """Place of the compared figures in the paper; "" if there are none."""
         return paper_where(self.name)
 
     def cell(self, row: str, column: str) -> Cell:

@@ -45,7 +45,7 @@ class Quadratic(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """When the iteration ends, as data: after a step in which no unknown of a frame moved further than `step`, or three
+    """End of the iteration, as data: after a step in which no unknown of a frame moved further than `step`, or three
     in a row whose gain was below the fraction `gain` of the cost, or `iterations` steps.
     """
 
@@ -57,7 +57,7 @@ class Limits:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Where the iteration stands: the best state with its cost and quadratic model (`latest`), and the state to try
+    """State of the iteration: the best state with its cost and quadratic model (`latest`), and the state to try
     next. trace: the cost after each iteration.
     """
 

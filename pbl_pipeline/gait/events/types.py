@@ -108,7 +108,7 @@ class GaitEvents:
 
     @property
     def corrected(self) -> bool:
-        """Whether a person corrected the detected events."""
+        """True if a person corrected the detected events."""
         return any(c.check == "events_by_hand" for c in self.qc)
 
     def times(self, side: str, event: str) -> list[float]:

@@ -65,7 +65,7 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
 
 
 def turns(grid: Grid, phases: Phases, params: WalkingParams) -> Bool[np.ndarray, " N"]:
-    """Whether the person turns instead of walking on, of each frame."""
+    """True if the person turns instead of walking on, of each frame."""
     if params.max_turn_deg_per_stride:
         return np.abs(turn_deg_per_stride(grid, phases)) > params.max_turn_deg_per_stride
     return np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s
