@@ -14,15 +14,7 @@ from .in_view import (
 )
 from .marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from .methods import METHODS
-from .multi_view import (
-    MOST_MISS_M,
-    SAME_TIME_S,
-    MultiView,
-    cameras_of_files,
-    check_same_times,
-    check_views_agree,
-    ray_miss_m,
-)
+from .multi_view import MOST_MISS_M, MultiView, cameras_of_files, check_same_times, check_views_agree, ray_miss_m
 from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from .picture import Picture, PictureMeter
 from .protocol import KeypointDetector, KeypointParams

@@ -5,24 +5,9 @@ compared as post - pre, arguments `a, b` as a - b. Random numbers are drawn from
 statistic raise `PblError` STATS_INPUT; no function drops values.
 """
 
-from ._change import (
-    LIMIT_SD,
-    MIN_PERSONS,
-    NIQR_FACTOR,
-    BlandAltman,
-    Srm,
-    Wilcoxon,
-    bland_altman,
-    cohens_dz,
-    effect_size,
-    niqr,
-    srm,
-    wilcoxon,
-)
+from ._change import BlandAltman, Srm, Wilcoxon, bland_altman, cohens_dz, effect_size, niqr, srm, wilcoxon
 from ._curves import CURVE_METHODS, CurveTest, Phase, curve_test
 from ._groups import (
-    CORRECTIONS,
-    CORRELATIONS,
     Correlation,
     MannWhitney,
     Test,

@@ -125,7 +125,8 @@ class StudyData:
                 raise invalid(f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side", name)
         _check_units(self.measures, "measures", "measure")
         _check_units(self.curves, "curves", "variable")
-        if ((self.measures["measure"] == "gdi") & (self.measures["side"] == "both")).any():
+        measures: Any = self.measures
+        if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
             raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
         _check_scores(self.scores, self.instruments)
 

@@ -6,7 +6,6 @@ the tables. Report, overlay, exports and web pages take a `Visit` and compute no
 
 from .files import (
     FIT,
-    KINETICS,
     METRICS,
     OVERLAY,
     REPORT,
@@ -21,4 +20,4 @@ from .files import (
     visit_facts,
     visit_of_fits,
 )
-from .types import Held, Recording, Solution, Visit, stage_checks
+from .types import Held, Recording, Solution, Visit
