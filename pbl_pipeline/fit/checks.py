@@ -162,7 +162,7 @@ def _height(session: Session, scale: np.ndarray, taller: float | None) -> list[C
             taller,
             SCALE_HIGH if taller > 1 else SCALE_LOW,
             "the stated height is far from what is seen (value: their ratio): a mistyped height, another person, or a "
-            "child, whom a phone's detector takes for an adult and on whom nobody has measured its index",
+            "child, whom a phone's detector takes for an adult, and whose index was never validated",
         ),
     ]
 
@@ -223,7 +223,7 @@ def _assumed(session: Session) -> list[Check]:
     if not fields:
         return []
     advice = (
-        f"the keypoints do not state {', '.join(fields)}: a lens without distortion, a camera that nobody measured and "
+        f"the keypoints do not state {', '.join(fields)}: a lens without distortion, an unmeasured camera and "
         "the box around the points stand for them; write the fields (docs/files.md)"
     )
     return [Check("keypoints_fields_assumed", WARN, float(len(fields)), 0.0, advice)]

@@ -192,8 +192,8 @@ class Plan:
     on_path: Float[np.ndarray, " N"]
     speed_m_per_s: Float[np.ndarray, " N"]  # (N,) along the way, which sets how much of a walk the legs and arms do
     steps: tuple[Step, ...]  # all stances, in order of foot down
-    #: angle -> (N,) of both sides where nobody walks: hip_flexion, knee_flexion, ankle_angle, tilt, lumbar_extension,
-    #: arm_flex, elbow_flex; missing ones are those of standing.
+    #: angle -> (N,) of both sides while the person does not walk: hip_flexion, knee_flexion, ankle_angle, tilt,
+    #: lumbar_extension, arm_flex, elbow_flex; missing ones are those of standing.
     posture_deg: dict[str, np.ndarray]
 
     def moved(self, yaw_rad: float, to_m: tuple[float, float]) -> Plan:

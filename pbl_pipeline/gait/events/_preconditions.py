@@ -69,7 +69,7 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
             return grid, f"the {side} foot is never seen", "film from where both legs are in view"
     height = check_upright(grid)
     if height < MIN_HIP_HEIGHT:
-        said = f"the hips are {height:.2f} leg lengths above the feet: nobody stands"
+        said = f"the hips are {height:.2f} leg lengths above the feet: no one is standing"
         return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
     if np.mean(seated(grid)[hips]) > SEATED_SHARE:
         said = "the person sits: the hips are hardly ever as high above the lower foot as a standing person's"
