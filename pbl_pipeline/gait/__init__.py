@@ -5,7 +5,7 @@ Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keyp
 """
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
-from ._bands import AdultRanges, NormalBands, adult_ranges, curve_frame, leg_length_m, normal_bands
+from ._bands import CURVE_FRAME_COLUMNS, AdultRanges, NormalBands, adult_ranges, curve_frame, leg_length_m, normal_bands
 from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
