@@ -153,21 +153,21 @@ def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     first, last = np.flatnonzero(seen)[[0, -1]]
     absent = 1.0 - float(np.mean(seen[first : last + 1]))
     return [
-        _check(
+        _limit_check(
             "frames_seen_s",
             seconds,
             SECONDS_WARN,
             0.0,
             "fewer than about three strides are in view: film a longer walk",
         ),
-        _check(
+        _limit_check(
             "whole_person_s",
             shown.counts_s,
             SECONDS_WARN,
             SECONDS_FAIL,
             f"{shown.text()}: keep head and feet in the picture, step back or film a longer walk",
         ),
-        _check(
+        _limit_check(
             "frames_without_person_share",
             absent,
             ABSENT_WARN,
@@ -193,13 +193,13 @@ def _cut(keypoints: Keypoints) -> list[Check | None]:
     ):
         if points.any() and seen.any():
             cut = at_border & ~found[:, points].all(axis=1)
-            checks.append(_check(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
+            checks.append(_limit_check(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
     whole = found[:, feet].any(axis=1) & found[:, head].any(axis=1)
     if whole.any():
         points = np.where(found[whole][..., None], xy[whole], np.nan)
         extent = np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
         checks.append(
-            _check(
+            _limit_check(
                 "body_height_px",
                 float(np.median(extent.max(axis=1))),
                 HEIGHT_WARN_PX,
@@ -216,14 +216,14 @@ def _picture(keypoints: Keypoints) -> list[Check | None]:
     if picture is None or not len(picture.time_s):
         return []
     return [
-        _check(
+        _limit_check(
             "picture_brightness",
             picture.bright,
             BRIGHT_WARN,
             BRIGHT_FAIL,
             "the person is too dark: switch lights on, and do not film against a window",
         ),
-        _check(
+        _limit_check(
             "picture_detail_share",
             picture.detail_share,
             DETAIL_WARN,
@@ -240,7 +240,7 @@ def _rate(time_s: np.ndarray) -> Check | None:
         return None
     rate = 1.0 / interval_s
     advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
-    return _check("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
+    return _limit_check("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
 
 
 def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
@@ -250,11 +250,11 @@ def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
         return []
     advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
     mean = float(keypoints.confidence[seen][:, legs].mean())
-    found = [_check("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
+    found = [_limit_check("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
     probability = probability_within(keypoints)
     if probability is not None:
         fraction = float(probability[seen][:, legs].mean())
-        found.append(_check("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
+        found.append(_limit_check("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
     return found
 
 
@@ -263,14 +263,14 @@ def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
         return []
     changes = float(len(side_changes(keypoints)))
     advice = "left and right change places between frames: look at the overlay; film from the side"
-    found = [_check("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    found = [_limit_check("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
     if keypoints.sides_changed is not None:
         fraction = float(keypoints.sides_changed[seen].any(axis=1).mean())
         advice = (
             "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
             "the movement now: look at the overlay, film in better light or more from the side"
         )
-        found.append(_check("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+        found.append(_limit_check("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
     return found
 
 
@@ -287,7 +287,7 @@ def side_changes(keypoints: Keypoints) -> np.ndarray:
     return rows[1:][turned & (np.diff(keypoints.time_s[rows]) <= _LONGEST_STEP_S)]
 
 
-def _check(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+def _limit_check(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
     """Check of a value that should be high (`warn` above `fail`) or low (`warn` below it); None if it is not known."""
     if not np.isfinite(value):
         return None

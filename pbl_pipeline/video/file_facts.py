@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import av
-import cv2
 import numpy as np
 
 from pbl_pipeline import progress
@@ -116,8 +115,9 @@ class BorderMeter:
         """Add a frame; all have one size."""
         scale = _SIDE_PX / max(frame.width, frame.height)
         size = max(2, round(frame.width * scale)), max(2, round(frame.height * scale))
-        self._last = frame.reformat(format="gray").to_ndarray()
-        grey = cv2.resize(self._last, size, interpolation=cv2.INTER_AREA).astype(np.int16)
+        full = frame.reformat(format="gray")
+        self._last = full.to_ndarray()
+        grey = full.reformat(*size, interpolation="AREA").to_ndarray().astype(np.int16)
         if not self._n:
             # Of the first and last row, and of the first and last column: a border keeps its colour.
             self._colours = np.array([np.median(grey[[0, -1]]), np.median(grey[:, [0, -1]])])[:, None, None]
