@@ -48,13 +48,13 @@ class Asset:
 
     @property
     def path(self) -> Path:
-        """Where the file is kept on this machine, present or not."""
+        """Path of the file on this machine, present or not."""
         return folder() / (self.file or Path(self.member).name)
 
 
 @dataclasses.dataclass(frozen=True)
 class AssetStatus:
-    """What is known of an asset without fetching: `state` is "ok", "missing" or "changed" (other bytes than pinned)."""
+    """State of an asset on this machine: "ok", "missing" or "changed" (other bytes than pinned)."""
 
     asset: Asset
     path: Path
@@ -82,7 +82,7 @@ def needed() -> list[str]:
 
 
 def folder() -> Path:
-    """Where assets are kept: `assets` in the user's cache folder (PBL_CACHE), created when absent.
+    """Folder of the assets: `assets` in the user's cache folder (PBL_CACHE), created when absent.
 
     Raises `PblError` ASSET_MISSING: the folder cannot be made.
     """
@@ -103,7 +103,7 @@ def fetch(name: str) -> Path:
     ------
     PblError
         ASSET_MISSING: it is not here and cannot be fetched (PBL_OFFLINE, no network, no pip or npm, no space).
-        ASSET_CHECKSUM: what came, or what was put there, is not the pinned file.
+        ASSET_CHECKSUM: the file that was downloaded, or placed in the folder, is not the pinned one.
     KeyError
         No asset has that name.
     """
@@ -111,8 +111,9 @@ def fetch(name: str) -> Path:
     if _is_pinned(asset.path, asset.sha256):
         return asset.path
     try:
-        with _one_at_a_time():
-            if not _is_pinned(asset.path, asset.sha256):  # another process may have brought it meanwhile
+        # Others wait. Without file locks each process fetches, which is slower but as safe.
+        with one_process(folder() / ".lock"):
+            if not _is_pinned(asset.path, asset.sha256):  # another process may have fetched it meanwhile
                 _bring(asset)
     except OSError as error:
         raise _unwritable(error) from error
@@ -227,13 +228,6 @@ def _checksum(what: str, found: str, expected: str, next_step: str) -> PblError:
     return PblError(
         "ASSET_CHECKSUM", found=f"SHA-256 {found}", expected=f"SHA-256 {expected}", next_step=next_step, key=what
     )
-
-
-@contextlib.contextmanager
-def _one_at_a_time() -> Iterator[None]:
-    """Let one process fetch while others wait for it. Without file locks both fetch, which is slower but as safe."""
-    with one_process(folder() / ".lock"):
-        yield
 
 
 @contextlib.contextmanager

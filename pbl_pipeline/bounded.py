@@ -1,11 +1,10 @@
-"""Reading of files from outside with bounds: what a file claims of its own size is not believed.
+"""Bounded reading of untrusted files, whatever size they claim to have.
 
-A small file can unpack to gigabytes, and few bytes of text become large objects. Whatever its content, a file that is
-read here takes less than 1 GiB; what takes the most is `MAX_ARRAYS`, whose numbers are copied once or twice by those
-who convert them.
+A small file can unpack to gigabytes, and a few bytes of text become large objects. Any file that is read here takes
+less than 1 GiB of memory; `MAX_ARRAYS` takes the most, because callers copy the numbers once or twice.
 
-All functions raise OSError where a file cannot be opened or read, and ValueError, in words, where its content is
-refused. Who reads a format adds the code.
+All functions raise OSError if a file cannot be opened or read, and ValueError, with a message, if its content is
+refused. The reader of each format adds the error code.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ MAX_TEXT = 32 * MIB
 MAX_ROWS = 500_000
 #: Columns of a table, as many as a sheet of a workbook can have; and its cells, empty ones included.
 MAX_COLUMNS, MAX_CELLS = 16_384, 2_000_000
-#: From the first to the last time stamp of a recording (s): what lies between them is put on even grids.
+#: From the first to the last time stamp of a recording (s), which is resampled to even grids.
 MAX_SECONDS = 3600.0
 #: Bytes of a TOML file, a hundred cameras: its reader takes the square of the number of a key's parts.
 MAX_TOML = MIB // 32
@@ -46,7 +45,7 @@ MAX_CONTAINERS, MAX_DEPTH = 1_000_000, 32
 #: Bytes of the arrays that are read from one .npz, each number counted as 8: 87 markers and 40 joints for 16 minutes at
 #: 60 Hz.
 MAX_ARRAYS = 256 * MIB
-#: Bytes of a text in an array as an object of its own, at least.
+#: Least bytes of a text in an array as a Python object.
 _STRING = 128
 #: Bytes of an archive's directory: some ten thousand members.
 _MAX_DIRECTORY = MIB
@@ -57,7 +56,7 @@ _LONG_NUMBER = re.compile(r"\d{309}")
 _LARGEST_INT = 10**308
 _HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
 
-#: What the readers of packed files raise for damaged ones; RuntimeError: one with a password.
+#: Errors that readers of packed files raise for damaged ones; RuntimeError: for one with a password.
 DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, gzip.BadGzipFile)
 
 
@@ -77,7 +76,7 @@ def read_bytes(path: str | Path, at_most: int) -> bytes:
 
 
 def read_start(path: str | Path, n: int) -> bytes:
-    """The first `n` bytes of a regular file, fewer where it has no more."""
+    """The first `n` bytes of a regular file, fewer of a shorter one."""
     with _opened(path) as file:
         return file.read(n)
 
@@ -87,9 +86,9 @@ def read_text(path: str | Path, at_most: int = MAX_TEXT) -> str:
     return read_bytes(path, at_most).decode("utf-8-sig")
 
 
-def read_json(path: str | Path, at_most: int = MAX_TEXT) -> Any:
+def read_json(path: str | Path) -> Any:
     """The content of a JSON file, as `parse_json` takes it."""
-    return parse_json(read_text(path, at_most))
+    return parse_json(read_text(path))
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -244,8 +243,7 @@ def _npy_header(data: bytearray) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     read = np.lib.format.read_array_header_1_0 if size == 2 else np.lib.format.read_array_header_2_0
     try:
         shape, fortran, dtype = read(io.BytesIO(bytes(data[8:start])))
-    # NumPy reads it as Python's own syntax: whatever that stumbles over.
-    except Exception as error:
+    except Exception as error:  # NumPy parses it as Python source and raises anything
         raise ValueError(f"a header that makes no sense ({type(error).__name__})") from error
     if len(shape) > 8 or any(isinstance(n, bool) or n < 0 for n in shape) or max(shape, default=0) > MAX_ARRAYS:
         raise ValueError(f"shape {shape}"[:100])

@@ -23,7 +23,7 @@ _DASH = {"right": "none", "left": "7 3"}  # sides differ in print without colour
 _CYCLE_SIZE, _CYCLE_MARGIN = (280, 200), (36, 8, 8, 22)
 #: The plot of `compare_chart` in its view box: left, top, right and bottom; from left to right it is 0 to 100 %.
 CYCLE_PLOT = (_CYCLE_MARGIN[0], _CYCLE_MARGIN[1], _CYCLE_SIZE[0] - _CYCLE_MARGIN[2], _CYCLE_SIZE[1] - _CYCLE_MARGIN[3])
-#: Colour and dash of lines that are compared. They differ in grey, too, and none is that of a side (`SIDE_COLOUR`).
+#: Colour and dash of lines that are compared. They also differ in grey, and none is that of a side (`SIDE_COLOUR`).
 SERIES = (
     ("#22262b", "none"),
     ("#00835f", "7 3"),
@@ -167,7 +167,7 @@ def cycle_chart(
     foot_off_percent
         side -> mean percent of the cycle at which the foot leaves the ground.
     norm
-        percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+        percent (Q,), mean (Q,), sd (Q,) in degrees; None if there is none.
     faint
         The side whose curves are less certain.
     unit, least
@@ -210,7 +210,7 @@ def compare_chart(
         Mean (P,) and sd (P,) in degrees, drawn as `SERIES` has it at the same place; NaN where the sd is not known,
         None for a visit without this curve. At most `len(SERIES)`.
     norm
-        percent (Q,), mean (Q,), sd (Q,) in degrees; None where there is none.
+        percent (Q,), mean (Q,), sd (Q,) in degrees; None if there is none.
     reference
         Place of the curve that is drawn thicker.
     faint

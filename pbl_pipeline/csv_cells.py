@@ -1,7 +1,7 @@
-"""Cells of tables that are written for spreadsheets, which compute a text that begins like a formula.
+"""Cells of tables for spreadsheets, which evaluate a text that begins like a formula.
 
-`=HYPERLINK(...)` as the label of a visit or the name of a file must not be computed where a table is opened. Such texts
-are written after an apostrophe, which spreadsheets take as the mark of a text; numbers stay numbers.
+`=HYPERLINK(...)` as the label of a visit or the name of a file must not be evaluated when a table is opened. Such texts
+are written after an apostrophe, by which spreadsheets recognise a text; numbers stay numbers.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ CODES: dict[str, str] = {
     "BACKUP_INVALID": "a backup is incomplete or was changed",
     "TIME_LIMIT": "a job took longer than a worker gives it and was ended",
     "WORKER_CRASH": "a job took its worker's process down more than once",
-    "DECIDED_MEANWHILE": "somebody else decided, or it was computed anew, since the page was loaded",
+    "DECIDED_MEANWHILE": "another person decided, or it was computed again, since the page was loaded",
     "WEB_NOT_MADE": "a file that the review page was making was not finished",
     "WEB_REFUSED": "a request to the review page may not be answered: no session, no right, or a form of another page",
     "WEB_PORT": "the review page cannot listen on that port",
@@ -94,13 +94,13 @@ class PblError(Exception):
     code
         One of `CODES`.
     found
-        What is the case, concretely ("the file holds 0 bytes").
+        The facts, concretely ("the file holds 0 bytes").
     expected
-        What would have been right ("an MP4, MOV or WebM video").
+        The valid input ("an MP4, MOV or WebM video").
     next_step
-        What the reader can do now ("copy the file from the phone again").
+        The reader's remedy ("copy the file from the phone again").
     key
-        What it is about: a path (kept as text), a table key, a frame.
+        The object at fault: a path (kept as text), a table key, a frame.
 
     A module whose errors have parts in common makes them by `functools.partial(PblError, code, next_step=...)`.
     """
@@ -122,11 +122,11 @@ class PblError(Exception):
         return "\n".join(lines)
 
     def short(self) -> str:
-        """Return code and what was found on one line: what a result that lacks something says of it."""
+        """Return code and `found` on one line, as the reason that a result is missing."""
         return f"{self.code}: {harmless(self.found, lines=False)}"
 
     def about(self, key: object) -> PblError:
-        """This error where it says what it is about, else the same about `key`: who reads several files knows which."""
+        """Return this error, about `key` unless it already has a key: a reader of several files names the one."""
         return self if self.key is not None else self.with_key(key)
 
     def with_key(self, key: object) -> PblError:
@@ -139,7 +139,7 @@ class PblError(Exception):
 
 @contextlib.contextmanager
 def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -> Iterator[None]:
-    """Raise an OSError of the block as a `PblError`; found is what the system says."""
+    """Raise an OSError of the block as a `PblError`; `found` is the system's message."""
     try:
         yield
     except OSError as error:
@@ -147,9 +147,9 @@ def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -
 
 
 def harmless(text: str, lines: bool = True) -> str:
-    """Text with control characters written out: a name from outside must not move the reader's cursor, nor (without
+    """Text with control characters escaped: a name from outside must not move the reader's cursor, nor (without
     `lines`) begin a line that looks like ours."""
     kept = "\n" if lines else ""
-    # Control, format (direction of writing), lone surrogates (bytes that are no text), separators of lines, paragraphs.
+    # Control, format (direction of writing), lone surrogates (undecoded bytes), separators of lines, paragraphs.
     odd = ("Cc", "Cf", "Cs", "Zl", "Zp")
     return "".join(c.encode("unicode_escape").decode() if category(c) in odd and c not in kept else c for c in text)

@@ -1,4 +1,4 @@
-"""Packages that only some need: imported when they are used, with a coded error where they are not installed."""
+"""Optional packages: imported when they are used, with a coded error if they are not installed."""
 
 from __future__ import annotations
 

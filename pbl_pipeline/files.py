@@ -44,7 +44,7 @@ def fields_of(path: str | Path) -> frozenset[str]:
 
 @contextmanager
 def one_process(path: Path, timeout_s: float = math.inf) -> Iterator[None]:
-    """Let one process in at a time, by a lock of the file `path`; where the system has no such locks, all.
+    """Let one process in at a time, by a lock of the file `path`; without file locks (Windows), all.
 
     Raises
     ------

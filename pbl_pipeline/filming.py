@@ -1,4 +1,4 @@
-"""How the walks of a visit were filmed, and whether two visits were filmed alike: only such can be compared."""
+"""Filming conditions of the walks of a visit, and their differences between two visits, which must be filmed alike."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 
-#: A side counts as a view from this fraction of the cycles of a recording on (a turn at the end is not a view), front
-#: or back from the other: a pass along the camera begins and ends obliquely.
+#: Least fraction of a recording's cycles that makes a side a view (a turn at the end is not one), and that makes front
+#: or back one: a pass along the camera's axis begins and ends obliquely.
 SIDE_SHARE, FRONT_SHARE = 0.25, 0.5
 #: The view from the front or the back, in which neither leg is behind the other.
 FRONT_OR_BACK = "front_or_back"
 VIEW = "view"
-#: What `differences` compares, in its order.
+#: Properties that `differences` compares, in its order.
 WHAT = ("aid", "orthosis", "pace", "height", "camera", "picture", VIEW)
 #: Lowest number of pixels of the shorter side of a picture, and what such pictures are called.
 _PICTURES = ((1400, "2160p"), (900, "1080p"), (600, "720p"), (0, "480p"))
@@ -22,7 +22,7 @@ _VIEWS = {"right": "left", "left": "right"}  # the camera is on the other side o
 
 @dataclasses.dataclass(frozen=True)
 class Filming:
-    """How the pooled walks of a visit were filmed. Each is sorted, and empty where it is not known.
+    """Filming conditions of the pooled walks of a visit. Each field is sorted, and empty if it is not known.
 
     views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: as stated of
     the visit, none where nothing is; paces: of the walks; height: whether the body height was stated ("stated" or
@@ -42,7 +42,7 @@ class Filming:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """What was not alike in two visits, one of `WHAT`, with its values now and before."""
+    """A property, one of `WHAT`, that differs between two visits, with its values now and before."""
 
     what: str
     now: tuple[str, ...] = ()
@@ -54,8 +54,8 @@ class Difference:
 
 
 def differences(now: Filming, before: Filming) -> tuple[Difference, ...]:
-    """Return what was not alike when two visits were filmed. What is not known of one of them is not compared, but an
-    aid or orthosis that is stated of one visit alone differs."""
+    """Return the differences in how two visits were filmed. A property that is unknown in one of them is not compared,
+    except that an aid or orthosis stated in one visit alone is a difference."""
     pairs = zip(WHAT, _compared(now), _compared(before), strict=True)
     return tuple(
         Difference(what, a, b) for what, a, b in pairs if a != b and ((a and b) or what in ("aid", "orthosis"))

@@ -25,9 +25,9 @@ FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
 def configure() -> None:
     """Set JAX up for the fit and the networks of detection. Call before the first array; idempotent.
 
-    Compiled programs are kept in `jax/` of the user's cache folder; JAX's own environment variables win: what
-    `JAX_COMPILATION_CACHE_DIR` or `JAX_PERSISTENT_CACHE_*` say, or a program set in `jax.config` before, stays. So do
-    XLA's flags that are set. Precision stays JAX's default, float32.
+    Compiled programs are kept in `jax/` of the user's cache folder. JAX's own settings win: those of
+    `JAX_COMPILATION_CACHE_DIR` and `JAX_PERSISTENT_CACHE_*`, those that a program made in `jax.config` before, and XLA
+    flags that are set. Precision stays JAX's default, float32.
     """
     # JAX makes its options attributes at run time, which a type checker cannot see.
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
@@ -35,7 +35,7 @@ def configure() -> None:
             folder = settings.cache_dir() / "jax"
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            # A cache only saves time: a read-only home is no reason to refuse the work, but worth a word.
+            # A cache only saves time: with a read-only home the work goes on, with a warning.
             warnings.warn(f"compiled programs are not kept, every start compiles anew: {error}", stacklevel=2)
         else:
             jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -74,8 +74,8 @@ def _default(option: str, value: float) -> None:
 def import_mjx() -> Any:
     """Return the module of MuJoCo's kinematics in JAX, imported where it is needed: by one solver.
 
-    It prints two lines on stdout where NVIDIA's optional warp is absent, which would end up in the output of a command.
-    Only those lines are dropped; whatever else is printed meanwhile is passed on.
+    Without NVIDIA's optional warp it prints two lines on stdout, which would end up in the output of a command. Only
+    those lines are dropped; everything else that is printed meanwhile is passed on.
     """
     printed = io.StringIO()
     try:

@@ -1,4 +1,4 @@
-"""A function in a separate process, which is ended when it takes too much time or memory."""
+"""Run a function in a separate process, which is killed when it takes too much time or memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def limited(
     stop: threading.Event | None = None,
     end_s: float = 0.0,
 ) -> Any:
-    """Call a function for what it raises, or for its result. A script that calls this keeps what it does under
+    """Call a function for its exceptions, or for its result. A script that calls this needs the guard
     `if __name__ == "__main__":`.
 
     Parameters
@@ -43,7 +43,7 @@ def limited(
     stop
         Ends the process when it is set.
     end_s
-        Time that the process has to end by itself when it is stopped (SIGTERM), before it is killed (s).
+        Time from SIGTERM, when the process is stopped, until it is killed (s).
 
     Raises
     ------

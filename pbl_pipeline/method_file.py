@@ -1,4 +1,4 @@
-"""A method of one's own from a JSON file: a registered one with other parameters (docs/files.md)."""
+"""A custom method from a JSON file: a registered one with other parameters (docs/files.md)."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from pbl_pipeline.methods import STAGES, Method, P, Stage, of_stage
 from pbl_pipeline.paramset import Paramset
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{1,31}")
-#: Keys of the file that are no parameters.
+#: Keys of the file that are not parameters.
 _ABOUT = ("stage", "name", "base")
 
 
 def read_method(path: Path, base: str | None = None, new_name: bool = True) -> Method[Any]:
-    """The method that a file describes, as version 1: `stage` (else: fit), `name` (else: that of the file), `base`, the
-    method whose parameters are changed (else: `base`, else the stage's default), and the changes, group by group.
-    `new_name`: the name is one that can be registered.
+    """Read the method that a file describes, as version 1: `stage` (default: fit), `name` (default: that of the file),
+    `base`, the method whose parameters are changed (default: `base`, else the stage's default), and the changes, group
+    by group. `new_name`: refuse a name that cannot be registered.
 
-    Raises `PblError` FILE_MISSING, FILE_FORMAT: no such file or JSON object, a stage, base or parameter that there is
-    not, a value of another type, a name that ships or is none.
+    Raises `PblError` FILE_MISSING, FILE_FORMAT: no such file or JSON object, an unknown stage, base or parameter, a
+    value of another type, a name that ships or is not valid.
     """
     try:
         found = read_json(path)
@@ -33,7 +33,7 @@ def read_method(path: Path, base: str | None = None, new_name: bool = True) -> M
             raise TypeError("not an object")
         about = {key: found.pop(key) for key in _ABOUT if key in found}
         if odd := [key for key, value in about.items() if not isinstance(value, str)]:
-            raise TypeError(f"{odd[0]} is no text")
+            raise TypeError(f"{odd[0]} is not a text")
         stage, name = about.get("stage", "fit"), about.get("name", path.stem)
         if stage not in STAGES:
             raise KeyError(f"stage {stage!r}; known: {', '.join(STAGES)}")
@@ -63,8 +63,8 @@ def read_method(path: Path, base: str | None = None, new_name: bool = True) -> M
 
 
 def named_or_file(stage: Stage[P], given: str | None, base: str | None = None) -> Method[P]:
-    """The method of a stage that a text means: a name, or the path of a JSON file of changes (to `base` where it names
-    none); None for the default.
+    """The method of a stage by its name or by the path of a JSON file of changes (to `base` unless the file names
+    another); None for the default.
 
     Raises `PblError` SOLVER_UNKNOWN; what `read_method` raises; FILE_FORMAT for a method of another stage.
     """
@@ -101,8 +101,8 @@ def _merge(base: Mapping[str, Any], changes: Mapping[str, Any], stage: str) -> d
 
 
 def _check_number(name: str, value: object, stage: str) -> None:
-    """Numbers are finite; those of the fit are not negative, and counts at least 1. Whether a number is wanted, its
-    class says."""
+    """Refuse numbers that are not finite and, of the fit, negative ones and counts below 1. The parameters' class
+    checks the types."""
     if not isinstance(value, (int, float)):
         return
     least = -math.inf if stage != "fit" else 1 if name in ("steps", "samples_per_trial", "max_iterations") else 0

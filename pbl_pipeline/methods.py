@@ -51,8 +51,8 @@ def stored(*, stage: str, name: str, version: int, params: Mapping[str, Any], sh
             "SOLVER_UNKNOWN",
             found=f"{stage} method {method.key} with hash {sha}, whose parameters hash to {method.hash}",
             expected=f"{type(method.params).__name__} of pbl-pipeline {code_version()}, as they were stored",
-            next_step="use the version of pbl-pipeline that wrote the method, or select a newer one; if somebody "
-            "edited the row, restore the method table from the backup",
+            next_step="use the version of pbl-pipeline that wrote the method, or select a newer one; if the row was "
+            "edited, restore the method table from the backup",
             key=method.key,
         )
     return method
@@ -71,7 +71,7 @@ class Family:
 class Method(Generic[P]):
     """A method that can run: its row, the same parameters as a frozen dataclass, and its function.
 
-    What `function` takes is the stage's own; docs/extending.md says it for each.
+    Each stage has its own arguments of `function` (docs/extending.md).
     """
 
     paramset: Paramset
@@ -107,14 +107,14 @@ class Method(Generic[P]):
 
 class Provider(Protocol[P_co]):
     """Methods that depend on the machine, such as those of registered models. Each has version 1 in the library; the
-    tables number what they meet under one name."""
+    tables number the different ones that they meet under one name."""
 
     def names(self) -> Sequence[str]:
-        """What this machine offers."""
+        """Names of the methods that this machine offers."""
         ...
 
     def params(self, name: str) -> P_co | None:
-        """The parameters of the method of that name as it is now; None where this machine has none of that name.
+        """The parameters of the method of that name as it is now; None if this machine has none of that name.
 
         Raises `PblError` where it has one that cannot be used.
         """
@@ -131,9 +131,9 @@ class Stage(Mapping[str, Method[P]]):
     kind
         The parameter that names the family, or "family" where the parameters of the stage have none.
     default
-        Name of the method where nobody names one.
+        Name of the method that is used unless one is named.
     provider
-        Further methods, those that this machine offers.
+        Further methods: those that this machine offers.
     """
 
     def __init__(self, name: str, kind: str, default: str, provider: Provider[P] | None = None) -> None:
@@ -155,10 +155,10 @@ class Stage(Mapping[str, Method[P]]):
     def register(
         self, name: str, version: int, params: P, function: Callable[..., Any] | str | None = None
     ) -> Method[P]:
-        """Add a method. With a function it is the first of a family, which has the name that `params` states under
-        `kind`, or else the method's own; without, a further one of the family whose parameters these are.
+        """Add a method. With a function it is the first of a family, whose name is the one that `params` states under
+        `kind`, else the method's; without, it is a further method of the family with this class of parameters.
 
-        Raises `ValueError` where the name is taken.
+        Raises `ValueError` if the name is taken.
         """
         if name in self._methods:
             raise ValueError(f"{self.name} method {name} is registered already")
@@ -170,9 +170,9 @@ class Stage(Mapping[str, Method[P]]):
         return self._methods[name]
 
     def register_family(self, name: str, params: type, function: Callable[..., Any] | str) -> Family:
-        """Add a family without a method of its own: one whose methods the provider offers.
+        """Add a family whose methods are all offered by the provider.
 
-        Raises `ValueError` where the name is taken.
+        Raises `ValueError` if the name is taken.
         """
         if name in self.families:
             raise ValueError(f"{self.name} family {name} is registered already")
@@ -181,8 +181,8 @@ class Stage(Mapping[str, Method[P]]):
 
     # ------------------------------------------------------------------------------------------------------- resolution
     def find(self, given: Method[P] | Paramset | P | str | None = None) -> Method[P]:
-        """The method that is meant: by name, also with its version (`zeni-2008-v1`), or of the machine's provider; a
-        paramset; a family's own parameters; None for the default.
+        """Resolve a method: a name, also with its version (`zeni-2008-v1`) or of the machine's provider; a paramset;
+        parameters of a family; None for the default.
 
         Raises `PblError` SOLVER_UNKNOWN; what the provider raises.
         """
@@ -201,8 +201,8 @@ class Stage(Mapping[str, Method[P]]):
         return self._method(f"{family.name}-custom", 1, given, family)
 
     def make(self, name: str, version: int, params: P, family: Family | None = None) -> Method[P]:
-        """A method of one's own: parameters of a family under a name. `family` decides where the parameters name none,
-        and several have parameters of their class.
+        """Make a custom method: parameters of a family under a name. `family` decides between families with the same
+        class of parameters if these name none.
 
         Raises `PblError` SOLVER_UNKNOWN, and `ValueError` for a value that is not of its field's type.
         """
@@ -226,8 +226,8 @@ class Stage(Mapping[str, Method[P]]):
         return self._method(paramset.name, paramset.version, params, family)
 
     def offered(self, name: str) -> Method[P] | None:
-        """The method of that name that this machine's provider offers; None for the registered ones and where there is
-        none. Raises what the provider raises."""
+        """The method of that name that this machine's provider offers; None for registered and unknown names. Raises
+        the provider's errors."""
         if name in self or self._provider is None:
             return None
         params = self._provider.params(name)
@@ -238,7 +238,7 @@ class Stage(Mapping[str, Method[P]]):
         return [*self, *(self._provider.names() if self._provider else ())]
 
     def registered(self, name: str) -> Method[P] | None:
-        """The registered method of that name or key; None where there is none."""
+        """The registered method of that name or key; None if there is none."""
         return ({m.key: m for m in self.values()} | self._methods).get(name)
 
     def _named(self, name: str) -> Method[P]:
@@ -251,7 +251,7 @@ class Stage(Mapping[str, Method[P]]):
         return method
 
     def _method(self, name: str, version: int, params: P, family: Family) -> Method[P]:
-        # As they come back from a row: 4 where a float is meant is 4.0, and hashes as such.
+        # As they are read back from a row: 4 in a float's place is 4.0, and hashes as such.
         params = Paramset.of(self.name, name, version, params).to(type(params))
         paramset = Paramset.of(self.name, name, version, params)
         if self.kind not in paramset.params and name != family.name:

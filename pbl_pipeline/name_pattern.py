@@ -1,4 +1,4 @@
-"""Statements in the names of files (`pbl ingest --name-pattern`)."""
+"""Subject, session, pace and activity in the names of files (`pbl ingest --name-pattern`)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ LONGEST_S, _MOST_BYTES = 20.0, 2**28
 
 
 def read_names(text: str, paths: Sequence[Path]) -> tuple[tuple[str, ...], list[dict[str, str] | None]]:
-    """Return the groups of a pattern, and for each file group -> what its whole name without suffix states; without
-    groups that took no part or are empty, None where the name does not fit.
+    """Return the groups of a pattern, and for each file a dict from group to its text in the whole name without suffix:
+    empty groups are left out, and the dict is None if the name does not fit.
 
     The pattern is a regular expression of Python with named groups. Some take years for a short name, so they are
     matched in a process with limits.

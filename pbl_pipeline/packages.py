@@ -23,14 +23,13 @@ from . import npm_by_pip
 
 @dataclasses.dataclass(frozen=True)
 class Package(abc.ABC):
-    """A pinned package: what to ask its client for, and how to know that it came."""
+    """A pinned package: the request to its client, and the hash of the file that is to come."""
 
     requirement: str
     filename: str
     sha256: str
     size_bytes: int
-    #: What a package is called there.
-    kind: ClassVar[str]
+    kind: ClassVar[str]  # the registry's word for a package
 
     @abc.abstractmethod
     def command(self, into: str | Path) -> list[str]:
@@ -38,7 +37,7 @@ class Package(abc.ABC):
 
     @abc.abstractmethod
     def absent(self) -> str:
-        """Why this machine cannot run `command`, with what adds the client; empty where it can."""
+        """Reason why this machine cannot run `command`, and how to install the client; empty if it can."""
 
     @abc.abstractmethod
     def environment(self, scratch: Path) -> dict[str, str]:
@@ -46,7 +45,7 @@ class Package(abc.ABC):
 
     @abc.abstractmethod
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Why the client failed, in one line."""
+        """The client's error in one line."""
 
     @abc.abstractmethod
     def read(self, path: Path, member: str) -> bytes:
@@ -60,7 +59,7 @@ class Package(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class Wheel(Package):
-    """Of a Python package index. `pip_options` select the file whatever machine asks."""
+    """Of a Python package index. `pip_options` select the same file on every machine."""
 
     pip_options: tuple[str, ...]
     kind: ClassVar[str] = "wheel"
@@ -79,7 +78,7 @@ class Wheel(Package):
         return {"TMPDIR": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Pip's last error; without a connection it only says that nothing matches, so that is said first."""
+        """Pip's last error. Without a connection that is only that nothing matches, so the cause comes first."""
         errors = _lines(done.stderr, "ERROR")
         reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
         unreachable = "connection broken" in done.stderr or "ConnectionError" in done.stderr
@@ -117,7 +116,7 @@ class NpmPackage(Package):
         return {"npm_config_cache": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Npm's first sentence, after its codes; where it cannot connect, that is said first."""
+        """Npm's first sentence after its codes; a failed connection comes first."""
         lines = _lines(done.stderr, "npm ERR!", "npm error", "ERROR")
         errors = [line for line in lines if line and not line.startswith(("code ", "syscall ", "errno "))]
         reason = errors[0] if errors else f"npm ended with code {done.returncode} and brought another file"

@@ -1,4 +1,4 @@
-"""Method parameters as frozen, hashed data: what makes a result reproducible.
+"""Method parameters as frozen, hashed data, which make a result reproducible.
 
 A method row in the database is one `Paramset`. It is never edited: other parameters are another row.
 """
@@ -59,8 +59,8 @@ class Paramset:
 
 
 def later(default: Any) -> Any:
-    """A field that parameters have got since methods with them were shipped. Left out at its default, which must be
-    what the methods did before it, so that their hashes stay."""
+    """A field that was added to parameters after methods with them had shipped. It is left out at its default, which
+    must be what the methods did before, so that their hashes stay."""
     return dataclasses.field(default=default, metadata={_LATER: True})
 
 
@@ -89,15 +89,15 @@ def canonical_json(value: Any) -> str:
 
 
 def _exactly(value: Any, kind: type) -> Any:
-    """`value`, which must be of this type already; but people and some databases write 1.0 as 1."""
+    """Return `value` if it has this type already; an int passes for a float, as people and databases write 1.0 as 1."""
     wanted = (int, float) if kind is float else kind
     if not isinstance(value, wanted) or (isinstance(value, bool) and kind is not bool):
-        raise TypeError(f"{value!r} is no {kind.__name__}")
+        raise TypeError(f"{value!r} is not of type {kind.__name__}")
     return kind(value)
 
 
 def _reason(error: BaseException, kind: type | None) -> str:
-    """What is wrong with one value, for `cattrs.transform_error`, which adds where it stands."""
+    """Return the fault of one value, for `cattrs.transform_error`, which adds its path."""
     return str(error) if isinstance(error, TypeError) else cattrs.v.format_exception(error, kind)
 
 

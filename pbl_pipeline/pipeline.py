@@ -52,8 +52,8 @@ def run_visit(
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
-    A video that fails is left out, and so is one whose bytes were named before, because its steps would count twice;
-    the others go on. Into `out` goes only a picture of the people of a video in which one must be chosen.
+    A video that fails is left out, and so is one with the bytes of another, whose steps would count twice; the others
+    go on. Only one file is written to `out`: the numbered people of a video in which one must be chosen.
 
     `paramset` is the method of the fit; None: the one that suits the keypoints (`fit.default_fit`). `attitude_files`
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
@@ -110,7 +110,7 @@ def run_visit(
 
 @dataclasses.dataclass(frozen=True)
 class _Input:
-    """A video of `run_visit`: its sensor log with the file of that, its methods, and an error that it has already."""
+    """A video of `run_visit`: its sensor log and the log's file, its methods, and its error, if it has one already."""
 
     path: Path
     name: str
@@ -125,7 +125,7 @@ class _Input:
 
 
 def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblError | None]]:
-    """Detect in each video, in their order: in as many processes as `at_once` says, or here."""
+    """Detect in each video, in order: in `at_once` processes, or in this one."""
     processes = at_once(sum(i.error is None for i in inputs))
     if processes < 2:
         yield from map(_detected, inputs)
@@ -135,7 +135,7 @@ def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblErro
 
 
 def at_once(videos: int) -> int:
-    """Processes that detect in so many videos: one for each core where a GPU computes the networks, else this one,
+    """Number of processes that detect in so many videos: one for each core if a GPU computes the networks, else one,
     whose threads use the cores."""
     return max(1, min(videos, cores())) if gpu_visible() and asked_device() != "cpu" else 1
 
@@ -183,11 +183,11 @@ def measured(
     return dataclasses.replace(visit.with_measures(measures), kinetics=kinetics)
 
 
-def write_results(out: Path, visit: Visit, title: str = "Gait report", language: str = LANGUAGES[0]) -> list[Path]:
-    """Write everything that a person or program reads of a visit into `out` and return the paths, the report first.
+def write_results(out: Path, visit: Visit, language: str = LANGUAGES[0]) -> list[Path]:
+    """Write all results of a visit into `out` and return the paths, the report first.
 
     The files of `visit.save_visit`, `<name>.overlay.mp4` of each recording whose video is known, and `report.html`
-    (docs/files.md). Where PBL_DEIDENTIFY says so, overlays and pictures show the recordings with hidden heads.
+    (docs/files.md). With PBL_DEIDENTIFY, overlays and pictures show the recordings with hidden heads.
 
     Raises the `PblError`s of `render_overlay` and `deidentify.to_show`.
     """
@@ -197,12 +197,12 @@ def write_results(out: Path, visit: Visit, title: str = "Gait report", language:
         overlays = [out / f"{r.name}.{OVERLAY}" for r in filmed]
         for recording, path in zip(filmed, overlays, strict=True):
             draw_overlay(recording, path)
-        report = write_visit_report(out / REPORT, shown, title, language)
+        report = write_visit_report(out / REPORT, shown, language=language)
     return [report, *(p for p in overlays if p.exists()), *save_visit(visit, out)]
 
 
 def draw_overlay(recording: Recording, path: Path) -> None:
-    """Draw the body of a fitted recording over its video, a copy with hidden heads where that is what may be shown.
+    """Draw the body of a fitted recording over its video, or over the copy with hidden heads if only that may be shown.
 
     Raises the `PblError`s of `render_overlay`.
     """
@@ -225,7 +225,7 @@ def write_visit_report(path: Path, visit: Visit, title: str = "Gait report", lan
 
 @contextlib.contextmanager
 def _as_shown(visit: Visit) -> Iterator[Visit]:
-    """Yield the visit with the recordings whose pictures may be shown."""
+    """Yield the visit with the videos of its recordings that may be shown."""
     with new_folder() as folder:
         recordings = tuple(
             dataclasses.replace(r, shown=r.shown or to_show(r.path, folder, r.video)) if r.fitted and r.path else r

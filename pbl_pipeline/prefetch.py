@@ -1,4 +1,4 @@
-"""An iterator that works ahead in a thread of its own, for sources that leave Python's lock (decoding does)."""
+"""An iterator that works ahead in a separate thread, for sources that release Python's lock (decoding does)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _POLL_S = 0.1
 def prefetched(source: Iterable[T], n: int) -> Generator[T, None, None]:
     """The items of `source`, of which up to `n` are ready before they are asked for.
 
-    What `source` raises is raised here, after the items before it. When the caller stops early, the thread ends before
+    Errors of `source` are raised here, after the items before them. When the caller stops early, the thread ends before
     this iterator does.
     """
     ready: queue.Queue[object] = queue.Queue(n)

@@ -15,7 +15,7 @@ _told: Callable[[int, int | None], None] | None = None
 
 
 def tell(function: Callable[[int, int | None], None] | None) -> None:
-    """Have a function called with what `track` has done and the total, about after each item; None: no longer."""
+    """Register a function to be called after each item of `track` with the number done and the total; None: none."""
     global _told
     _told = function
 
@@ -27,7 +27,7 @@ def enable(on: bool = True) -> None:
 
 
 def enabled() -> bool:
-    """Whether somebody looks at bars."""
+    """True if bars are drawn."""
     return _enabled
 
 
@@ -45,7 +45,7 @@ def _telling(items: Iterable[T], total: int | None, told: Callable[[int, int | N
 
 @contextmanager
 def bar(label: str, total: int | None = None, unit: str = "step") -> Iterator[Callable[..., None]]:
-    """A bar for work that is not an iteration: yields `update(n=1, note="", total=None)`; a total replaces the last."""
+    """A bar for work that is not an iteration; yields `update(n=1, note="", total=None)`; `total` changes the total."""
     with tqdm(desc=label, total=total, unit=unit, disable=not _enabled, **_style()) as b:
 
         def update(n: int = 1, note: str = "", total: int | None = None) -> None:

@@ -1,13 +1,13 @@
-"""Cores and memory that this process may use: those of the machine, less what a container or batch system withholds.
+"""Cores and memory that this process may use, within the limits of a container or batch system.
 
-Memory of pictures goes back to the system as soon as they are let go.
+Memory of pictures is returned to the system as soon as they are freed.
 
 The C library of Linux keeps blocks of up to 32 MB in one heap once the first of them was freed. A picture of a phone
-video has 6 MB; between two of them small results are stored that stay, so the hole that a picture leaves is soon too
+video has 6 MB; small results that stay are stored between two of them, so the hole that a picture leaves is soon too
 small for the next one, and the heap grows although nothing is held: tracking took 3.3 GB after two minutes of 1080p.
-With a fixed limit large blocks are mapped on their own and returned when freed. The limit lies below the colour planes
-of a picture (518 KB at 1080p, 230 KB at 720p): while they stayed in the heap, a worker that keeps the pictures of each
-recording grew by some 280 MB with each.
+With a fixed limit, large blocks are mapped separately and returned when freed. The limit lies below the colour planes
+of a picture (518 KB at 1080p, 230 KB at 720p): with 1 MB, a process that had kept the pictures of a recording of 7 s
+held 500 to 770 MB afterwards instead of 300.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-#: Blocks from this size on are mapped on their own (bytes): where the C library begins, too.
+#: Blocks from this size on are mapped separately (bytes); the C library starts with the same limit.
 LARGE = 128 << 10
 #: The C library's name of that limit (malloc.h).
 _M_MMAP_THRESHOLD = -3
@@ -41,16 +41,16 @@ def return_large_blocks() -> bool:
 CORES = "PBL_CORES"
 #: Variables by which numerical libraries choose their number of threads when loaded: OpenMP, BLAS, XLA, OpenCV.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC", "OPENCV_FOR_THREADS_NUM")
-#: By this the GNU C library asks the kernel for large pages: of the time to keep a decoded picture, 1.1 of 1.4 ms went
-#: into one fault for each 4 KB (docs/benchmarks.md).
+#: Makes the GNU C library ask the kernel for large pages: of the 1.4 ms to keep a decoded picture, page faults of 4 KB
+#: took 1.1 ms (docs/benchmarks.md).
 _LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-#: Where the kernel shows control groups, and to which of them a process belongs.
+#: The kernel's control groups, and the file that names those of this process.
 _GROUPS, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def cores(stated: bool = True) -> int:
-    """Number of cores that this process may use, 1 at least: those that it is bound to, at most the quota of its
-    control group and, where `stated`, what `PBL_CORES` says."""
+    """Number of cores that this process may use, at least 1: those that it is bound to, at most the quota of its
+    control group and, with `stated`, `PBL_CORES`."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     own = os.environ.get(CORES, "") if stated else ""
     limits = [bound, *_quotas(), *([int(own)] if own.isdecimal() else [])]
@@ -100,8 +100,8 @@ def _quotas() -> Iterator[float]:
 
 
 def _values(name: str, controller: str = "") -> list[str]:
-    """Contents of a file of each control group from this process's own up to the root, as far as they are there.
-    controller: of version 1, which has a tree for each."""
+    """Contents of a file of each control group from this process's up to the root, as far as they exist. controller: of
+    version 1, which has a tree for each."""
     folder, _, file = name.rpartition("/")
     own = _read(_OWN).splitlines()
     paths = [p for _, names, p in (line.split(":", 2) for line in own) if controller in names.split(",")]

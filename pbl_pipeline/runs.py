@@ -1,4 +1,4 @@
-"""Stretches of an array with one value."""
+"""Runs of equal values in an array."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 
 def runs(values: ArrayLike) -> list[slice]:
-    """The stretches of (N,) flags that are True, in order; of numbers, those of one value other than 0."""
+    """The runs of True in (N,) flags, in order; of numbers, the runs of one value other than 0."""
     numbers = np.asarray(values, float)
     edges = np.flatnonzero(np.diff(numbers, prepend=0.0, append=0.0))
     return [slice(int(a), int(b)) for a, b in pairwise(edges) if numbers[a]]

@@ -1,4 +1,4 @@
-"""Where things live on this machine. Environment variables override; nothing is read from the working directory."""
+"""Folders and switches of this machine. Environment variables override; nothing is read from the working directory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import platformdirs
 
 from pbl_pipeline.errors import PblError
 
-#: How the heads in a recording may be hidden (`pbl_pipeline.deidentify`).
+#: Ways to hide the heads in a recording (`pbl_pipeline.deidentify`).
 DEIDENTIFY = ("blur", "pixelate", "skeleton")
 
 #: Every environment variable the project reads, with its meaning (README lists them; a test compares).
@@ -62,14 +62,14 @@ def store_dir() -> Path:
 
 
 def models_dir() -> Path:
-    """Folder of the registered keypoint models (not created here). Not the cache: a lab's own model is nowhere else."""
+    """Folder of the registered keypoint models (not created here). Not the cache: a lab's model has no other copy."""
     return Path(os.environ.get("PBL_MODELS") or home_dir() / "models").absolute()
 
 
 def deidentify_how() -> str:
-    """How recordings are shown in overlays and reports: "blur", "pixelate", "skeleton", or "" for as they are.
+    """The way heads are hidden in overlays and reports: "blur", "pixelate", "skeleton", or "" for not at all.
 
-    Raises `PblError` USAGE for another word: who misspells it must not see faces.
+    Raises `PblError` USAGE for another word: a misspelling must not show faces.
     """
     how = os.environ.get("PBL_DEIDENTIFY", "").strip().lower()
     if how not in ("", *DEIDENTIFY):
@@ -83,10 +83,10 @@ def deidentify_how() -> str:
 
 
 def audit_looks() -> bool:
-    """True where each look at a recording in the review page has to leave a row."""
+    """True if each viewing of a recording in the review page has to leave a row."""
     return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")
 
 
 def offline() -> bool:
-    """True when nothing may be fetched."""
+    """True if nothing may be fetched."""
     return os.environ.get("PBL_OFFLINE", "") not in ("", "0")

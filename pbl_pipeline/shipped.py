@@ -20,7 +20,7 @@ def shipped_text(path: str) -> str:
 
 
 def shipped_page(path: str) -> Template:
-    """Return a page by its path within the package: every text is escaped, and a name that is not given is an error."""
+    """Return a page by its path within the package: every text is escaped, and a missing name is an error."""
     import jinja2
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
@@ -28,7 +28,7 @@ def shipped_page(path: str) -> Template:
 
 
 def shipped_model(path: str, arrays: Iterable[str]) -> dict[str, Any]:
-    """Return the fields of a model, those named in `arrays` as arrays, without the note of how it was made."""
+    """Return the fields of a model, those named in `arrays` as arrays, without `made_by`."""
     data: dict[str, Any] = parse_json(shipped_text(path))
     del data["made_by"]
     return data | {name: np.array(data[name]) for name in arrays}

@@ -14,11 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 
-#: How the names begin; the number of the process follows, then its own word, because a container that is started again
-#: has processes of the same numbers.
+#: Names begin with this; the number of the process and a random word follow, because the processes of a container that
+#: is started again have the same numbers.
 _PREFIX, _OWN = "pbl-tmp-", secrets.token_hex(4)
-#: Names that earlier versions gave. Those of the page have no number: they go when nothing changed in them for so long
-#: (s).
+#: Names of earlier versions. Those of the page have no number: they are removed when unchanged for so long (s).
 _EARLIER, _UNCHANGED_S = ("pbl-files-", "pbl-web-"), 86_400.0
 
 
@@ -27,7 +26,6 @@ class TemporaryFolder(tempfile.TemporaryDirectory[str]):
 
     @property
     def path(self) -> Path:
-        """Where it is."""
         return Path(self.name)
 
     def __enter__(self) -> Path:  # type: ignore[override]  # a path instead of its text
@@ -40,7 +38,7 @@ def new_folder(beside: Path | None = None) -> TemporaryFolder:
     Parameters
     ----------
     beside
-        Folder to make it in, on the disk of what will be moved out of it; what killed processes left there is removed.
+        Parent folder, on the disk that its files will be moved to; leftovers of killed processes there are removed.
         None: the system's folder for temporary files.
     """
     if beside is not None:

@@ -13,10 +13,10 @@ from markupsafe import Markup, escape
 
 from pbl_pipeline.errors import CODES
 
-#: The first is taken where a browser asks for none of them.
+#: The first is the default.
 LANGUAGES = ("en", "de")
 _NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
-#: Letters of a text with places of its own from which on it is taken where a place is English.
+#: A text with this many letters outside its places is used even if a place stays English.
 _LEAST = 12
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
@@ -26,7 +26,7 @@ _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 #: A command or its option, and one in brackets behind what it does.
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
-#: Tags of a page, and what stands in it that is not read or is marked as a name.
+#: Tags of a page, and its parts that are not read or are marked as names.
 _TAGS = re.compile(r'(?s)(<style>.*?</style>|<b translate="no">.*?</b>|<[^>]+>)')
 _LABELS = re.compile(r'(?<= (?:aria-label|data-label)=")[^"]+(?=")|(?<= alt=")[^"]+(?=")')
 _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z0-9])")
@@ -45,7 +45,7 @@ def text(language: str, name: str, /, **values: Any) -> str:
 
 
 def library_words(language: str, english: str) -> str:
-    """Return what the library says in English in a language, as it stays where there is no such text."""
+    """Return an English text of the library in a language, unchanged if it is not in the catalogue."""
     found = _library_words(language, english)
     return english if found is None else found
 
@@ -58,7 +58,7 @@ def _library_words(language: str, english: str) -> str | None:
     if own is not None:
         return own
     for at in (m.start() for m in re.finditer(r" \(", english) if english.endswith(")")):
-        # A check and in brackets the recording that it is of.
+        # A check, followed by its recording in brackets.
         if (own := catalogue().get(f"library.{english[:at]}", {}).get(language)) is not None:
             return own + english[at:]
     if language == "en":
@@ -78,7 +78,7 @@ def _library_words(language: str, english: str) -> str | None:
             continue
         places = match.groupdict()
         made = _filled(language, match, own)
-        # A place that is neither known nor a single word may be a wrong division of the text: another pattern may fit.
+        # A place that is neither known nor a single word may be a wrong split of the text: another pattern may fit.
         if all(" " not in v or _library_words(language, v) is not None for v in places.values()):
             return made
         best = best or (made if len(re.sub(r"\{\w+\}", "", own)) >= _LEAST else None)
@@ -102,7 +102,7 @@ def _filled(language: str, places: re.Match[str], own: str) -> str:
 
 @functools.cache
 def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
-    """The library's texts with places, those with most words of their own first."""
+    """The library's texts with places, those with the longest fixed text first."""
     texts = catalogue().items()
     names = (n.removeprefix("library.") for n, said in texts if "library." in n[:8] and "{" in n and language in said)
     of_words = sorted(names, key=lambda n: -len(re.sub(r"\{\w+\}", "", n)))
@@ -111,7 +111,7 @@ def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
 
 
 def decimals(language: str, text: str) -> str:
-    """Return a text with its decimal points as the language has them."""
+    """Return a text with the decimal signs of the language."""
     return _POINT.sub(",", text) if language == "de" else text
 
 
@@ -121,7 +121,7 @@ def in_chart(language: str, chart: Markup) -> Markup:
 
 
 def page_in(language: str, page: str) -> str:
-    """Return a page that was written in English, its texts and labels in a language; what is not known stays."""
+    """Return a page that was written in English with its texts and labels in a language; unknown ones stay English."""
     if language == LANGUAGES[0]:
         return page
     parts = _TAGS.split(page)
@@ -144,7 +144,7 @@ def _said(language: str, escaped: str) -> str:
 
 
 def _sentence(language: str, text: str) -> str | None:
-    """Return what the library says, also where it begins with a capital and ends with a stop here."""
+    """Return a text of the library in a language, which here may begin with a capital and end with a stop."""
     if not any(c.isalpha() for c in text):
         return decimals(language, text)
     stops = (pattern for pattern, _ in _patterns(language) if pattern.pattern.endswith(r"\."))
@@ -158,7 +158,7 @@ def _sentence(language: str, text: str) -> str | None:
 
 
 def library(language: str, english: str) -> str:
-    """What the library says in English, in the language of a page: HTML, marked as English where it stays so."""
+    """Return an English text of the library in the language of a page: HTML, marked as English if it stays so."""
     own = _library_words(language, english)
     if own is not None:
         return escape(own)
@@ -166,7 +166,7 @@ def library(language: str, english: str) -> str:
 
 
 def on_page(language: str, english: str) -> Markup:
-    """Return what the library says as `library` does, without what names a command: a page says what to click."""
+    """Return a text as `library` does, without the sentences that name a command: a page says what to click."""
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown

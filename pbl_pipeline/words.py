@@ -1,11 +1,11 @@
-"""Names of gait measures, joint angles and checks as people read them, the units that names end with, and numbers."""
+"""Display names of gait measures, joint angles and checks, the units in the ends of names, and formats of numbers."""
 
 from __future__ import annotations
 
 import functools
 import math
 
-#: Computed tables, in the order of the chain -> what is computed, for people who know no table.
+#: Computed tables, in the order of the chain -> description for people who know no tables.
 STAGES = {
     "VideoInfo": "reading of the video",
     "Tracking": "search for people",
@@ -87,7 +87,7 @@ KINETICS: dict[str, tuple[str, str, int]] = {
     "ankle_work_j_per_kg": ("Work of the ankle in stance", "J/kg", 2),
     "centre_of_mass_excursion_m": ("Vertical excursion of the centre of mass", "m", 3),
 }
-#: Curves of forces and moments that people read: our name -> heading, unit.
+#: Curves of forces and moments in reports: our name -> heading, unit.
 KINETICS_CURVES: dict[str, tuple[str, str]] = {
     "force_vertical_bw": ("Vertical force", "BW"),
     "force_forward_bw": ("Forward force", "BW"),
@@ -100,7 +100,7 @@ KINETICS_CURVES: dict[str, tuple[str, str]] = {
     "ankle_angle_power_w_per_kg": ("Ankle power", "W/kg"),
 }
 
-#: Joint angles: our name -> heading, and what positive means where the heading does not say it.
+#: Joint angles: our name -> heading, and the positive direction unless the heading states it.
 ANGLES: dict[str, tuple[str, str]] = {
     "hip_flexion": ("Hip flexion", ""),
     "hip_adduction": ("Hip adduction", ""),
@@ -117,9 +117,9 @@ PELVIS_ANGLES: dict[str, tuple[str, str]] = {
 #: So does the direction of the foot.
 FOOT_ANGLES: dict[str, tuple[str, str]] = {"foot_progression": ("Foot direction", "toes in +")}
 
-#: Why a recording that waits to be computed has no fit.
+#: Reason why a recording that waits to be computed has no fit.
 NOT_COMPUTED = "not computed yet"
-#: Why a recording is not usable, by one word; "other" asks for words of one's own.
+#: Reasons why a recording is not usable, by one word; "other" asks for a text.
 UNUSABLE: dict[str, str] = {
     "not_in_view": "the person is not in view, or only in part",
     "too_dark": "too dark or blurred",
@@ -135,11 +135,11 @@ UNUSABLE: dict[str, str] = {
 
 @functools.cache
 def unit_of(name: str) -> str:
-    """The unit that a measure's name ends with; empty where it has none, such as an index."""
+    """The unit in the end of a measure's name; empty if it has none, such as an index."""
     return next((unit for end, unit in _UNITS if name.endswith(end)), "")
 
 
-#: Ends of the names of checks and what stands in brackets for them, and words that are not spelled as they stand there.
+#: Ends of the names of checks and their units, and words of these names that are displayed differently.
 _CHECK_UNITS = {"cm": "cm", "px": "px", "s": "s", "deg": "\N{DEGREE SIGN}", "percent": "%", "m": "m"}
 _SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI", "trial": "recording"}
 
@@ -156,7 +156,7 @@ def check_words(name: str) -> str:
 
 
 def number(value: float | None, decimals: int) -> str:
-    """The value with so many decimals and a real minus sign; an en dash where it is unknown."""
+    """The value with so many decimals and a real minus sign; an en dash if it is unknown."""
     if value is None or not math.isfinite(value):
         return "\N{EN DASH}"
     text = f"{value:.{decimals}f}"
@@ -164,7 +164,7 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """The value with so many significant digits, never in powers of ten; empty where there is none."""
+    """The value with so many significant digits, never in powers of ten; empty if it is unknown."""
     if value is None or not math.isfinite(value):
         return ""
     if value == 0:

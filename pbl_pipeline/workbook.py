@@ -1,8 +1,8 @@
-"""Workbooks (.xlsx) as rows of texts, without anything that hides a value.
+"""Workbooks (.xlsx) as rows of texts; sheets that hide a value are refused.
 
-A workbook of a few kilobytes can unpack to gigabytes, name a cell in the last row and column, or hold what its reader
-does not expect. It is measured first, then read as a stream; call `read_workbook` through `limited`, with `READ_S` and
-`READ_BYTES`.
+A workbook of a few kilobytes can unpack to gigabytes, name a cell in the last row and column, or hold content that its
+reader does not expect. It is measured first, then read as a stream; call `read_workbook` through `limited`, with
+`READ_S` and `READ_BYTES`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def read_workbook(path: Path) -> list[tuple[str, list[list[str]]]]:
     OSError
         The file cannot be read.
     ValueError
-        No workbook, a damaged one, or one of more rows, columns, cells or letters than are read.
+        Not a workbook, a damaged one, or one with too many rows, columns, cells or letters.
     PblError
         SHEET_FORMAT: merged cells, formulas, error values.
     """
@@ -46,7 +46,7 @@ def read_workbook(path: Path) -> list[tuple[str, list[list[str]]]]:
         members = archive.infolist()
         if sum(m.file_size for m in members) > _MAX_UNPACKED:
             raise ValueError(f"more than {_MAX_UNPACKED // MIB} MiB unpacked")
-        # What is measured is what is read: parts of other names are left out.
+        # Only the measured parts are read: those of other names are left out.
         measured = io.BytesIO()
         parts = {}
         with zipfile.ZipFile(measured, "w") as copy:
@@ -62,7 +62,7 @@ def read_workbook(path: Path) -> list[tuple[str, list[list[str]]]]:
         return list(_sheets(measured, path, parts))
     except (PblError, MemoryError):
         raise
-    except Exception as error:  # whatever the reader of workbooks stumbles over
+    except Exception as error:  # openpyxl raises anything for a damaged workbook
         raise ValueError(f"a workbook that makes no sense ({type(error).__name__}: {error})") from error
 
 
@@ -87,10 +87,10 @@ def _sheets(data: io.BytesIO, path: Path, parts: dict[str, _Part]) -> Iterator[t
 
 
 def _rows(sheet: Any, where: str, n_cells: int, room: _Room) -> Iterator[list[str]]:
-    """Yield the rows of a sheet, all cells that its part holds and no row that is only formatted at its end."""
+    """Yield the rows of a sheet with all cells of its part, without trailing rows that are only formatted."""
     from openpyxl.cell.read_only import ReadOnlyCell
 
-    sheet.reset_dimensions()  # what the sheet claims of its own size hides cells beyond it
+    sheet.reset_dimensions()  # cells beyond the size that the sheet claims would be hidden
     empty = n_found = 0
     for row in sheet.iter_rows():
         cells = [_text(cell, where) for cell in row]
@@ -108,7 +108,7 @@ def _rows(sheet: Any, where: str, n_cells: int, room: _Room) -> Iterator[list[st
 
 
 class _Room:
-    """What is left of the rows, cells and letters that a workbook may have."""
+    """Count of the rows, cells and letters of a workbook, which are bounded."""
 
     def __init__(self) -> None:
         self.rows = self.cells = self.letters = 0
@@ -123,7 +123,7 @@ class _Room:
 
 
 class _Part:
-    """A part of a workbook, read once to know what it holds: well-formed, without a document type, and not large.
+    """A part of a workbook, parsed once to check that it is well-formed, not large and without a document type.
 
     Attributes
     ----------

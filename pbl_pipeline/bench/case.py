@@ -20,32 +20,29 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.validation import JOINTS_PAPER
 
 from .data import read_keypoints, read_truth, sessions
-from .machine import machine, peak_rss
+from .machine import peak_rss, write_result
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, SessionFit, TrialFit
     from pbl_pipeline.keypoints import Keypoints
     from pbl_pipeline.methods import Method
 
-#: The joints of the paper's validation (Statistics): hips, knees, ankles, lumbar, neck, shoulders without rotation,
-#: elbows.
+#: Joints of the paper's validation (Statistics): hips, knees, ankles, lumbar, neck, shoulders without rotation, elbows.
 PAPER_JOINTS = tuple(joint_of(angle)[0] for angle in JOINTS_PAPER)
 MAIN_JOINTS = tuple(j for j in PAPER_JOINTS if j.startswith(("hip_", "knee_", "ankle_", "lumbar_")))
 
 
-def joint_errors_deg(
-    fitted_rad: np.ndarray, true_rad: np.ndarray, joint_names: Sequence[str], wanted: Sequence[str] = PAPER_JOINTS
-) -> dict[str, float]:
-    """Median absolute error (deg) over the frames of one trial of each joint; frames without a result do not count.
+def joint_errors_deg(fitted_rad: np.ndarray, true_rad: np.ndarray, joint_names: Sequence[str]) -> dict[str, float]:
+    """Median absolute error (deg) of each of `PAPER_JOINTS` over the frames of one trial that have a result.
 
-    fitted_rad, true_rad : (T, 40) in the order of `joint_names`. NaN where no frame has a result.
+    fitted_rad, true_rad : (T, 40) in the order of `joint_names`. NaN if no frame has a result.
     """
     known = np.all(np.isfinite(fitted_rad), axis=1)
     if not known.any():
-        return dict.fromkeys(wanted, float("nan"))
+        return dict.fromkeys(PAPER_JOINTS, float("nan"))
     names = list(joint_names)
     error = np.rad2deg(np.abs(fitted_rad[known] - true_rad[known]))
-    return {n: float(np.median(error[:, names.index(n)])) for n in wanted}
+    return {n: float(np.median(error[:, names.index(n)])) for n in PAPER_JOINTS}
 
 
 def mean_over(errors: dict[str, float], joints: Sequence[str]) -> float:
@@ -84,13 +81,8 @@ def main(judge: Judge | None = None) -> None:
     """Measure the case of the command line and write its result; `judge` instead of `accuracy_of`."""
     spec = json.loads(sys.argv[1])
     case = {k: spec["case"][k] for k in ("method", "batch", "repeat", "camera_motion")}
-    try:
-        result = measure(Path(spec["folder"]), spec["stage"], spec["started"], **case, judge=judge or accuracy_of)
-    except PblError as error:
-        result = {"error": error.code, "error_text": error.text()}
-    except Exception as error:  # noqa: BLE001 - the table shows what went wrong in a case and goes on
-        result = {"error": type(error).__name__, "error_text": str(error)}
-    Path(spec["result"]).write_text(json.dumps(result | machine()), encoding="utf-8")
+    folder, judge = Path(spec["folder"]), judge or accuracy_of
+    write_result(spec["result"], lambda: measure(folder, spec["stage"], spec["started"], **case, judge=judge))
 
 
 def measure(
@@ -124,7 +116,7 @@ def measure(
         seconds.append(time.perf_counter() - begin)
     for group in groups[1:]:
         fits |= _fitted({session: read_keypoints(session) for session in group}, chosen, camera_motion)
-    # Before anything else is computed, so that it is the fit's own.
+    # Before anything else is computed, so that it is that of the fit.
     out |= {"warm_seconds": min(seconds), "warm_seconds_each": seconds, "n_sessions": len(fits)} | memory()
     good = {session: fit for session, fit in fits.items() if not isinstance(fit, PblError)}
     out |= _failures(fits) | (judge(good) if good else {})
@@ -144,7 +136,6 @@ def memory() -> dict[str, Any]:
 
 def accuracy_of(fits: Mapping[Path, SessionFit]) -> dict[str, Any]:
     """Return the mean over all trials of `trial_accuracy` as `accuracy`."""
-
     pairs = [p for session, fit in fits.items() for p in zip(fit.trials, read_truth(session), strict=True)]
     return {"accuracy": summary([trial_accuracy(trial, truth) for trial, truth in pairs])}
 
@@ -152,7 +143,7 @@ def accuracy_of(fits: Mapping[Path, SessionFit]) -> dict[str, Any]:
 def _fitted(
     trials: Mapping[Path, Sequence[Keypoints]], method: Method[Params], camera_motion: str
 ) -> dict[Path, SessionFit | PblError]:
-    """The fits of some sessions, of several together; an error of one session is its result."""
+    """Fit some sessions, several together; an error of one session is its result."""
     from pbl_pipeline import fit
 
     names = {session: [f"trial{k}" for k in range(len(of))] for session, of in trials.items()}
@@ -175,9 +166,7 @@ def _failures(fits: Mapping[Path, SessionFit | PblError]) -> dict[str, Any]:
 
 
 def _against_one(session: Path, together: SessionFit | PblError, trials: Any, *how: Any) -> dict[str, Any]:
-    """The largest difference (rad) of a session of a batch to the same session fitted alone."""
-    import numpy as np
-
+    """Largest difference (rad) between a session fitted in a batch and the same session fitted alone."""
     alone = _fitted({session: trials[session]}, *how)[session]
     if isinstance(alone, PblError) or isinstance(together, PblError):
         return {}

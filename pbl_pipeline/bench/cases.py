@@ -16,7 +16,7 @@ FPS = 30.0
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """What is observed: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz."""
+    """Simulated data: `n_sessions` people, each with `n_trials` walks of `n_frames` frames at 30 Hz."""
 
     n_trials: int = 1
     n_sessions: int = 3
@@ -46,12 +46,8 @@ class Case:
         return ", ".join([*parts, self.camera_motion, *[f"batch {self.batch}"] * (self.batch > 1)])
 
 
-def fit_cases(
-    method: str, trials: Sequence[int], batches: Sequence[int], n_people: int, repeat: int, n_frames: int = 300
-) -> list[Case]:
+def fit_cases(method: str, trials: Sequence[int], batches: Sequence[int], n_people: int, repeat: int) -> list[Case]:
     """Return a case for each number of trials and each size of a batch."""
     return [
-        Case(method, Data(n, batch if batch > 1 else n_people, n_frames), batch, repeat)
-        for n in trials
-        for batch in batches
+        Case(method, Data(n, batch if batch > 1 else n_people, 300), batch, repeat) for n in trials for batch in batches
     ]

@@ -14,28 +14,21 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
-
-from .machine import machine, peak_rss
+from .machine import peak_rss, write_result
 
 T = TypeVar("T")
 _SAMPLE_S = 0.5
 
 
 def main() -> None:
-    """Entry of the process."""
+    """Measure the case of the command line and write its result."""
     spec = json.loads(sys.argv[1])
-    try:
-        result = measure(Path(spec["video"]), spec["person"], spec["repeat"], spec["keypoints"])
-    except PblError as error:
-        result = {"error": error.code, "error_text": error.text()}
-    except Exception as error:  # noqa: BLE001 - the caller shows what went wrong
-        result = {"error": type(error).__name__, "error_text": str(error)}
-    Path(spec["result"]).write_text(json.dumps(result | machine()), encoding="utf-8")
+    video, person = Path(spec["video"]), spec["person"]
+    write_result(spec["result"], lambda: measure(video, person, spec["repeat"], spec["keypoints"]))
 
 
 def measure(video: Path, person: int | None, repeat: int, keypoints: str | None) -> dict[str, Any]:
-    """The figures of docs/benchmarks.md, section detect: of the fastest of `repeat` runs; memory over all of them."""
+    """Return the figures of docs/benchmarks.md, section detect: of the fastest of `repeat` runs; memory over all."""
     runs = [_run(video, person, keypoints) for _ in range(repeat)]
     best = min(runs, key=lambda r: r["seconds"])
     return best | {"runs_seconds": [r["seconds"] for r in runs], "host_bytes": peak_rss()}
@@ -53,7 +46,7 @@ def _run(video: Path, person: int | None, keypoints: str | None) -> dict[str, An
         subject = choose_subject(tracking, override=person).person_id
         if subject is None and tracking.persons:  # without a clear subject: the person in view for longest
             subject = max(tracking.persons, key=lambda p: time_in_view_s(p, tracking.time_s)).person_id
-        # No person: ID 0 is unknown, and the error says so.
+        # Without a person ID 0 raises the error.
         camera = guess_camera(info)
         found = _timed(
             stages, "keypoints", lambda: detect_keypoints(video, tracking, subject or 0, camera, params=keypoints)
@@ -104,8 +97,8 @@ def _timed(stages: dict[str, dict[str, Any]], name: str, call: Callable[[], T]) 
 
 
 def growth(samples: np.ndarray) -> int | None:
-    """How much more memory the last quarter of a stage takes than the second one (medians); None where it is too short
-    to tell. Positive and as large as a video's frames: it piles something up."""
+    """Difference in memory between the last quarter of a stage and the second one (medians); None for a short stage.
+    One as large as a video's frames shows that frames accumulate."""
     quarter = len(samples) // 4
     if quarter < 4:
         return None
@@ -113,7 +106,7 @@ def growth(samples: np.ndarray) -> int | None:
 
 
 def resident_bytes() -> int | None:
-    """Memory of this process now; None where the system does not say."""
+    """Memory of this process now; None if the system does not state it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):

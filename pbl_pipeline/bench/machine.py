@@ -1,16 +1,30 @@
-"""The machine and the memory as a measured process sees them."""
+"""Results of a measured process, with its machine and memory."""
 
 from __future__ import annotations
 
+import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import cores
 
 
+def write_result(path: str | Path, measure: Callable[[], dict[str, Any]]) -> None:
+    """Write the result of a measurement as JSON, or its error, with the machine."""
+    try:
+        result = measure()
+    except PblError as error:
+        result = {"error": error.code, "error_text": error.text()}
+    except Exception as error:  # noqa: BLE001 - the table of the benchmark shows the error and continues
+        result = {"error": type(error).__name__, "error_text": str(error)}
+    Path(path).write_text(json.dumps(result | machine()), encoding="utf-8")
+
+
 def machine() -> dict[str, Any]:
-    """Device and processor as this process saw them."""
+    """Device and processor of this process."""
     out: dict[str, Any] = {"cores": cores()}
     if "jax" in sys.modules:
         import jax

@@ -10,12 +10,13 @@ from pbl_pipeline import jax_setup
 jax_setup.configure()
 
 from pbl_pipeline.body._capsules import (  # noqa: E402
-    CapsuleFrames,
+    BodyFrames,
     Capsules,
     CapsuleShapes,
-    capsule_frames,
+    body_frames,
     capsule_shapes,
     capsules,
+    scaled_model,
     stature_m,
 )
 from pbl_pipeline.body._chain import (  # noqa: E402

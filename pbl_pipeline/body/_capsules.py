@@ -1,4 +1,4 @@
-"""The body as capsules in the world: all that a drawing needs, without JAX; and how tall it is."""
+"""The body as capsules in the world, for drawing, without JAX; and its height."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -42,7 +43,7 @@ class CapsuleShapes:
 
 
 @dataclasses.dataclass(frozen=True)
-class CapsuleFrames:
+class BodyFrames:
     """`position_m` (T, B, 3) and `rotation` (T, B, 3, 3), body to world (z up); NaN where qpos is NaN."""
 
     position_m: np.ndarray
@@ -65,7 +66,7 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
 
     Ellipsoids are drawn as capsules side by side (see `_strands`). Kinematics by C MuJoCo, in double precision.
     """
-    shapes, at = capsule_shapes(body, scale), capsule_frames(body, qpos, scale)
+    shapes, at = capsule_shapes(body, scale), body_frames(body, qpos, scale)
 
     def world(points: np.ndarray) -> np.ndarray:
         return at.position_m[:, shapes.body] + np.einsum("tgij,gj->tgi", at.rotation[:, shapes.body], points)
@@ -100,11 +101,9 @@ def capsule_shapes(body: Body, scale: np.ndarray) -> CapsuleShapes:
     )
 
 
-def capsule_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> CapsuleFrames:
-    """Where the bodies are at the poses `qpos` (T, 40) with scale multipliers (8,), by C MuJoCo in double precision."""
-    own_scale = np.asarray(scale, np.float64)[body.scale_index]
-    model = copy.copy(body.mj_model)
-    model.body_pos[2:] *= own_scale[body.parent_index[1:], None]
+def body_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> BodyFrames:
+    """Return the bodies at the poses `qpos` (T, 40) with scale multipliers (8,), by C MuJoCo in double precision."""
+    model = scaled_model(body, scale)
     data = mujoco.MjData(model)
     qpos = np.asarray(qpos, np.float64)
     xpos = np.full((len(qpos), len(body.body_names), 3), np.nan)
@@ -114,7 +113,14 @@ def capsule_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> CapsuleFr
             data.qpos[:] = pose
             mujoco.mj_kinematics(model, data)
             xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
-    return CapsuleFrames(xpos, xmat)
+    return BodyFrames(xpos, xmat)
+
+
+def scaled_model(body: Body, scale: np.ndarray) -> Any:
+    """Copy the model for C MuJoCo with the origins of the bodies scaled by multipliers (8,); masses are unscaled."""
+    model = copy.copy(body.mj_model)
+    model.body_pos[2:] *= np.asarray(scale, np.float64)[body.scale_index[body.parent_index[1:]], None]
+    return model
 
 
 @functools.cache
@@ -137,9 +143,8 @@ def _local(body: Body) -> tuple[_Local, ...]:
 
 
 def _strands(axes: np.ndarray, half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """An ellipsoid with half axes a >= b >= c as parallel capsules along a, side by side along b, of radius c.
-
-    As many as leave no gap; the ends follow the ellipse, so the outline keeps its three half axes.
+    """Approximate an ellipsoid with half axes a >= b >= c by parallel capsules along a, side by side along b, of radius
+    c, without gaps; the ends follow the ellipse, so that the outline has its three half axes.
     """
     order = np.argsort(half)[::-1]
     (a, b, c), (along, across, _) = half[order], axes[order]

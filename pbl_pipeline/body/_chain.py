@@ -1,9 +1,9 @@
 """Forward kinematics of the tree, level by level, compiled once.
 
-MuJoCo's own kinematics in JAX (`mjx.kinematics`) returns the same numbers, which a test holds, at the same speed, but
-its program has some 9,000 operations and takes ten times as long to compile (docs/benchmarks.md), more than a short
-trial takes to fit. Here all hinges turn at once, the turns of each body are multiplied at once, and the tree is then
-walked level by level: a dozen batched products of 3x3 matrices. The derivative is in `_kinematics.py`, for both.
+MuJoCo's kinematics in JAX (`mjx.kinematics`) returns the same numbers (a test compares them) at the same speed, but its
+program has some 9,000 operations and takes ten times as long to compile (docs/benchmarks.md), more than a short trial
+takes to fit. Here all hinges turn at once, the turns of each body are multiplied at once, and the tree is then
+traversed level by level: a dozen batched products of 3x3 matrices. `_kinematics.py` has the derivative of both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pbl_pipeline.jax_setup import import_mjx
 
 
 class Frames(NamedTuple):
-    """B bodies and Q joints in the world at N poses, under MuJoCo's names: origins (m) and rotations (body to world) of
+    """B bodies and Q joints in the world at N poses, with MuJoCo's names: origins (m) and rotations (body to world) of
     the bodies, axes and anchors (m) of the joints."""
 
     xpos: Float[Array, "N B 3"]
@@ -70,7 +70,7 @@ def chain_frames(body: Body, qpos: Float[Array, "N Q"], body_pos: Float[Array, "
 
 @dataclasses.dataclass(frozen=True)
 class _Chain:
-    """The joints of each body in the order in which they act, padded to the most a body has; Q stands for none."""
+    """Joints of each body in the order in which they act, padded to the largest number; Q stands for none."""
 
     rest: np.ndarray  # (B, 3, 3): the body against its parent at qpos 0
     axis: np.ndarray  # (Q, 3) in the body's frame
@@ -132,8 +132,8 @@ def _forward(body: Body, chain: _Chain, qpos: Array, body_pos: Array) -> Frames:
     return Frames(xpos, matrices, xaxis, xpos[owner])
 
 
-# Sums of products and not matrix products: those are rounded to ten bits on GPUs, and called one by one on CPUs.
-# The barrier keeps the compiler from computing a product anew in each of the products that use it.
+# Sums of products instead of matrix products, which are rounded to ten bits on GPUs and called one by one on CPUs.
+# The barrier keeps the compiler from computing a product again in each of the products that use it.
 def _product(a: Array, b: Array) -> Array:
     return jax.lax.optimization_barrier(sum(a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(3)))
 

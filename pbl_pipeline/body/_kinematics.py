@@ -1,9 +1,9 @@
 """The body model `M(theta, beta) -> x` of the paper: joint angles, scales and marker offsets to points in the world.
 
-Stated once, with its derivative in closed form: every joint moves the points of the bodies beyond it as a rigid body
-moves, ``dx = omega x (x - o) + v``, where a hinge contributes its axis to omega and a slide its axis to v (the
-geometric Jacobian, e.g. Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 4). Gauss-Newton takes the columns of
-that Jacobian (`marker_jacobian`); automatic differentiation takes the rule, forward and, transposed, in reverse.
+Its derivative is in closed form: every joint moves the points of the bodies beyond it like a rigid body,
+``dx = omega x (x - o) + v``, where a hinge contributes its axis to omega and a slide its axis to v (the geometric
+Jacobian, e.g. Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 4). Gauss-Newton uses the columns of that
+Jacobian (`marker_jacobian`); automatic differentiation uses the rule, forward and, transposed, in reverse.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Forward = Callable[[Body, Array, Array], Frames]
 
 
 class Points(Protocol):
-    """J points fixed to bodies, such as a `MarkerSet`: the index of each one's body, its place in that body's frame."""
+    """J points fixed to bodies, such as a `MarkerSet`: index of the body, and position in its frame."""
 
     @property
     def body_index(self) -> Any: ...
@@ -37,16 +37,12 @@ class Points(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class MarkerJacobian:
-    """J points in the world (m) at N poses and their derivatives.
-
-    x_world_m; per_qpos: m/rad (m/m for slides); per_scale: m per unit of each multiplier; per_offset: rotates and
-    scales a point's offset into the world.
-    """
+    """J points in the world (m) at N poses and their derivatives."""
 
     x_world_m: Float[Array, "N J 3"]
-    per_qpos: Float[Array, "N J 3 Q"]
-    per_scale: Float[Array, "N J 3 S"]
-    per_offset: Float[Array, "N J 3 3"]
+    per_qpos: Float[Array, "N J 3 Q"]  # m/rad (m/m for slides)
+    per_scale: Float[Array, "N J 3 S"]  # m per unit of each multiplier
+    per_offset: Float[Array, "N J 3 3"]  # rotates and scales a point's offset into the world
 
 
 def body_poses(
@@ -136,7 +132,7 @@ def scaled_body_pos(body: Body, scale: Float[Array, " S"]) -> Float[Array, "B 3"
     return jnp.asarray(body.mj_model.body_pos[1:], scale.dtype) * parent_scale[:, None]
 
 
-# Compiled here so that a call outside any jit is not hundreds of small ones; inside a jit this changes nothing.
+# Compiled so that a call outside any jit is not hundreds of small ones; no effect inside a jit.
 @functools.partial(jax.jit, static_argnums=0)
 def _compiled_frames(body: Body, qpos: Array, scale: Array) -> Frames:
     return chain_frames(body, qpos, scaled_body_pos(body, scale))
@@ -144,8 +140,8 @@ def _compiled_frames(body: Body, qpos: Array, scale: Array) -> Frames:
 
 @dataclasses.dataclass(frozen=True)
 class _Placed:
-    """Points at N poses and what their derivative is made of: `lever` from the root's origin o to the point, the
-    joints' contributions to omega and, about o, to v.
+    """Points at N poses and the parts of their derivative: `lever` from the root's origin o to the point, the joints'
+    contributions to omega and, about o, to v.
     """
 
     x: Array  # (N, J, 3)

@@ -1,4 +1,4 @@
-"""Marker sets: which points of the body are observed. Data, not code: a table of (name, body, x, y, z)."""
+"""Marker sets: the observed points of the body, from tables of (name, body, x, y, z)."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from pbl_pipeline.names import is_plain
 
 _DATA = Path(__file__).parent / "data"
 _COLUMNS = ("name", "body", "x", "y", "z")
-#: Of a table of markers (bytes): a thousand.
+#: Largest table of markers (bytes), about a thousand of them.
 _LARGEST = 1 << 17
 
-#: Names of the marker sets that ship with the project.
+#: Names of the included marker sets.
 MARKER_SETS: tuple[str, ...] = tuple(sorted(p.stem.removeprefix("markers_") for p in _DATA.glob("markers_*.csv")))
 _format_error = functools.partial(
     PblError,
@@ -41,8 +41,8 @@ class MarkerSet:
     body_index: np.ndarray  # (J,) int index into `Body.body_names`
     #: (J, 3) position on the unscaled body, in the body's frame (x forward, y up, z right), metres.
     position_m: np.ndarray
-    #: (J,) how far the detector's 3D position of the point may be taken for the place on the body, 0 (not at all: only
-    #: its pixels count) to 1. A property of the detector; 1 unless the table has a column `weight_3d`.
+    #: (J,) weight of the point's 3D position, 0 (only its pixels count) to 1, a property of the detector;
+    #: 1 unless the table has a column `weight_3d`.
     weight_3d: np.ndarray
 
     def __len__(self) -> int:
@@ -66,7 +66,7 @@ class MarkerSet:
 
 @functools.cache
 def marker_set(name: str) -> MarkerSet:
-    """A marker set that ships with the project. Raises `PblError` MARKER_SET_UNKNOWN."""
+    """Return an included marker set. Raises `PblError` MARKER_SET_UNKNOWN."""
     if name not in MARKER_SETS:
         raise PblError(
             "MARKER_SET_UNKNOWN",
@@ -81,10 +81,10 @@ def marker_set(name: str) -> MarkerSet:
 def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     """Read a table of markers: CSV with the columns name, body, x, y, z in metres in the body's frame.
 
-    The column `weight_3d` may be there too (`MarkerSet`); an empty cell means 1. Lines that start with `#` are
-    comments, further columns are ignored. `name` is the file's stem unless given.
+    The column `weight_3d` is optional (`MarkerSet`); an empty cell means 1. Lines that start with `#` are comments,
+    other columns are ignored. `name` is the file's stem unless given.
 
-    Raises `PblError` FILE_FORMAT: unreadable, a column missing, a number that is none, a name twice, a body the model
+    Raises `PblError` FILE_FORMAT: unreadable, a column missing, an invalid number, a name twice, a body the model
     lacks, no rows.
     """
     path = Path(path)
@@ -116,7 +116,7 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
             weight = float(row.get("weight_3d") or 1)
         except (TypeError, ValueError) as error:
             raise _format_error(f"{where}: {error}", key=path) from error
-        # Two metres from a body's origin is no place on a person: most often a table in millimetres.
+        # No point of a person is two metres from a body's origin: most often the table is in millimetres.
         if not np.all(np.isfinite(position)) or np.max(np.abs(position)) > 2:
             raise _format_error(f"{where}: position {position}", key=path)
         if not 0 <= weight <= 1:

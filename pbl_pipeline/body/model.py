@@ -1,4 +1,4 @@
-"""The body as data: the MJCF read by C MuJoCo and put on the JAX device; its joint values as angles in degrees."""
+"""The body model: the MJCF read by C MuJoCo and put on the JAX device, and its joint values as angles in degrees."""
 
 # MuJoCo is a compiled module without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -34,9 +34,8 @@ Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """A tree of B bodies with Q degrees of freedom (the shipped one: 21 and 40) and S scale groups (8). Index 0 is the
-    root, the pelvis: MuJoCo's world is left out.
-    """
+    """A tree of B bodies with Q degrees of freedom (ours: 21 and 40) and S scale groups (8). Index 0 is the root, the
+    pelvis, without MuJoCo's world."""
 
     #: The model for C MuJoCo.
     mj_model: mujoco.MjModel
@@ -69,10 +68,10 @@ class Body:
 
 @functools.cache
 def load_body(path: Path = _MJCF) -> Body:
-    """The 40-degree-of-freedom body, or that of another MJCF of the same form (cached).
+    """Load the 40-degree-of-freedom body, or that of another MJCF of the same structure (cached).
 
     The MJCF names its scale groups in texts `scale_group/NAME`, whose data are the bodies of the group; `*` stands for
-    those of no other group.
+    all other bodies.
     """
     xml, model = _c_model(path)
     texts = _texts(model)
@@ -146,20 +145,20 @@ def _frozen(array: np.ndarray) -> np.ndarray:
 SCALE_NAMES: tuple[str, ...] = tuple(_scale_groups(_texts(_c_model(_MJCF)[1])))
 
 
-#: OpenSim's knee is negative in flexion: joint -> angle of the other sign. It is turned here and nowhere else.
+#: Joints whose angle has the other sign: OpenSim's knee is negative in flexion. Nothing else changes the sign.
 _TURNED = {"knee_angle": "knee_flexion"}
 
 
 def angle_of(joint: str) -> tuple[str, float]:
     """Name of a joint's angle and its sign against the joint's value: ("knee_flexion_r", -1.0) of "knee_angle_r".
 
-    The side may be left out. Joints whose angle has the joint's own sign keep their name.
+    The side may be omitted. Joints whose angle has the same sign keep their name.
     """
     return _other_name(joint, _TURNED)
 
 
 def joint_of(angle: str) -> tuple[str, float]:
-    """The joint of an angle and its sign, as `angle_of`: ("knee_angle_r", -1.0) of "knee_flexion_r"."""
+    """Name of an angle's joint and its sign, as `angle_of`: ("knee_angle_r", -1.0) of "knee_flexion_r"."""
     return _other_name(angle, {angle: joint for joint, angle in _TURNED.items()})
 
 

@@ -15,7 +15,7 @@ from .command_line import Commands
 
 
 class Numbers(click.ParamType):
-    """Whole numbers with commas between them."""
+    """Whole numbers, separated by commas."""
 
     name = "N,N"
 
@@ -27,7 +27,7 @@ class Numbers(click.ParamType):
         except ValueError:
             numbers = ()
         if not numbers or min(numbers) < 1:
-            self.fail(f"{value!r} is no list of whole numbers from 1, such as 1,10", param, ctx)
+            self.fail(f"{value!r} is not a list of whole numbers from 1, such as 1,10", param, ctx)
         return numbers
 
 
@@ -66,7 +66,7 @@ def fit(
 ) -> None:
     """Time the session fit on a synthetic walker whose angles are known, and compare the result with them.
 
-    What is measured, and how, is in docs/benchmarks.md. A case that fails is a row with the code of its error.
+    docs/benchmarks.md describes the measurements. A case that fails is a row with the code of its error.
     """
     from pbl_pipeline import bench as b
     from pbl_pipeline.files import check_out_file
@@ -99,7 +99,7 @@ def detect(
 ) -> None:
     """Time decoding, tracking and keypoints of VIDEO; without one, of the demo recording at 1920x1080.
 
-    What is measured, and how, is in docs/benchmarks.md.
+    docs/benchmarks.md describes the measurements.
     """
     from pbl_pipeline import bench as b
     from pbl_pipeline.files import check_out_file
@@ -114,7 +114,7 @@ def detect(
 
 
 def keep(benchmark: str, rows: Iterable[Row], path: Path | None) -> list[Row]:
-    """Gather the rows of a benchmark and write them to `path` after each one: a run of hours may be interrupted."""
+    """Collect the rows of a benchmark and write them to `path` after each one: a run of hours may be interrupted."""
     from pbl_pipeline.code_version import code_version
 
     begun = datetime.now(UTC).isoformat(timespec="seconds")

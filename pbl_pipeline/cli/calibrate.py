@@ -46,9 +46,9 @@ def calibrate(
 ) -> None:
     """Measure the lens of a camera from VIDEO, in which it films a flat board from many sides.
 
-    OUT is what --camera of `pbl run`, `pbl detect` and `pbl ingest` reads; beside it a picture shows which parts of the
-    view the board was in and how far the fitted lens is off. Film with the settings of your recordings: the same phone,
-    lens, resolution, stabilisation, and the focus locked. docs/camera.md says how to film and how to read the figures.
+    Pass OUT to --camera of `pbl run`, `pbl detect` and `pbl ingest`; a picture next to it shows which parts of the view
+    the board covered and the residuals of the fitted lens. Film with the settings of your recordings: the same phone,
+    lens, resolution, stabilisation, and the focus locked. docs/camera.md explains filming and the figures.
     """
     import cv2
 

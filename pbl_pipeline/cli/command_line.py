@@ -1,4 +1,4 @@
-"""Finds commands by name, loads only the one called, and turns every error into an exit code and a text on stderr."""
+"""Command line: finds commands by name, loads only the one called, and turns errors into exit codes and texts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
 class Commands(click.Group):
-    """Its own commands, and those that packages above the library register under an entry-point group."""
+    """A group of its own commands and of those that other packages register under an entry-point group."""
 
     entries = "pbl.commands"
 
@@ -36,7 +36,7 @@ class Commands(click.Group):
         return None
 
 
-#: What people want to do, and the commands for it, in the order of doing it.
+#: Tasks and their commands, in the order of use.
 TASKS = {
     "From files to files": ("run", "detect", "fit", "events", "gait", "study", "deidentify"),
     "Begin with the tables": ("demo", "db", "capture", "ingest", "list", "populate", "status", "report", "export"),
@@ -65,7 +65,7 @@ class ByTask(Commands):
 
 
 def _print_version(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
-    """Print version and commit; git is asked only here."""
+    """Print version and commit; git is run only here."""
     if asked and not ctx.resilient_parsing:
         click.echo(f"pbl, version {code_version()}")
         ctx.exit()
@@ -77,7 +77,7 @@ def _print_version(ctx: click.Context, _: click.Parameter, asked: bool) -> None:
     help="Show the version and exit.",
 )  # fmt: skip
 @click.option("--quiet", is_flag=True, help="No progress bars.")
-@click.option("--debug", is_flag=True, help="Print the traceback of an error, too.")
+@click.option("--debug", is_flag=True, help="Also print the traceback of an error.")
 def cli(quiet: bool, debug: bool) -> None:
     """Gait analysis from phone video: joint angles, gait events and a Gait Deviation Index.
 
@@ -88,8 +88,8 @@ def cli(quiet: bool, debug: bool) -> None:
 
 
 def main() -> None:
-    """Entry point of the `pbl` script."""
-    for stream in (sys.stdout, sys.stderr):  # a name that the terminal's encoding lacks must not end the work
+    """Run the `pbl` script."""
+    for stream in (sys.stdout, sys.stderr):  # a character that the terminal's encoding lacks must not end the work
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -103,12 +103,12 @@ def main() -> None:
         sys.exit(EXIT_INTERRUPTED)
     except PblError as error:
         _explain(error)
-    except Exception as error:  # noqa: BLE001 - the last place that can turn a traceback into advice
+    except Exception as error:  # noqa: BLE001 - every error gets a next step instead of a traceback
         _explain(error)
 
 
 def _explain(error: Exception) -> None:
-    # The option is read from the words of the call: the error may have come before any option was.
+    # The option is read from the arguments: the error may have been raised before the options were parsed.
     if "--debug" in sys.argv[1:]:
         traceback.print_exception(error)
     coded = error if isinstance(error, PblError) else _unforeseen(error)
@@ -117,8 +117,7 @@ def _explain(error: Exception) -> None:
 
 
 def _unforeseen(error: Exception) -> PblError:
-    """What is said of an error that no stage gave a code: a full disk and a name too long by theirs, all else as
-    INTERNAL."""
+    """Convert an error without a code: a full disk and a name too long have codes, all others are INTERNAL."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
         return PblError(
             "FILE_UNWRITABLE",

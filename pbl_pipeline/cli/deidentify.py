@@ -1,4 +1,4 @@
-"""`pbl deidentify`: a copy of a video in which nobody can be recognised."""
+"""`pbl deidentify`: a copy of a video in which no one can be recognised."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-#: Runs of frames that are printed; the sidecar has them all.
+#: Most runs of frames that are printed; the sidecar has them all.
 _MOST_RUNS = 10
 
 
@@ -24,15 +24,15 @@ _MOST_RUNS = 10
     "--keep",
     type=click.Choice(["place", "device", "time"]),
     multiple=True,
-    help="What to keep of the metadata; repeatable.",
+    help="Metadata to keep; repeatable.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace files of these names.")
 def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], overwrite: bool) -> None:
     """Write a copy of VIDEO in which the heads of all people are hidden, without sound and metadata.
 
-    Frames and time stamps are those of VIDEO, so that what is computed from VIDEO belongs to both; measure VIDEO, not
-    the copy, in which detectors miss the faces. Beside the copy a .deidentified.json lists the frames that are not
-    certain: look at these before the copy leaves the house. docs/privacy.md says how often a head is covered.
+    Frames and time stamps are those of VIDEO, so that results computed from VIDEO belong to both; measure VIDEO, not
+    the copy, in which detectors miss the faces. A .deidentified.json next to the copy lists the frames that are not
+    certain: review these before you pass the copy on. docs/privacy.md states how often a head is covered.
     """
     from pbl_pipeline.deidentify import REASONS, check_call
     from pbl_pipeline.deidentify import deidentify as run
@@ -53,6 +53,6 @@ def deidentify(video: Path, out: Path | None, how: str, keep: tuple[str, ...], o
             found=f"no head in {len(done.reasons)} frames; {done.path.name} was written, and "
             + ("nothing is drawn in it" if how == "skeleton" else "nothing in it is covered"),
             expected="a person whose head is in the picture",
-            next_step="look at the whole video before it leaves the house; --how skeleton shows no picture at all",
+            next_step="look at the whole video before you pass it on; --how skeleton shows no picture at all",
             key=str(video),
         )

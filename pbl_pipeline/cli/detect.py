@@ -12,7 +12,7 @@ from .options import DEVICE, KEYPOINTS, PEOPLE, Person, keypoint_method, trackin
 @click.command(epilog="Example: pbl detect walk.mp4 --out walk.keypoints.npz --person auto")
 @click.argument("video", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="keypoints.npz to write.")
-@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
+@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is assumed.")
 @click.option("--attitude", type=click.Path(path_type=Path), help="Sensor log of the phone (docs/phone_capture.md).")
 @click.option("--person", type=Person(), default="auto", show_default=True, help="ID of the person to measure.")
 @PEOPLE
@@ -30,9 +30,9 @@ def detect(
 ) -> None:
     """Find the people in VIDEO, choose the one to measure, and write that person's keypoints.
 
-    Where no one is clearly the subject, nothing is measured: a picture with the numbered people is written beside OUT,
-    and the command is to be called again with --person N. With --attitude the keypoints carry the phone's orientation,
-    and the fit then knows where gravity points and how the camera moved.
+    If no one is clearly the subject, nothing is measured: a picture with the numbered people is written next to OUT;
+    call the command again with --person N. With --attitude the keypoints include the phone's orientation, so that the
+    fit knows the direction of gravity and the movement of the camera.
     """
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.keypoints import check_keypoints, confidence_text, detect_keypoints, visibility

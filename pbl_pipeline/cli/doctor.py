@@ -1,4 +1,4 @@
-"""`pbl doctor`: what is installed, which device is used, what is missing and how to get it."""
+"""`pbl doctor`: check of the installation and its devices, with next steps for missing parts."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ OK, NOTE, MISSING = "ok", "note", "missing"
 
 #: Free space (GB) below which a session of videos will not fit.
 _MIN_FREE_GB = 2.0
-#: Where distributions put the server, which is often not on a user's PATH.
+#: Folders where distributions install the server, which is often not on a user's PATH.
 _SERVER_PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One line of the table. `state` is "ok", "note" (works, but read it) or "missing" (needed, with a next step)."""
+    """One line of the table."""
 
     what: str
-    state: str
+    state: str  # "ok", "note" (works, but read it) or "missing" (needed, with a next step)
     detail: str
     next_step: str = ""
 
@@ -43,9 +43,9 @@ class Finding:
 @click.command()
 @click.option("--fetch", is_flag=True, help="First fetch the model and demo files that are missing.")
 def doctor(fetch: bool) -> None:
-    """Say what is installed, which device is used, what is missing and how to get it.
+    """Show what is installed, which device is used, and how to get missing parts.
 
-    Ends with code 0 when everything the default chain needs is there, else 1. Changes nothing without --fetch.
+    Exits with code 0 if everything that the default chain needs is there, else 1. Changes nothing without --fetch.
 
     Example: pbl doctor --fetch
     """
@@ -53,15 +53,13 @@ def doctor(fetch: bool) -> None:
     found = examine(failed)
     _print(found)
     missing = [f for f in found if f.state == MISSING]
-    summary = (
-        f"{len(missing)} missing: {', '.join(f.what for f in missing)}" if missing else "All that is needed is here."
-    )
+    summary = f"{len(missing)} missing: {', '.join(f.what for f in missing)}" if missing else "Nothing is missing."
     click.echo(f"\n{summary}")
     sys.exit(1 if missing else 0)
 
 
 def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
-    """All findings, in the order they are printed. `fetch_errors` says why an asset could not be fetched just now."""
+    """Collect all findings, in the order of printing. `fetch_errors`: asset -> why it could not be fetched just now."""
     found = [_python(), *_packages(), _jax_device(), _jax_cache(), _litert(), _onnx(), _codecs(), _database()]
     found += list(_assets(fetch_errors or {}))
     found += list(_models())
@@ -98,7 +96,7 @@ def _python() -> Finding:
 
 
 def _packages() -> Iterator[Finding]:
-    """The packages that pyproject.toml names, without the extras."""
+    """Find the packages that pyproject.toml requires, without the extras."""
     try:
         lines = requires("pbl-pipeline") or []
     except PackageNotFoundError:
@@ -120,7 +118,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _loads(what: str, check: Callable[[], Finding], next_step: str) -> Finding:
-    """`check()`, with what a broken or absent installation raises turned into a finding."""
+    """Return `check()`, or a finding for the error that a broken or missing installation raises."""
     try:
         return check()
     except (ImportError, OSError, RuntimeError, ValueError, PblError) as error:
@@ -148,7 +146,7 @@ def _jax_cache() -> Finding:
         from pbl_pipeline import jax_setup
 
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what it would warn of is the finding below
+            warnings.simplefilter("ignore")  # its warning is the finding below
             jax_setup.configure()
         jax_setup.import_mjx()
         folder = getattr(jax.config, "jax_compilation_cache_dir", None)
@@ -168,7 +166,7 @@ def _litert() -> Finding:
         detail = f"ai-edge-litert {version('ai-edge-litert')}"
         try:
             detector = assets.ASSETS["blazepose_detector"].path
-        except PblError:  # no cache folder: a finding of its own
+        except PblError:  # no cache folder, which is another finding
             detector = None
         if detector is None or not detector.is_file():
             return Finding("LiteRT", OK, f"{detail}; not tried, no model here yet")
@@ -181,7 +179,7 @@ def _litert() -> Finding:
 
 
 def _onnx() -> Finding:
-    """Which execution providers there are, and on which of them ONNX models will be run."""
+    """Check the execution providers of ONNX models, and which of them will be used."""
 
     def check() -> Finding:
         import onnxruntime
@@ -194,9 +192,9 @@ def _onnx() -> Finding:
         try:
             models.providers_for(asked)
         except PblError as error:
-            return Finding("ONNX runtime", MISSING, f"{detail}; {asked} is asked for", error.next_step)
+            return Finding("ONNX runtime", MISSING, f"{detail}; {asked} is requested", error.next_step)
         if "cuda" in there:
-            return Finding("ONNX runtime", OK, f"{detail}; {asked}: `pbl models verify` tells whether CUDA starts")
+            return Finding("ONNX runtime", OK, f"{detail}; {asked}: `pbl models verify` checks that CUDA starts")
         if shutil.which("nvidia-smi") and asked != "cpu":
             remedy = "pip uninstall onnxruntime && pip install onnxruntime-gpu"
             return Finding("ONNX runtime", NOTE, f"{detail}; an NVIDIA GPU is not used, models run on the CPU", remedy)
@@ -241,22 +239,22 @@ def _codecs() -> Finding:
 
 
 def _database() -> Finding:
-    """A server program, or the server that DJ_HOST names. The tables are not imported: the library stands alone."""
+    """Check for a server program, or the server in DJ_HOST, without the tables: the library does not import them."""
     host = os.environ.get("DJ_HOST")
     if host:
-        return Finding("database", NOTE, f"DJ_HOST names {host}; not contacted", "`pbl db status` asks it")
+        return Finding("database", NOTE, f"DJ_HOST is {host}; not contacted", "`pbl db status` checks it")
     unpacked = settings.home_dir() / "server" / "usr" / "sbin"
     places = os.pathsep.join([os.environ.get("PATH", os.defpath), *_SERVER_PLACES, str(unpacked)])
     server = shutil.which("mariadbd", path=places)
     if server:
-        return Finding("database", OK, f"{server} (embedded; `pbl db status` says whether it runs)")
+        return Finding("database", OK, f"{server} (embedded; `pbl db status` shows whether it runs)")
     other = shutil.which("mysqld", path=places)
     found = f"{other} is MySQL, the embedded server is MariaDB" if other else "no MariaDB server program"
     return Finding(
         "database",
         MISSING,
         f"{found} (`pbl run`, `detect`, `fit`, `events` and `gait` work without)",
-        "`pbl db init` gets it (apt), or set DJ_HOST to a server that runs",
+        "`pbl db init` installs it (apt), or set DJ_HOST to a running server",
     )
 
 
@@ -284,7 +282,7 @@ def _assets(errors: dict[str, PblError]) -> Iterator[Finding]:
 
 
 def _folder(what: str, where: Callable[[], Path], variable: str) -> Finding:
-    """Whether a folder can be written and has room. The home folder may not exist yet: its parent is asked."""
+    """Check that a folder is writable and has room. The home folder may not exist yet: then its parent is checked."""
     try:
         path = where()
         there = path
@@ -294,7 +292,7 @@ def _folder(what: str, where: Callable[[], Path], variable: str) -> Finding:
             pass
         free_gb = shutil.disk_usage(there).free / 1e9
     except OSError as error:
-        return Finding(what, MISSING, f"cannot be written: {error}", f"set {variable} to a folder of your own")
+        return Finding(what, MISSING, f"cannot be written: {error}", f"set {variable} to one of your folders")
     later = "" if path.exists() else ", made on first use"
     detail = f"{path} (writable{later}, {free_gb:.0f} GB free)"
     if free_gb < _MIN_FREE_GB:

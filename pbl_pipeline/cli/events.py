@@ -1,4 +1,4 @@
-"""`pbl events`: foot down and foot up of one file."""
+"""`pbl events`: initial contacts and toe-offs of one file."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _format_error = functools.partial(
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
 @click.option("--method", default="phase-transformer", show_default=True, help=METHOD_HELP)
 def events(file: Path, out: Path, method: str) -> None:
-    """Find foot down and foot up in FILE and write them as CSV.
+    """Find initial contacts and toe-offs in FILE and write them as CSV.
 
     FILE is a fit.npz, a keypoints.npz with 3D markers (its fields decide), or a laboratory's C3D, whose markers are
-    searched whatever its labels say. Where nobody walks, the CSV has only its header and the reason is printed.
+    searched; its own events are ignored. Without walking, the CSV has only its header and the reason is printed.
     """
     from pbl_pipeline.gait import detect_events
 

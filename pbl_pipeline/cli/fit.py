@@ -26,7 +26,7 @@ _ENDS = (".npz", ".keypoints", ".markers")
 @click.option("--params", help="Name of a paramset, or a JSON file with changes to one (docs/files.md).")
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--cameras", type=click.Path(path_type=Path), help="Calibration (TOML): FILES are views of one trial.")
-@click.option("--marker-set", help="Name of a marker set, or a table (CSV) of your own; needed for .trc files.")
+@click.option("--marker-set", help="Name of a marker set, or your own table (CSV); needed for .trc files.")
 @HEIGHT
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
@@ -55,7 +55,7 @@ def fit(
     from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
 
     check_out_folder(out)
-    fit_paramset(solver, params)  # a wrong name is said before anything is read
+    fit_paramset(solver, params)  # raises for a wrong name before anything is read
     table = _marker_set(marker_set)
     trials: Sequence[Any] = [_load(path, table, up) for path in files]
     paramset = fit_paramset(solver, params, points_of(trials))
@@ -82,7 +82,7 @@ def fit(
 
 
 def _marker_set(given: str | None) -> MarkerSet | None:
-    """The table of `--marker-set`: a file where it ends in .csv, else the name of a shipped set."""
+    """Return the table of `--marker-set`: a file if it ends in .csv, else the name of an included set."""
     from pbl_pipeline.body import load_marker_set, marker_set
 
     if given is None:
@@ -91,7 +91,7 @@ def _marker_set(given: str | None) -> MarkerSet | None:
 
 
 def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMarkers:
-    """One file as a trial; markers of a laboratory are put into the order of their marker set."""
+    """Load one file as a trial; markers of a laboratory are sorted as in their marker set."""
     import dataclasses
 
     from pbl_pipeline.files import fields_of
@@ -112,7 +112,7 @@ def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMark
 def _views_of_one(
     views: Sequence[Keypoints | WorldMarkers], stems: Sequence[str], calibration: Path
 ) -> tuple[MultiView, str]:
-    """The files as views of one trial, and the trial's name."""
+    """Return the files as views of one trial, and the trial's name."""
     from pbl_pipeline.keypoints import Keypoints, MultiView, cameras_of_files
 
     seen = [view for view in views if isinstance(view, Keypoints)]

@@ -54,9 +54,9 @@ def gait(
     """Events, cycles, spatiotemporal measures and GDI of one session.
 
     FILES are fits (fit.npz of `pbl fit`), or a laboratory's recordings (C3D with the nine angles of Plug-in Gait).
-    Measures that cannot be trusted are null with a reason. Whether a fit lies on the person stands in the session.json
-    that `pbl fit` wrote beside it: without that it is not known. Where metrics.json is written beside the fits, their
-    events.csv and cycles.npz and the kinetics are too: they belong together.
+    Measures that cannot be trusted are null with a reason. The session.json of `pbl fit` next to a fit states whether
+    it lies on the person: without it that is not known. If metrics.json is written to the folder of the fits, so are
+    their events.csv and cycles.npz and the kinetics, which belong to it.
     """
     from pbl_pipeline import progress
     from pbl_pipeline.files import check_out_file
@@ -99,5 +99,5 @@ def gait(
 
 
 def is_c3d(path: Path) -> bool:
-    """Whether a file is a laboratory's recording, by its name; it may be gzipped."""
+    """True for the name of a laboratory's recording, possibly gzipped."""
     return path.name.lower().removesuffix(".gz").endswith(".c3d")

@@ -13,14 +13,14 @@ _DEVICE = click.option(
 def models() -> None:
     """Keypoint models as ONNX (docs/models.md): list, add, verify, remove.
 
-    A registered model is used with `pbl detect --keypoints NAME`, `pbl run --keypoints NAME` and
-    `pbl ingest --keypoint-method NAME`. None comes with this software; each has its own licence, which is shown.
+    Use a registered model with `pbl detect --keypoints NAME`, `pbl run --keypoints NAME` and
+    `pbl ingest --keypoint-method NAME`. This software includes none; each has its own licence, which is shown.
     """
 
 
 @models.command("list", epilog="Example: pbl models list")
 def list_() -> None:
-    """The registered models, with their licences, and whether their files are what they were."""
+    """List the registered models with their licences, and check that their files are unchanged."""
     from pbl_pipeline import models as library
     from pbl_pipeline import settings
 
@@ -40,11 +40,11 @@ def list_() -> None:
 @models.command(epilog="Example: pbl models add https://lab.example/rtmpose-m.zip --sha256 3f2a...")
 @click.argument("source", metavar="FOLDER_OR_URL")
 @click.option("--sha256", metavar="HEX", help="SHA-256 of the archive; an address needs it.")
-@click.option("--replace", is_flag=True, help="Where another model is registered under the name.")
+@click.option("--replace", is_flag=True, help="Replace another model that is registered under the name.")
 def add(source: str, sha256: str | None, replace: bool) -> None:
     """Register a model from its folder, or from a .zip or .tar archive in a file or at an address.
 
-    Checksum, graph and output shapes are checked, and the model is run once, before anything is kept.
+    Checksum, graph and output shapes are checked, and the model is run once, before anything is stored.
     """
     from pbl_pipeline import models as library
 
@@ -79,7 +79,7 @@ def verify(names: tuple[str, ...], device: str | None) -> None:
 @models.command(epilog="Example: pbl models remove rtmpose-m")
 @click.argument("name")
 def remove(name: str) -> None:
-    """Delete a registered model. Results made with it stay; methods that name it fail until it is added again."""
+    """Delete a registered model. Results made with it stay; methods that use it fail until it is added again."""
     from pbl_pipeline import models as library
 
     click.echo(f"removed {library.remove(name)}")

@@ -19,13 +19,11 @@ if TYPE_CHECKING:
     from pbl_pipeline.tracking import TrackingParams
 
 
-#: Commands that fit: how the camera was held, and what is meant where nobody says.
+#: Motions of the camera, for commands that fit.
 CAMERA_MOTIONS = ("static", "handheld")
-CAMERA_MOTION_HELP = "Default: handheld where the phone's orientation is known, else static."
-
-
+CAMERA_MOTION_HELP = "Default: handheld if the phone's orientation is known, else static."
 HEIGHT = click.option(
-    "--height-m", type=float, help="Measured body height, such as 1.72: lengths and speeds become those of it."
+    "--height-m", type=float, help="Measured body height, such as 1.72: lengths and speeds are scaled to it."
 )
 MASS = click.option(
     "--mass-kg", type=float, help="Measured body mass, such as 68.5: forces can then be shown in newtons."
@@ -35,28 +33,20 @@ LANGUAGE = click.option(
 )
 
 KEYPOINTS = click.option(
-    "--keypoints",
-    "keypoints",
-    metavar="NAME",
-    help="Keypoint method, such as blazepose-heavy, or a model of `pbl models list`.",
+    "--keypoints", metavar="NAME", help="Keypoint method, such as blazepose-heavy, or a model of `pbl models list`."
 )
 DEVICE = click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
-    help="Where ONNX models run (else PBL_ONNX_DEVICE, else CUDA where it works).",
+    help="Device of ONNX models (default: PBL_ONNX_DEVICE, else CUDA if it works).",
 )
-
-
 PEOPLE = click.option(
-    "--people",
-    "people",
-    metavar="NAME",
-    help="Tracking method, such as blazepose-tiles, or a detector of `pbl models list`.",
+    "--people", metavar="NAME", help="Tracking method, such as blazepose-tiles, or a detector of `pbl models list`."
 )
 
 
 def tracking_method(name: str | None) -> Method[TrackingParams]:
-    """The tracking method of `--people`, with its model's licence on the terminal before it is used.
+    """Return the tracking method of `--people`, and print its model's licence before it is used.
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID.
     """
@@ -70,8 +60,8 @@ def tracking_method(name: str | None) -> Method[TrackingParams]:
 
 
 def keypoint_method(name: str | None, device: str | None) -> Method[KeypointParams]:
-    """The keypoint method of `--keypoints`, with its model's licence on the terminal before it is used; ONNX models of
-    this process run on `--device`.
+    """Return the keypoint method of `--keypoints`, and print its model's licence before it is used; ONNX models of this
+    process run on `--device`.
 
     Raises `PblError` SOLVER_UNKNOWN, MODEL_INVALID, MARKER_SET_UNKNOWN, DEVICE_UNAVAILABLE.
     """
@@ -103,13 +93,12 @@ class Person(click.ParamType):
 
 
 def fit_paramset(solver: str | None, params: str | None, points: Sequence[Points] = ()) -> Method[Params]:
-    """Return the fit's method that `--solver` and `--params` ask for; `points`: of the trials, for the default.
+    """Return the fit's method of `--solver` and `--params`; `points`: of the trials, for the default.
 
-    `--params` is a name, or a JSON file of changes to the method that its key "base" names. Without either, and without
-    "base", it is the default method; with `--solver` alone the default one of that solver.
+    `--params` is a name, or a JSON file of changes to the method in its key "base". Without either, and without "base",
+    it is the default method; with `--solver` alone the default one of that solver.
 
-    Raises `PblError` SOLVER_UNKNOWN (also where the method is of another solver than `--solver`), FILE_MISSING,
-    FILE_FORMAT.
+    Raises `PblError` SOLVER_UNKNOWN (also for a method of another solver than `--solver`), FILE_MISSING, FILE_FORMAT.
     """
     from pbl_pipeline.fit import METHODS, default_fit
     from pbl_pipeline.method_file import named_or_file

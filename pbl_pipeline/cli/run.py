@@ -1,4 +1,4 @@
-"""`pbl run`: the whole chain on files, no database."""
+"""`pbl run`: the whole chain on files, without a database."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .options import (
 @click.command(epilog="Example: pbl run walk1.mp4 walk2.mp4 --out results --camera phone.toml")
 @click.argument("videos", nargs=-1, required=True, type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the results.")
-@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is guessed.")
+@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file; without it a phone is assumed.")
 @click.option(
     "--attitude",
     type=click.Path(path_type=Path),
@@ -50,7 +50,7 @@ from .options import (
 @click.option("--norm", help="Normative set of the GDI.")
 @HEIGHT
 @MASS
-@click.option("--activity", help="What the person does in all VIDEOS: tug, sit_to_stand, squat (else: walking).")
+@click.option("--activity", help="Activity in all VIDEOS: tug, sit_to_stand, squat (default: walking).")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
 @LANGUAGE
 def run(
@@ -72,23 +72,23 @@ def run(
     subject: str,
     language: str,
 ) -> None:
-    """Put VIDEOS, the trials of one session, through the whole chain.
+    """Process VIDEOS, the trials of one session, with the whole chain.
 
     Writes report.html, metrics.json, kinetics.json, session.json, and per trial the keypoints, the fit, the angles, the
-    events, the forces and a video with the body drawn over it. A video that cannot be used is named and left out; the
-    others go on, and the exit code is 1.
+    events, the forces and a video with the body drawn over it. A video that cannot be used is reported and left out;
+    the others are processed, and the exit code is 1.
     """
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.pipeline import run_visit, write_results
 
-    # What can be wrong with the call is found before minutes of work.
+    # Wrong arguments are found before minutes of work.
     if person is not None and len(videos) > 1:
         raise PblError(
             "USAGE",
             found=f"person {person} for {len(videos)} videos",
             expected="a person's number with one video: people are numbered anew in each",
-            next_step="leave out --person; where the automatic choice is wrong, run that video alone with --person, "
+            next_step="leave out --person; if the automatic choice is wrong, run that video alone with --person, "
             "or use `pbl ingest` and `pbl choose`, which keep a choice for each video of a visit",
         )
     if attitude and len(attitude) != len(videos):

@@ -23,7 +23,7 @@ def study() -> None:
 @study.command(epilog="Example: pbl study check spine2026")
 @click.argument("folder", type=click.Path(path_type=Path))
 def check(folder: Path) -> None:
-    """Read the FOLDER of a study and refuse what is damaged or contradictory."""
+    """Read the FOLDER of a study and check that it is complete and consistent."""
     from pbl_pipeline.study import content_hash, read_study
 
     data = read_study(folder)
@@ -41,18 +41,18 @@ def check(folder: Path) -> None:
     "Example: pbl study report --slice spine2026 --out spine2026_report"
 )
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
-@click.option("--slice", "name", metavar="NAME", help="A slice of the tables (`pbl study slice`) in place of FOLDER.")
+@click.option("--slice", "name", metavar="NAME", help="A slice of the tables (`pbl study slice`) instead of FOLDER.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for report.html, figures, tables.")
 @click.option(
     "--from", "change_from", default="", metavar="ROLE", help="Change from this visit (default: the study's)."
 )
 @click.option("--to", "change_to", default="", metavar="ROLE", help="Last visit of the change.")
-@click.option("--group", default="", metavar="GROUP", help="The group whose change is judged.")
+@click.option("--group", default="", metavar="GROUP", help="Group whose change is assessed.")
 def report(folder: Path | None, name: str | None, out: Path, change_from: str, change_to: str, group: str) -> None:
-    """One page of a study's FOLDER or slice: who is in and out, repeatability, correlation with scores, change, curves.
+    """Write the report of a FOLDER or slice: participants, repeatability, correlation with scores, change, curves.
 
-    Figures are written as SVG and PDF, tables as CSV and LaTeX. Statistics that the values do not support are a
-    code with its reason.
+    Figures are written as SVG and PDF, tables as CSV and LaTeX. Statistics that the values do not support are replaced
+    by a code with its reason.
     """
     from pbl_pipeline.study import read_study
     from pbl_pipeline.study_report import write_study_report
@@ -65,7 +65,7 @@ def report(folder: Path | None, name: str | None, out: Path, change_from: str, c
 
 
 def _of_slice(name: str) -> Any:
-    """The `StudyData` of a slice, from what the tables register as the entry point `slice` of `pbl.study_data`."""
+    """Load the `StudyData` of a slice through the entry point `slice` of `pbl.study_data`, registered by the tables."""
     found = [e for e in entry_points(group="pbl.study_data") if e.name == "slice"]
     if not found:
         raise click.UsageError("--slice needs the tables, which are not installed")

@@ -19,7 +19,7 @@ class _Speed(click.ParamType):
     epilog="Example: pbl synth --out trials --seed 3 --impairment crouch:0.7 --view sagittal --camera handheld"
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
-@click.option("--name", help="Name of the files (default: from what is asked for).")
+@click.option("--name", help="Name of the files (default: from the options).")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of person, motion, hand and noise.")
 @click.option(
     "--task",
@@ -43,10 +43,10 @@ class _Speed(click.ParamType):
     type=click.Choice(["static", "panned", "handheld"]),
     default="static",
     show_default=True,
-    help="Panned and handheld come with the phone's orientation log.",
+    help="Panned and handheld include the phone's orientation log.",
 )
 @click.option("--marker-set", default="bml_movi_87", show_default=True, help="Points of the detector.")
-@click.option("--seconds", type=float, help="Default: 5 for walk and standing, 10 for others, all of tug, four_square.")
+@click.option("--seconds", type=float, help="Default: 5 for walk, standing; 10 for others; whole tug, four_square.")
 @click.option("--fps", type=float, default=30.0, show_default=True)
 @click.option("--speed", type=_Speed(), help="m/s, or very_slow, slow, free, fast, very_fast (default: the person's).")
 @click.option("--ground", type=click.Choice(["overground", "treadmill"]), default="overground", show_default=True)
@@ -68,7 +68,7 @@ def synth(
 ) -> None:
     """Make a trial whose joint angles, gait events, body and camera are known.
 
-    Writes NAME.keypoints.npz as `pbl detect` would, NAME.truth.npz and NAME.events.csv; see docs/synth.md.
+    Writes NAME.keypoints.npz as `pbl detect`, NAME.truth.npz and NAME.events.csv; see docs/synth.md.
     """
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.synthetic import Impairment, SynthSpec, speed_of_group, synthesise

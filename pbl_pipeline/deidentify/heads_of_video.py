@@ -1,9 +1,8 @@
-"""All heads of a video: people and their keypoints, then faces that no body explains.
+"""All heads of a video: those of people by their keypoints, then faces that belong to none of these.
 
-Faces in a picture: MediaPipe's two detectors, BlazeFace of short and of full range.
-
-Layouts: modules/face_detection of the mediapipe 0.10.21 wheel. Both give a square box from the brows to the chin and
-six points, eyes first. Their faces look into the camera; a head from behind only its body shows.
+Faces are found by MediaPipe's two detectors, BlazeFace of short and of full range (layouts: modules/face_detection of
+the mediapipe 0.10.21 wheel). Both return a square box from the brows to the chin and six points, eyes first, of faces
+that look into the camera; a head from behind is only found by its body.
 """
 
 from __future__ import annotations
@@ -26,22 +25,22 @@ from .types import BODY, DISAGREE, FACE, HELD, KEYPOINTS, NONE, Head, HeadParams
 
 #: Points that make the face in the marker set `blazepose_33`.
 FACE_WORDS = ("nose", "eye", "ear", "mouth")
-#: Frames around one that say where its head should be.
+#: Frames before and after one whose heads show where its head should be.
 _AROUND = 3
 
 
 def is_face(name: str) -> bool:
-    """Whether a keypoint is of the face."""
+    """True for a keypoint of the face."""
     return any(word in name.split("_") for word in FACE_WORDS)
 
 
 def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams) -> Head:
-    """The head of a tracked person in every frame in which she is in view, not yet held over gaps.
+    """Find the head of a tracked person in every frame in which she is in view, without holding it over gaps.
 
-    Where the points of the head were found, the circle is around the middle of the ears, or of those points of the face
-    that are in the picture. `head_radius_m` becomes pixels by the size of the body: the spread of all keypoints in the
-    picture over their spread in metres across the line of sight (a weak perspective). Elsewhere the circle is around
-    the upper end of the body.
+    If points of the head were found, the circle is around the middle of the ears, or of those points of the face that
+    are in the picture. `head_radius_m` is converted to pixels by the size of the body: the spread of all keypoints in
+    the picture over their spread in metres across the line of sight (a weak perspective). Otherwise the circle is
+    around the upper end of the body.
     """
     from_body = body_end(track.roi_px, params)
     circle, source = from_body.copy(), np.where(np.isfinite(from_body).all(axis=1), BODY, NONE).astype(np.uint8)
@@ -50,17 +49,17 @@ def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams)
     circle[known], source[known] = seen[known], KEYPOINTS
     radius = track.roi_px[:, 2] / 2
     apart = np.linalg.norm(seen[:, :2] - from_body[:, :2], axis=1)
-    wrong = known & (apart > params.agree * radius)  # NaN compares as False: without a body nothing disagrees
+    wrong = known & (apart > params.agree * radius)  # False for NaN: without a body nothing disagrees
     jumped = known & (off_course(seen) > params.jump * seen[:, 2])
     source[wrong | jumped] = DISAGREE
-    # Whom to believe is not known: the circle that holds both.
+    # Either may be right: the circle that contains both.
     for t in np.flatnonzero(wrong):
         circle[t] = around_both(seen[t], from_body[t])
     return Head(circle, source, track.box_px, keypoints.xy_px, keypoints.names)
 
 
 def head_circle(keypoints: Keypoints, params: HeadParams) -> np.ndarray:
-    """(T, 3) the circle of the head by the keypoints, NaN where no point of the face is in the picture."""
+    """(T, 3) circle of the head by the keypoints, NaN if no point of the face is in the picture."""
     names = keypoints.names
     face = np.array([is_face(n) for n in names])
     ears = np.array(["ear" in n.split("_") for n in names])
@@ -84,7 +83,7 @@ def px_per_m(keypoints: Keypoints) -> np.ndarray:
 
 
 def body_end(roi_px: np.ndarray, params: HeadParams) -> np.ndarray:
-    """(T, 3) the circle at the upper end of a region of interest (T, 4): where the head of a body is that fills it."""
+    """(T, 3) circle at the upper end of a region of interest (T, 4), around the head of a body that fills it."""
     roi = np.asarray(roi_px, float)
     radius = roi[:, 2] / 2
     up = np.column_stack([np.sin(roi[:, 3]), -np.cos(roi[:, 3])])
@@ -92,7 +91,7 @@ def body_end(roi_px: np.ndarray, params: HeadParams) -> np.ndarray:
 
 
 def off_course(circle: np.ndarray) -> np.ndarray:
-    """(T,) how far (px) each centre is from the median of those around it; NaN without any."""
+    """(T,) distance (px) of each centre from the median of those around it; NaN without any."""
     shifted = []
     for step in (s for s in range(-_AROUND, _AROUND + 1) if s):
         moved = np.full((len(circle), 2), np.nan)
@@ -108,7 +107,7 @@ def off_course(circle: np.ndarray) -> np.ndarray:
 
 
 def around_both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest circle (3,) that holds two circles (3,)."""
+    """Smallest circle (3,) that contains two circles (3,)."""
     apart = float(np.hypot(*(b[:2] - a[:2])))
     if apart + min(a[2], b[2]) <= max(a[2], b[2]):
         return a if a[2] >= b[2] else b
@@ -117,7 +116,7 @@ def around_both(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the second axis of those that are known, NaN where none is."""
+    """Mean of the known values over the second axis, NaN without any."""
     known = np.isfinite(values)
     count = known.sum(axis=1)
     total = np.where(known, values, 0.0).sum(axis=1)
@@ -125,11 +124,11 @@ def mean(values: np.ndarray) -> np.ndarray:
 
 
 def held(head: Head, time_s: np.ndarray, size_px: tuple[int, int], params: HeadParams) -> Head:
-    """The head with its gaps filled; where its place is in doubt, also where the sure frames around say it is.
+    """Fill the gaps of a head, and add second circles from the certain frames around where its position is in doubt.
 
     Gaps up to `bridge_s` are interpolated. Beyond the ends, and at both sides of a longer gap, the circle stays: for
-    `hold_s`, but no longer than the head was seen (a wrong sighting is short), or `leave_s` where it touches the edge
-    of the picture, through which a head comes and goes. It grows meanwhile.
+    `hold_s`, but no longer than the head was seen (a wrong sighting is short), or `leave_s` if it touches the edge of
+    the picture, through which a head comes and goes. It grows meanwhile.
     """
     n_seen = int((head.source != NONE).sum())
     seen_s = n_seen * float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
@@ -142,7 +141,7 @@ def held(head: Head, time_s: np.ndarray, size_px: tuple[int, int], params: HeadP
     circle = head.circle_px.copy()
     absent = np.flatnonzero(head.source == NONE)
     _fill(circle, head.circle_px, np.flatnonzero(head.source != NONE), absent, time_s, size_px, params)
-    # A track that goes astray before it ends leaves its head where it was last sure.
+    # A track that drifts off before it ends leaves its head at its last certain position.
     _fill(also, head.circle_px, np.flatnonzero(sure), absent, time_s, size_px, params)
     source = head.source.copy()
     filled = np.isfinite(circle[absent]).all(axis=1) | np.isfinite(also[absent]).all(axis=1)
@@ -159,7 +158,7 @@ def _fill(
     size_px: tuple[int, int],
     params: HeadParams,
 ) -> None:
-    """Write into the rows `wanted` of `out` the circles held from the rows `known` of `circle`, where any is."""
+    """Write the circles held from the rows `known` of `circle` into the rows `wanted` of `out`, if there are any."""
     if not len(known):
         return
     for t in wanted:
@@ -189,7 +188,7 @@ def _grown(circle: np.ndarray, for_s: float, params: HeadParams) -> np.ndarray:
 
 FULL_RANGE = SsdLayout(input_size=192, layers=((4, 1),), n_keypoints=6)
 SHORT_RANGE = SsdLayout(input_size=128, layers=((8, 2), (16, 6)), n_keypoints=6)
-#: Boxes of two windows that overlap more are of one face.
+#: Overlap above which boxes of two windows are of one face.
 SAME_IOU = 0.2
 
 
@@ -205,12 +204,12 @@ class FaceDetector:
         self.models = {"face_detector": self._full.sha256, "face_detector_near": self._short.sha256}
 
     def detect(self, image: np.ndarray, windows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes (N, 4) x0, y0, x1, y1 in px and scores (N,), best first, of the faces in the `windows` (x0, y0, x1, y1)
-        of `image` (H, W, 3) uint8 BGR. The short range's network looks at the whole picture only."""
+        """Find faces in the `windows` (x0, y0, x1, y1) of `image` (H, W, 3) uint8 BGR: boxes (N, 4) x0, y0, x1, y1 in
+        px and scores (N,), best first. The short range's network is applied to the whole picture only."""
         height, width = image.shape[:2]
         boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
-        looks = [(self._full, w) for w in windows] + [(self._short, (0, 0, width, height))]
-        for model, (x0, y0, x1, y1) in looks:
+        parts = [(self._full, w) for w in windows] + [(self._short, (0, 0, width, height))]
+        for model, (x0, y0, x1, y1) in parts:
             points, score = model.find(image[y0:y1, x0:x1])
             boxes.append(points[:, :2].reshape(-1, 4) + np.array([x0, y0, x0, y0]))
             scores.append(score)
@@ -220,7 +219,7 @@ class FaceDetector:
 
 
 def same_face(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(N,) overlap of a box (4,) with boxes (N, 4), 0 where they are not of one face."""
+    """(N,) overlap of a box (4,) with boxes (N, 4), 0 if they are not of one face."""
     overlap = box_iou(box, boxes)
     return np.where(overlap > SAME_IOU, overlap, 0.0)
 
@@ -233,11 +232,11 @@ _FRAMES_AHEAD = 4
 
 
 def find_heads(video_path: str | Path, params: HeadParams | None = None, info: VideoInfo | None = None) -> Heads:
-    """Find the heads of everybody in a video, in every frame, held over gaps.
+    """Find the heads of all people in a video, in every frame, held over gaps.
 
-    The video is decoded once for the people, once for the keypoints of each of them, and once for the faces; frames
-    stream, so that memory does not grow with the length but by the circles. `info` is what `video.probe` said of the
-    file. Where nobody is found, the `Heads` are empty.
+    The video is decoded once for the people, once for the keypoints of each person, and once for the faces; memory
+    grows with its length by the circles only. `info` is the result of `video.probe`. Without people the `Heads` are
+    empty.
 
     Raises the `PblError`s of `video.probe`, `tracking.track_people`, `keypoints.detect_keypoints`, `assets.fetch`.
     """
@@ -268,7 +267,7 @@ class _Face:
 
 
 def _sightings(video_path: str | Path, info: VideoInfo, params: HeadParams) -> list[_Face]:
-    """All faces in frames `face_interval_s` apart."""
+    """Find all faces in frames `face_interval_s` apart."""
     detector = FaceDetector(params.face_score)
     sizes = [tiles(info.width_px, info.height_px, f, params.face_overlap) for f in params.face_tiles]
     turns = itertools.cycle(sizes)
@@ -285,7 +284,7 @@ def _sightings(video_path: str | Path, info: VideoInfo, params: HeadParams) -> l
 
 
 def _confirmed(head: Head, faces: Sequence[_Face]) -> Head:
-    """The head, no longer in doubt in frames in which a face looks out of its circle."""
+    """Return the head, no longer in doubt in frames with a face in its circle."""
     source = head.source.copy()
     for face in faces:
         if source[face.index] == DISAGREE and _inside(face, head):
@@ -294,7 +293,7 @@ def _confirmed(head: Head, faces: Sequence[_Face]) -> Head:
 
 
 def _trails(faces: Sequence[_Face], time_s: np.ndarray, params: HeadParams) -> list[list[_Face]]:
-    """The faces that are seen often enough, each with its sightings in order of time."""
+    """Group the sightings by face, in order of time, and drop faces that are seen too rarely."""
     trails: list[list[_Face]] = []
     for face in faces:
         live = [t for t in trails if 0 < time_s[face.index] - time_s[t[-1].index] <= params.face_gap_s]
@@ -307,12 +306,12 @@ def _trails(faces: Sequence[_Face], time_s: np.ndarray, params: HeadParams) -> l
 
 
 def _explained(trail: Sequence[_Face], heads: Sequence[Head]) -> bool:
-    """Whether every sighting lies in the circle of a known head."""
+    """True if every sighting lies in the circle of a known head."""
     return all(any(_inside(face, head) for head in heads) for face in trail)
 
 
 def _on_body(trail: Sequence[_Face], heads: Sequence[Head]) -> bool:
-    """Whether most sightings lie within the box of a person whose head is surely elsewhere."""
+    """True if most sightings lie within the box of a person whose head is certainly elsewhere."""
     n = sum(any(_within_box(face, head) for head in heads) for face in trail)
     return n > len(trail) / 2
 
@@ -332,7 +331,7 @@ def _inside(face: _Face, head: Head) -> bool:
 
 
 def _of_face(trail: Sequence[_Face], time_s: np.ndarray, params: HeadParams) -> Head:
-    """The head of a face, interpolated between its sightings."""
+    """Head of a face, interpolated between its sightings."""
     at = [face.index for face in trail]
     boxes = np.array([face.box_px for face in trail])
     side = (boxes[:, 2:] - boxes[:, :2]).max(axis=1)

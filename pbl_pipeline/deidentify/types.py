@@ -1,4 +1,4 @@
-"""Heads over a video: where, and how surely; how they are searched, how large and how long."""
+"""Heads over a video with their certainty, and the parameters of finding them."""
 
 from __future__ import annotations
 
@@ -14,28 +14,9 @@ from pbl_pipeline.tracking import AssociationParams, TrackingParams, WatchParams
 
 @dataclasses.dataclass(frozen=True)
 class HeadParams:
-    """Parameters of `find_heads`. Margins are tuned on the clips that docs/privacy.md names, and reported on others.
+    """Parameters of `find_heads`. Margins were tuned on the clips that docs/privacy.md names, and tested on others."""
 
-    tracking: finds smaller and less sure people than measuring asks for; a false one costs a blurred patch of wall.
-    keypoints: those of all people, however briefly in view.
-    head_radius_m: of the circle around the middle of the ears, in metres of the detector's own body; the vertex and the
-    chin lie 0.13 m from there, hair and error come on top.
-    head_face: the same as a multiple of the largest distance between two points of the face; the larger one counts.
-    up, body_radius: where the body's upper end is taken to be, and its circle, in radii of the region of interest.
-    agree: a head farther than this from `up`, in the same unit, disagrees.
-    jump: so does one farther than this many head radii from where the frames around say.
-    face_score, face_sure, face_gap_s: a face counts from this score, if its scores add up to `face_sure` with no longer
-    gap between them (two sure sightings, three less sure ones).
-    face_on_body: what the scores must add up to where the face lies on the body of a person whose head is known: knees
-    and folds of cloth are taken for faces, and a blurred knee is not measured.
-    face_interval_s, face_tiles, face_overlap: searched so often, on tiles of these fractions of the shorter side by
-    turns.
-    face_radius: of the circle, in sides of the face's box.
-    hold_s, leave_s, bridge_s: a head is held so long before it is first and after it is last found; the same where it
-    touches the edge of the picture, and a face without a body; and over gaps up to this.
-    hold_growth: the circle grows meanwhile, by this many of its radii per second, to at most `hold_most` radii.
-    """
-
+    # Finds smaller and less certain people than measuring needs; a false one only blurs a patch of wall.
     tracking: TrackingParams = dataclasses.field(
         default_factory=lambda: TrackingParams(
             min_score=0.4,
@@ -44,33 +25,38 @@ class HeadParams:
             association=AssociationParams(sure_score=0.5),
         )
     )
+    # Of all people, however briefly in view.
     keypoints: KeypointParams = dataclasses.field(default_factory=lambda: KeypointParams(min_time_s=0.0, sides=None))
+    # Radius of the circle around the middle of the ears, in metres of the detector's body; the vertex and the chin are
+    # 0.13 m from there, and hair and error are added.
     head_radius_m: float = 0.2
-    head_face: float = 1.1
-    up: float = 0.76
-    body_radius: float = 0.42
-    agree: float = 0.3
-    jump: float = 0.5
-    face_score: float = 0.6
-    face_sure: float = 1.2
+    head_face: float = 1.1  # the same over the largest distance between two points of the face; the larger one is used
+    up: float = 0.76  # distance of the body's upper end from its middle, in radii of the region of interest,
+    body_radius: float = 0.42  # and the radius of its circle
+    agree: float = 0.3  # a head farther than this from the upper end, in the same unit, disagrees,
+    jump: float = 0.5  # and so does one farther than this many head radii from the heads in the frames around
+    face_score: float = 0.6  # least score of a sighting
+    face_sure: float = 1.2  # least sum of the scores of a face (two certain sightings, three less certain ones)
+    # The same for a face on the body of a person whose head is known: knees and folds of cloth are taken for faces, and
+    # a blurred knee is not measured.
     face_on_body: float = 5.0
-    face_gap_s: float = 0.5
-    face_interval_s: float = 0.1
-    face_tiles: tuple[float, ...] = (0.5, 0.25)
+    face_gap_s: float = 0.5  # longest gap between sightings of one face
+    face_interval_s: float = 0.1  # interval of the frames that are searched
+    face_tiles: tuple[float, ...] = (0.5, 0.25)  # sides of the tiles over the shorter side of the picture, in turn
     face_overlap: float = 0.3
-    face_radius: float = 1.1
-    hold_s: float = 2.0
-    leave_s: float = 0.5
-    bridge_s: float = 2.0
-    hold_growth: float = 1.0
-    hold_most: float = 2.0
+    face_radius: float = 1.1  # radius of the circle, in sides of the face's box
+    hold_s: float = 2.0  # time for which a head is held before it is first and after it is last found
+    leave_s: float = 0.5  # the same if it touches the edge of the picture, and for a face without a body
+    bridge_s: float = 2.0  # longest gap over which a head is interpolated
+    hold_growth: float = 1.0  # growth of a held circle per second, in its radii,
+    hold_most: float = 2.0  # and its largest size
 
 
-#: How the circle of a head in a frame was obtained, by its number in `Head.source`: keypoints and faces are certain
-#: enough to need no look of a person.
+#: Origins of the circle of a head in a frame, by number in `Head.source`: keypoints and faces are certain enough not to
+#: be reviewed.
 SOURCES = ("none", "keypoints", "face", "disagree", "body", "held")
 NONE, KEYPOINTS, FACE, DISAGREE, BODY, HELD = range(len(SOURCES))
-#: Why a frame is not certain -> what a person is told.
+#: Reason why a frame is not certain -> its text.
 REASONS: dict[str, str] = {
     "no_head": "no head was found in the frame",
     "held": "a head was not found; its place is carried over from frames before and after",
@@ -82,20 +68,15 @@ REASONS: dict[str, str] = {
 
 @dataclasses.dataclass(frozen=True)
 class Head:
-    """One head over the T frames of a video.
+    """One head over the T frames of a video."""
 
-    circle_px (T, 3): centre x, y and radius in px of the upright frame, around all of the head with hair and margin;
-    NaN where there is none. also_px (T, 3): a second one, in frames in which the first is in doubt. source (T,) uint8:
-    numbers of `SOURCES`. body_px (T, J, 2) and body_names: the person's
-    keypoints, for drawing; None for a face without a body. box_px (T, 4): x0, y0, x1, y1 of the person, or NaN.
-    """
-
+    #: (T, 3) centre x, y and radius in px of the upright frame, around the whole head with hair and margin, or NaN
     circle_px: np.ndarray
-    source: np.ndarray
-    box_px: np.ndarray
-    body_px: np.ndarray | None = None
-    body_names: tuple[str, ...] = ()
-    also_px: np.ndarray | None = None
+    source: np.ndarray  # (T,) uint8 numbers of `SOURCES`
+    box_px: np.ndarray  # (T, 4) x0, y0, x1, y1 of the person, or NaN
+    body_px: np.ndarray | None = None  # (T, J, 2) the person's keypoints, for drawing; None for a face without a body
+    body_names: tuple[str, ...] = ()  # J
+    also_px: np.ndarray | None = None  # (T, 3) a second circle, in frames in which the first is in doubt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +88,8 @@ class Heads:
     heads: tuple[Head, ...]
 
     def circles(self, index: int, spread_s: float = 0.0) -> list[np.ndarray]:
-        """For each head that is there: its circles (N, 3) in the frames within `spread_s` of frame `index`, so that
-        one frame's error uncovers nothing. A head that is only in other frames counts."""
+        """Circles (N, 3) of each head in the frames within `spread_s` of frame `index`, so that an error in one frame
+        uncovers nothing."""
         first, last = np.searchsorted(self.time_s, self.time_s[index] + np.array([-1.0, 1.0]) * (spread_s + 1e-9))
         first, last = int(first), max(int(last), index + 1)
         found = []
@@ -122,7 +103,7 @@ class Heads:
         return found
 
     def reasons(self) -> list[tuple[str, ...]]:
-        """For each frame why it is not certain, names of `REASONS`; empty where it is."""
+        """Reasons why each frame is not certain, names of `REASONS`; empty if it is."""
         names: list[set[str]] = [set() for _ in self.time_s]
         seen = np.zeros(len(self.time_s), bool)
         width, height = self.image_size_px

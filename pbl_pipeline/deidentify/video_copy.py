@@ -1,4 +1,4 @@
-"""A recording without faces: the pictures, the file around them, and what a person should look at again."""
+"""Copies of recordings without faces, and the list of frames that a person should review."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .types import REASONS, HeadParams, Heads, ranges
 BLUR_RADII = 0.4
 #: Side of a cell, in radii.
 CELL_RADII = 0.4
-#: The blur is computed on a picture in which a radius has this many pixels.
+#: Radius in the reduced picture that is blurred, px.
 _RADIUS_PX = 10.0
 _SHIFT = 4  # OpenCV's circles carry this many fractional bits
 _unwritable = functools.partial(
@@ -53,7 +53,7 @@ def cover(image: np.ndarray, circles: Sequence[np.ndarray], how: str) -> None:
     """Hide all circles (for each head (N, 3): centre x, y, radius in px) in `image` (H, W, 3) uint8 BGR, in place.
 
     `how` is "blur", a Gaussian of `BLUR_RADII`, or "pixelate", the means of cells of `CELL_RADII`. Both scale with the
-    head, so that as little is left of a near face as of a far one.
+    head, so that a near face is hidden as well as a far one.
     """
     for rows in circles:
         _cover_one(image, np.asarray(rows, float), how)
@@ -104,7 +104,7 @@ def _smaller(part: np.ndarray, factor: float) -> np.ndarray:
 
 
 HOW = DEIDENTIFY
-#: What may be kept of the file's metadata, and how the names of its tags begin.
+#: Metadata of the file that may be kept, and the beginnings of the names of its tags.
 KEEP: Mapping[str, tuple[str, ...]] = {
     "place": ("location", "com.apple.quicktime.location"),
     "device": (
@@ -113,31 +113,27 @@ KEEP: Mapping[str, tuple[str, ...]] = {
     ),
     "time": ("creation_time", "com.apple.quicktime.creationdate", "date"),
 }
-#: Kept without being asked for: it says that time runs slower than the movement did, and nothing of a person.
+#: Always kept: it shows slow motion, and nothing about a person.
 _ALWAYS = ("com.android.capture.fps", "com.apple.quicktime.capture.fps")
-#: Status of a result: every frame certain; some to be looked at; nothing was covered.
+#: Status of a result: every frame certain; some to be reviewed; nothing was covered.
 STATUSES = ("CERTAIN", "REVIEW", "NO_HEAD")
 SIDECAR_VERSION = 1
-#: A frame also hides where the head is in the frames within this time (s).
+#: The positions of the head in the frames within this time (s) are also covered.
 SPREAD_S = 0.05
-_QUALITY = 18  # x264's crf: results computed from the pictures should be those of the original
+_QUALITY = 18  # x264's crf, so that results computed from the copy are those of the original
 
 
 @dataclasses.dataclass(frozen=True)
 class Deidentified:
-    """What became of a video.
-
-    path, sidecar: the files. how: one of `HOW`. n_heads: heads that were found. status: one of `STATUSES`, `reason` a
-    sentence. reasons: for each of the T frames, why it is not certain (names of `REASONS`), empty where it is.
-    """
+    """Result for one video."""
 
     path: Path
     sidecar: Path
-    how: str
+    how: str  # one of `HOW`
     n_heads: int
-    status: str
-    reason: str
-    reasons: tuple[tuple[str, ...], ...]
+    status: str  # one of `STATUSES`
+    reason: str  # of the status, a sentence
+    reasons: tuple[tuple[str, ...], ...]  # (T,) why each frame is not certain, names of `REASONS`; empty if it is
 
     @property
     def uncertain(self) -> list[tuple[int, int]]:
@@ -145,25 +141,25 @@ class Deidentified:
         return ranges([bool(r) for r in self.reasons])
 
     def why(self, first: int, last: int) -> tuple[str, ...]:
-        """The reasons of a run of frames, in the order of `REASONS`."""
+        """Reasons of a run of frames, in the order of `REASONS`."""
         found = {r for of_frame in self.reasons[first : last + 1] for r in of_frame}
         return tuple(r for r in REASONS if r in found)
 
     @property
     def n_uncertain(self) -> int:
-        """Frames that are not certain."""
+        """Number of frames that are not certain."""
         return sum(bool(r) for r in self.reasons)
 
 
 def sidecar_of(out: Path) -> Path:
-    """Where what is known of a de-identified video is written: `walk.deidentified.json` for `walk.deidentified.mp4` and
-    for `walk.mp4`."""
+    """Path of the facts about a de-identified video: `walk.deidentified.json` for `walk.deidentified.mp4` and for
+    `walk.mp4`."""
     stem = out.stem.removesuffix(".deidentified")
     return out.with_name(f"{stem}.deidentified.json")
 
 
 def check_call(video: Path, out: Path, how: str, keep: Collection[str], overwrite: bool) -> None:
-    """What can be wrong before anything is read. Raises `PblError` USAGE, FILE_UNWRITABLE."""
+    """Check the arguments before anything is read. Raises `PblError` USAGE, FILE_UNWRITABLE."""
     if how not in HOW:
         raise _usage(f"--how {how}", f"one of {', '.join(HOW)}")
     if unknown := [k for k in keep if k not in KEEP]:
@@ -189,12 +185,12 @@ def deidentify(
     info: VideoInfo | None = None,
     heads: Heads | None = None,
 ) -> Deidentified:
-    """Write a video in which no head can be recognised, and beside it what a person should look at (docs/files.md).
+    """Write a video in which no head can be recognised, and a list of frames that a person should review
+    (docs/files.md).
 
-    Every frame of the original is there, upright, at its own time stamp; sound, and all metadata but those of `keep`
-    (names of `KEEP`), are not. Both files appear complete or not at all. A video in which no head is found is written
-    as it is, and its status says so. Memory does not grow with the length of the video but by a circle per head and
-    frame.
+    The copy has every frame of the original, upright, at its own time stamp, without sound, and without metadata except
+    those of `keep` (names of `KEEP`). Both files appear complete or not at all. A video in which no head is found is
+    written as it is, with that status. Memory grows with the length of the video by a circle per head and frame only.
 
     Raises `PblError` USAGE, FILE_UNWRITABLE (`check_call`); VIDEO_* for a file that cannot be read; VIDEO_CHANGED;
     ASSET_*.
@@ -204,9 +200,9 @@ def deidentify(
     video, out
         The recording, and an .mp4 file.
     how
-        "blur", "pixelate", or "skeleton": the bodies' keypoints on black.
+        "blur", "pixelate", or "skeleton" (the bodies' keypoints on black).
     params, info, heads
-        How heads are found; what `video.probe` said; heads that were found before.
+        Parameters of finding heads; result of `video.probe`; heads that were found before.
     """
     video, out = Path(video), Path(out)
     check_call(video, out, how, keep, overwrite)
@@ -238,10 +234,9 @@ def deidentify(
 
 
 def to_show(video: str | Path, folder: Path, info: VideoInfo | None = None) -> Path:
-    """The recording itself, or where PBL_DEIDENTIFY asks for it a de-identified copy that is written into `folder`.
+    """Return the recording itself or, as PBL_DEIDENTIFY requires, a de-identified copy written into `folder`.
 
-    Raises the `PblError`s of `deidentify`, and HEAD_NOT_FOUND: what is shown must not be a picture of which nothing
-    was covered.
+    Raises the `PblError`s of `deidentify`, and HEAD_NOT_FOUND if nothing was covered.
     """
     how = deidentify_how()
     if not how:
@@ -253,7 +248,7 @@ def to_show(video: str | Path, folder: Path, info: VideoInfo | None = None) -> P
 
 
 def covered_picture(image: np.ndarray, heads: Heads, index: int, how: str) -> np.ndarray:
-    """Frame `index` as the de-identified video shows it, from `image` (H, W, 3) uint8 BGR, which stays."""
+    """Frame `index` of the de-identified video, from `image` (H, W, 3) uint8 BGR, which is not changed."""
     if how == "skeleton":
         picture = np.zeros_like(image)
         for head in heads.heads:
@@ -277,7 +272,7 @@ def _pictures(video: Path, info: VideoInfo, heads: Heads, how: str) -> Iterator[
             "VIDEO_CHANGED",
             found=f"{'more than ' if n > info.n_frames else ''}{min(n, info.n_frames)} frames",
             expected=f"the {info.n_frames} frames that were probed",
-            next_step="run it again on a file that nobody writes to",
+            next_step="run it again when the file is complete",
             key=str(video),
         )
 
@@ -292,21 +287,21 @@ def _status(heads: Heads, reasons: tuple[tuple[str, ...], ...]) -> tuple[str, st
 
 
 def _kept(video: Path, keep: Collection[str]) -> dict[str, str]:
-    """The tags of the file that go over to the new one."""
+    """Tags of the file that are copied to the new one."""
     begins = tuple(b for name in keep for b in KEEP[name])
     found = read_metadata(video)
     return {n: text for n, text in found.items() if n in _ALWAYS or (begins and _is_of(n, begins))}
 
 
 def _is_of(name: str, begins: tuple[str, ...]) -> bool:
-    """Whether a tag is one of these, or below one that ends in a dot, or a language of it (`location-eng`)."""
+    """True if a tag is one of these, or below one that ends in a dot, or a language of it (`location-eng`)."""
     return any(name == b or name.startswith((b,) if b.endswith(".") else (f"{b}-", f"{b}.")) for b in begins)
 
 
 def _content(
     done: Deidentified, info: VideoInfo, sha256: str, params: HeadParams, keep: Collection[str]
 ) -> dict[str, Any]:
-    """What the sidecar says. The original is named by its hash alone: names of files are often names of people."""
+    """Content of the sidecar. The original is named by its hash alone: names of files are often names of people."""
     counts = collections.Counter(r for of_frame in done.reasons for r in of_frame)
     return {
         "format": "pbl-deidentified",

@@ -29,19 +29,19 @@ _AXES = {"tx": "x", "ty": "y", "tz": "z"}
 
 
 class Labels(NamedTuple):
-    """Labels of a visit in names of files, letters and digits; `visit` is empty for the only one of a person."""
+    """Labels of a visit in names of files, letters and digits; `visit` is "" for a person's only visit."""
 
     participant: str = "01"
     visit: str = ""
 
     @classmethod
     def of(cls, participant: str, visit: str) -> Labels:
-        """Return the labels of codes, without the characters that labels cannot have."""
+        """Return the labels of codes, without characters that labels cannot have."""
         return cls(*("".join(c for c in text if c.isascii() and c.isalnum()) for text in (participant, visit)))
 
     @property
     def folder(self) -> str:
-        """The folder of the visit in the data set."""
+        """Folder of the visit in the data set."""
         return f"sub-{self.participant}" + (f"/ses-{self.visit}" if self.visit else "")
 
 
@@ -61,14 +61,14 @@ def bids_files(
 ) -> dict[str, bytes]:
     """Return the content of each file by its path in the data set.
 
-    Raises `PblError` EXPORT_INPUT where the data set has a participants.tsv to which no participant can be added.
+    Raises `PblError` EXPORT_INPUT if no participant can be added to the participants.tsv of the data set.
 
     Parameters
     ----------
     origins
-        By the name of a trial, how it was made (`provenance.origin_of`).
+        Name of a trial -> its origin (`provenance.origin_of`).
     root
-        Folder of the data set. Its README, description and participants are kept where they are there already.
+        Folder of the data set. An existing README, description and list of participants are kept.
     """
     out = {name: data for name, data in _of_data_set().items() if not (root / name).exists()}
     out[_PARTICIPANTS] = _with_participant(root / _PARTICIPANTS, f"sub-{labels.participant}")
@@ -96,7 +96,7 @@ def bids_files(
 
 
 def _with_participant(path: Path, participant: str) -> bytes:
-    """Return the table of participants with a row for one of them, the rows and columns that it has already kept."""
+    """Return the table of participants with a row for one of them, and its existing rows and columns."""
     try:
         lines = read_text(path).splitlines() if path.exists() else ["participant_id"]
     except (OSError, ValueError) as error:
@@ -120,7 +120,7 @@ def _no_table(path: Path, found: str) -> PblError:
 
 
 def check_labels(root: Path, labels: Labels, overwrite: bool) -> None:
-    """Raise `PblError` EXPORT_INPUT for a visit without a label, or whose folder the data set has already."""
+    """Raise `PblError` EXPORT_INPUT for a visit without a label, or whose folder already exists in the data set."""
     found = ""
     if not labels.participant:
         found = "a code without a letter or digit"
@@ -177,8 +177,7 @@ def _channels(trial: ExportTrial) -> list[_Channel]:
 
 
 def _frames(trial: ExportTrial) -> dict[str, Any]:
-    """The frames of reference. The heading is that of the camera at the start, or of the laboratory: no axis is the
-    person's forwards."""
+    """Frames of reference. The heading is that of the camera at the start, or of the laboratory, not of the person."""
     shared = {"RotationRule": "right-hand", "RotationOrder": "n/a"}
     return {
         "world": {**shared, "SpatialAxes": "__U", "Description": f"z up; vertical {trial.fit.orientation_source}"},

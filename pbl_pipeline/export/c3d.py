@@ -1,4 +1,4 @@
-"""`.c3d`: markers, segment poses, events and the phone's sensors, as gait laboratories' programs read them."""
+"""`.c3d`: markers, segment poses, events and the phone's sensors, for gait laboratories' programs."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from .trial import EvenTrial, ExportTrial
 _EVENTS = {"foot_down": ("Foot Strike", 1), "foot_up": ("Foot Off", 2)}
 #: The frame numbers of a C3D have 16 bits.
 _LAST_FRAME = 65535
-#: Analog samples per frame at most: what a phone's sensors do not exceed at 25 frames a second.
+#: Most analog samples per frame: enough for a phone's sensors at 25 frames a second.
 _MOST_PER_FRAME = 20
-#: A gap between samples of a sensor that is not filled (s).
+#: Longest gap between samples of a sensor that is interpolated (s).
 _SENSOR_GAP_S = 0.1
 
 
 def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: str = "") -> None:
-    """Write points (mm), 4x4 poses of the bodies, events, and the phone's sensors where the trial has its log.
+    """Write points (mm), 4x4 poses of the bodies, events, and the phone's sensors if the trial has its log.
 
     The axes are those of our world: z up. A C3D has one rate: frames at uneven times are interpolated to their median
-    rate, and the parameter PBL:TIMES says so. Points and poses that are not known have residual -1 and NaN.
+    rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN.
 
     Raises `PblError` PACKAGE_MISSING without ezc3d; EXPORT_INPUT for a trial with more than 65,535 frames.
     """
@@ -37,7 +37,7 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     check_frames(trial)
     even = trial.even
     file = _Parameters(ezc3d)
-    # In this order: once ezc3d knows the rate of the points it takes no further channel.
+    # In this order: ezc3d accepts no further channel once it knows the rate of the points.
     for marker in trial.fit.marker_names:
         file.low.point(marker)
     analogs = _sensors(file, trial, even)
@@ -53,14 +53,14 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
         file.add("PBL", key.upper(), [value[:250]])
     file.add("PBL", "TIMES", ["interpolated to an even rate" if even.resampled else "as filmed"])
     file.low.header().firstFrame(even.first)
-    # ezc3d's own `write` wants the masks as bool and loses the memory of their conversion, 0.4 MB for 8 s of 33 points.
+    # ezc3d's `write` expects the masks as bool and leaks the memory of their conversion, 0.4 MB for 8 s of 33 points.
     masks = np.zeros((7, *points.shape[1:]))
     file.low.import_numpy_data(points, residuals, masks, analogs, poses)
     file.low.write(str(path), ezc3d.WriteOptions())
 
 
 class _Parameters:
-    """A new file of ezc3d, its parameters set from plain values."""
+    """A new file of ezc3d, whose parameters are set from plain values."""
 
     def __init__(self, ezc3d: Any) -> None:
         self.ezc3d, self.low = ezc3d, ezc3d.c3d()
@@ -80,7 +80,7 @@ class _Parameters:
 
 
 def check_frames(trial: ExportTrial) -> None:
-    """Raise `PblError` EXPORT_INPUT unless a C3D can number the trial's frames."""
+    """Raise `PblError` EXPORT_INPUT if a C3D cannot number the trial's frames."""
     even = trial.even
     n, first = len(even.markers_m), even.first
     if first < 0 or first + n > _LAST_FRAME:
@@ -105,7 +105,7 @@ def _points(file: _Parameters, even: EvenTrial) -> tuple[np.ndarray, np.ndarray]
 
 
 def _poses(file: _Parameters, trial: ExportTrial, even: EvenTrial) -> np.ndarray:
-    """The bodies' frames (x forward, y up, z right) as (4, 4, B, N) matrices, body to world, translation in mm."""
+    """Frames of the bodies (x forward, y up, z right) as (4, 4, B, N) matrices, body to world, translation in mm."""
     names = trial.poses.body.body_names
     pose = np.full((4, 4, len(names), len(even.rotation)), np.nan)
     pose[:3, :3] = even.rotation.transpose(2, 3, 1, 0)
@@ -124,7 +124,6 @@ def _events(file: _Parameters, trial: ExportTrial, name: str) -> None:
     if not found:
         file.add("EVENT", "USED", [0])
         return
-    icons = [_EVENTS[e.event][1] for e in found]
     # Minutes and seconds, from frame 1.
     times = np.array(np.divmod([e.time_s for e in found], 60.0))
     for key, values in (
@@ -134,7 +133,7 @@ def _events(file: _Parameters, trial: ExportTrial, name: str) -> None:
         ("DESCRIPTIONS", ["initial contact" if e.event == "foot_down" else "toe-off" for e in found]),
         ("SUBJECTS", [name] * len(found)),
         ("TIMES", times),
-        ("ICON_IDS", icons),
+        ("ICON_IDS", [_EVENTS[e.event][1] for e in found]),
         ("GENERIC_FLAGS", [0] * len(found)),
     ):
         file.add("EVENT", key, values)

@@ -1,7 +1,7 @@
-"""Tables of columns that know their units, and the two ways to write them: CSV and Parquet.
+"""Tables of columns with units, and writing them as CSV and Parquet.
 
-Tables as text, fast: cells are rows of bytes, filled digit by digit for all numbers at once; bytes of value 0 are
-dropped at the end. Three times as fast as Python's own formatting, which was most of the time of an export.
+Cells of text tables are rows of bytes, filled digit by digit for all numbers at once; bytes of value 0 are dropped at
+the end. This is three times as fast as Python's formatting, which took most of the time of an export.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import numpy as np
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.extras import needed
 
-#: From here on a double does not hold every digit; such numbers are formatted by Python.
+#: From here on a double does not hold every digit, and Python formats the numbers.
 _EXACT = 2.0**53
 
 
 def number_cells(values: np.ndarray, decimals: int) -> np.ndarray:
-    """(..., W) bytes of numbers with so many decimals, rounded to the nearest; empty for NaN, -0 is 0."""
+    """(..., W) bytes of numbers, rounded to `decimals`; empty for NaN, -0 is 0."""
     values = np.asarray(values, float)
     known = np.isfinite(values)
     scaled = np.rint(np.where(known, values, 0.0) * 10.0**decimals)
@@ -50,7 +50,7 @@ def number_cells(values: np.ndarray, decimals: int) -> np.ndarray:
 
 
 def text_cells(texts: Sequence[bytes]) -> np.ndarray:
-    """(N, W) bytes of N texts, none of which has a byte of value 0; may be written into."""
+    """(N, W) bytes of N texts without bytes of value 0; writable."""
     width = max(map(len, texts), default=0) or 1
     together = bytearray().join(t.ljust(width, b"\0") for t in texts)
     return np.frombuffer(together, np.uint8).reshape(len(texts), width)
@@ -71,7 +71,7 @@ def lines(blocks: Sequence[np.ndarray], separator: str) -> bytes:
 
 @dataclasses.dataclass(frozen=True)
 class Labels:
-    """(N,) texts of which few differ: `texts[codes]`. A categorical in Parquet, pandas and R."""
+    """(N,) texts `texts[codes]` with few different ones. A categorical in Parquet, pandas and R."""
 
     codes: np.ndarray
     texts: tuple[str, ...]
@@ -92,10 +92,10 @@ class Labels:
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """One column: its name, (N,) values (float with NaN for missing, int, bool or `Labels`), unit and meaning."""
+    """One column of a table."""
 
     name: str
-    values: np.ndarray | Labels
+    values: np.ndarray | Labels  # (N,) float with NaN for missing, int, bool or `Labels`
     unit: str
     meaning: str
 
@@ -109,7 +109,7 @@ class Column:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Columns of the same length under a name, which becomes that of the file."""
+    """Columns of the same length; the name becomes that of the file."""
 
     name: str
     columns: tuple[Column, ...]
@@ -122,7 +122,7 @@ class Table:
 
 
 def joined(parts: Sequence[Table]) -> Table:
-    """Tables of the same name and columns, one below the other. A column that a part lacks is missing there."""
+    """Concatenate tables of the same name and columns. Columns that a part lacks are missing there."""
     if len(parts) == 1:
         return parts[0]
     named = {c.name: c for part in parts for c in part.columns}
@@ -134,7 +134,7 @@ def joined(parts: Sequence[Table]) -> Table:
 
 
 def write_csv(table: Table, path: Path) -> None:
-    """UTF-8, comma, point; header of names; empty cells for what is missing; true and false in words."""
+    """Write UTF-8 with commas and decimal points, a header of names, empty cells for missing values, true and false."""
     head = ",".join(_quoted(c.name) for c in table.columns) + "\n"
     # Neighbouring columns of one kind are formatted together.
     kinds = itertools.groupby(table.columns, lambda c: c.kind)
@@ -143,7 +143,7 @@ def write_csv(table: Table, path: Path) -> None:
 
 
 def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
-    """Missing numbers are null; each field's metadata has `unit` and `meaning`, the table's has `about`.
+    """Write Parquet: missing numbers are null; each field's metadata has `unit` and `meaning`, the table's `about`.
 
     Raises `PblError` PACKAGE_MISSING without pyarrow.
     """
@@ -159,7 +159,7 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
             arrays.append(pa.array(c.values, from_pandas=True))
     fields = [_field(pa, c.name, a.type, c.unit, c.meaning) for c, a in zip(table.columns, arrays, strict=True)]
     made = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(about)))
-    # Statistics double the size of few rows. A dictionary of numbers that hardly repeat costs a tenth of the size and a
+    # Statistics double the size of few rows. A dictionary of numbers that hardly repeat adds a tenth of the size and a
     # fifth of the time.
     labels = [c.name for c in table.columns if isinstance(c.values, Labels)]
     parquet.write_table(made, path, compression="zstd", write_statistics=False, use_dictionary=labels)
@@ -171,7 +171,7 @@ def _field(pa: Any, name: str, kind: Any, unit: str, meaning: str) -> Any:
 
 
 def dictionary(tables: Sequence[Table]) -> Table:
-    """The data dictionary: one row for each column of each table."""
+    """Make the data dictionary: one row for each column of each table."""
     found = [(t.name, c) for t in tables for c in t.columns]
     texts = {
         "table": ([n for n, _ in found], "file without its ending"),

@@ -1,4 +1,4 @@
-"""`.mot` and `.forces.mot` as OpenSim reads them, and the floor from which heights of its formats and C3D count."""
+"""`.mot` and `.forces.mot` for OpenSim, and the floor from which the heights of its formats and C3D count."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from .trial import ExportTrial
 def write_forces(
     trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "forces", floor_m: np.ndarray | None = None
 ) -> None:
-    """Write the forces of both feet (N) and where they act (m) in OpenSim's ground, 100 Hz; 0 for a foot in the air.
+    """Write the forces of both feet (N) and their points of application (m) in OpenSim's ground, 100 Hz; 0 for a foot
+    in the air.
 
-    `floor_m` (T,): what was taken off the heights of the trial's frames. Times at which contact is not known are left
-    out. The moment about the vertical is 0: the stage has none.
+    `floor_m` (T,): heights subtracted from those of the trial's frames. Times with unknown contact are omitted. The
+    moment about the vertical is not computed and written as 0.
 
-    Raises `PblError` EXPORT_INPUT where there are no forces or the mass is not known (`check_forces`).
+    Raises `PblError` EXPORT_INPUT if there are no forces or the mass is not known (`check_forces`).
     """
     check_forces(trial)
     assert trial.kinetics is not None
@@ -56,7 +57,7 @@ def write_forces(
 
 
 def check_forces(trial: ExportTrial) -> None:
-    """Raise `PblError` EXPORT_INPUT where a trial has no forces or the person's mass is not known."""
+    """Raise `PblError` EXPORT_INPUT if a trial has no forces or the person's mass is not known."""
     if trial.kinetics is None or trial.kinetics.series is None:
         why = "" if trial.kinetics is None or not trial.kinetics.reason else f": {trial.kinetics.reason}"
         raise PblError(
@@ -80,7 +81,7 @@ def check_forces(trial: ExportTrial) -> None:
 
 def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of the coordinates in the order of OpenSim's models and their values (T, 40): degrees, and metres of the
-    pelvis in OpenSim's ground. The pelvis of our body moves from its place in the MJCF, OpenSim's from the origin."""
+    pelvis in OpenSim's ground. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
     body, qpos = load_body(), np.asarray(trial.fit.qpos, float)
     column = {n: i for i, n in enumerate(trial.fit.joint_names)}
     names = (*PELVIS_TURNS, *SLIDES, *(n for n in body.joint_names if n not in (*PELVIS_TURNS, *SLIDES)))
@@ -90,8 +91,8 @@ def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
 
 
 def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "coordinates") -> None:
-    """Write the 40 joint values under OpenSim's names: angles in degrees with the joints' own signs (knee negative in
-    flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are left out."""
+    """Write the 40 joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
+    flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]
     head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes", ""]
@@ -101,24 +102,24 @@ def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: 
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
 
 
-#: Where a floor was found, the lowest sole stays this close (m) to it in `_OF_FRAMES` of the frames.
+#: Largest distance (m) of the lowest sole from a floor in `_OF_FRAMES` of the frames.
 FLOOR_WITHIN_M = 0.03
 _OF_FRAMES = 0.8
-#: The floor is followed over about two strides (s).
+#: Window of the running median, about two strides (s).
 _WINDOW_S = 2.0
-#: It rises by at most this part of the path, and some error (m): more is a stair or a ramp, no error of the vertical.
+#: Largest rise of the floor as a fraction of the path, plus an error (m): more is a stair or a ramp.
 _STEEPEST, _ERROR_M = 0.1, 0.05
-#: The slide of the pelvis along the vertical.
+#: Slide of the pelvis along the vertical.
 _VERTICAL = "pelvis_ty"
 
 
 def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
     """Return (T,) heights (m) of the floor under the person in the fit's world, NaN without a pose; None: none found.
 
-    One foot at least is on the floor in every frame of a walk, so that the lowest point of both soles follows it: the
-    floor is its running median. A level floor may rise or sink in the world of one camera: a vertical that is off by
-    1 deg makes 10 cm over 6 m, and the distance from the camera has errors. None was found where the lowest point does
-    not stay within `FLOOR_WITHIN_M` (a jump, a poor fit) and where the floor is too steep (stairs).
+    At least one foot is on the floor in every frame of a walk, so the floor is the running median of the lowest point
+    of both soles. A level floor may rise or sink in the world of one camera: an error of the vertical of 1 deg makes
+    10 cm over 6 m, and the distance from the camera has errors. No floor is found if the lowest point does not stay
+    within `FLOOR_WITHIN_M` (a jump, a poor fit) or if the floor is too steep (stairs).
     """
     poses, known = trial.poses, trial.known
     soles = []
@@ -140,10 +141,10 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
 
 
 def on_floor(trial: ExportTrial) -> tuple[ExportTrial, str]:
-    """Return the trial with its heights counted from the floor under the person, and what 0 is, for headers.
+    """Return the trial with heights above the floor under the person, and a description of height 0 for headers.
 
-    Angles stay: a frame is moved as a whole. Heights of a laboratory's or of calibrated cameras' world stay as they
-    are, because force plates and other markers share it.
+    Angles do not change: each frame is moved as a whole. Heights in the world of a laboratory or of calibrated cameras
+    do not change, because force plates and other markers share it.
     """
     if is_metric(trial.fit):
         return trial, "height 0 is that of the laboratory's or the calibrated cameras' world"
@@ -159,6 +160,6 @@ def on_floor(trial: ExportTrial) -> tuple[ExportTrial, str]:
 
 
 def taken_off(trial: ExportTrial, standing: ExportTrial) -> np.ndarray:
-    """Return (T,) what `on_floor` took off the heights of the frames (m), NaN without a pose."""
+    """Return (T,) heights that `on_floor` subtracted from those of the frames (m), NaN without a pose."""
     column = trial.fit.joint_names.index(_VERTICAL)
     return np.asarray(trial.fit.qpos, float)[:, column] - np.asarray(standing.fit.qpos, float)[:, column]

@@ -1,4 +1,4 @@
-"""`.dlc.csv`: 2D keypoints with their confidence in DeepLabCut's form, which `movement` and others read."""
+"""`.dlc.csv`: 2D keypoints with their confidence in DeepLabCut's format, which `movement` and others read."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .trial import ExportTrial
 
 
 def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:
-    """Write pixels of the upright picture (x right, y down, origin at its upper left corner) and the confidence as the
-    detector states it (`likelihood`). One row per frame, number first; a point that was not seen has empty cells.
+    """Write pixels of the upright picture (x right, y down, origin at its upper left corner) and the detector's
+    confidence (`likelihood`). One row per frame, number first; a point that was not seen has empty cells.
 
-    Raises `PblError` EXPORT_INPUT where the trial's keypoints are not at hand.
+    Raises `PblError` EXPORT_INPUT for a trial without keypoints.
     """
     points = trial.keypoints
     if points is None:

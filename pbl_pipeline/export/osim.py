@@ -1,10 +1,10 @@
 """`.osim` and `.trc`: the fitted body as an OpenSim model, from the MJCF, the fit's scale and its markers; the markers.
 
-How a chain of MuJoCo's joints becomes one `CustomJoint`: the joints of a body act one after the other in the frame that
-those before them made, and so do the three rotations of OpenSim's `SpatialTransform`; its translations are along the
-axes of the parent's frame, as slides that act before all hinges are. So every body with up to three hinges, and up to
-three slides before them, is one CustomJoint with the MJCF's axes and order. A body with fewer hinges has further axes
-at right angles that do not turn. All joints of the shipped body are of this kind, and none are coupled.
+A chain of MuJoCo's joints becomes one `CustomJoint`: the joints of a body act one after the other, each in the frame of
+those before it, as do the three rotations of OpenSim's `SpatialTransform`; its translations are along the axes of the
+parent's frame, like slides that act before all hinges. So every body with up to three hinges, and up to three slides
+before them, is one CustomJoint with the MJCF's axes and order. A body with fewer hinges gets further axes at right
+angles that do not turn. All joints of our body are of this kind, and none are coupled.
 """
 
 # MuJoCo is a compiled module without type stubs.
@@ -32,8 +32,8 @@ from .trial import ExportTrial, site_positions, wanted_markers
 def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
     """Write the fitted markers in mm, in OpenSim's ground: x as ours, y up, z = -y of our world.
 
-    Frames in which no marker is known are left out, because OpenSim's inverse kinematics stops at them; a single marker
-    that is not known is an empty cell. `Time` holds the video's own stamps, `DataRate` their median rate.
+    Frames without a known marker are omitted, because OpenSim's inverse kinematics stops at them; a single unknown
+    marker is an empty cell. `Time` has the video's stamps, `DataRate` their median rate.
     """
     fit = trial.fit
     seen = np.isfinite(fit.markers_world_m).any(axis=(1, 2))
@@ -50,7 +50,7 @@ def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
         "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in numbers),
         "",
     ]
-    # OpenSim loses an empty cell at the end of a line: a further tab keeps it.
+    # OpenSim ignores an empty cell at the end of a line, without a further tab.
     kept = np.where(np.isnan(xyz[:, -1, 0]), ord("\t"), 0).astype(np.uint8)[:, None]
     cells = number_cells(xyz.reshape(n, -1), 4)
     last = np.concatenate([cells[:, -1], kept], axis=1)
@@ -73,23 +73,23 @@ _JOINTS = {
     "radius": "radioulnar",
     "hand": "radius_hand",
 }
-#: Written as the range of a coordinate that the MJCF does not limit: rad, m.
+#: Range of a coordinate that the MJCF does not limit: rad, m.
 _FREE_RAD, _FREE_M = 2 * np.pi, 100.0
 
 
 def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "pbl_body") -> None:
     """Write the scaled body with the fitted markers as an OpenSim 4 model.
 
-    Lengths are scaled as the fit scales them. Masses, centres and inertias are those of the forces (`kinetics.Inertia`)
-    where the person's mass is known. Else masses are the unscaled body's, centres move with the scale, inertias with
-    its square.
+    Lengths are scaled as in the fit. If the person's mass is known, masses, centres and inertias are those of the
+    forces (`kinetics.Inertia`). Otherwise masses are the unscaled body's, centres scale with lengths, inertias with
+    their square.
 
     Raises
     ------
     PblError
-        MARKER_SET_UNKNOWN: the body has no place for the fit's markers.
+        MARKER_SET_UNKNOWN: the body lacks the fit's markers.
     ValueError
-        The body has a chain of joints that is no CustomJoint.
+        The body has a chain of joints that cannot be one CustomJoint.
     """
     body, fit = load_body(), trial.fit
     markers = wanted_markers(trial)
@@ -112,9 +112,9 @@ def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title:
 
 @functools.cache
 def pelvis_rest_m(body: Body) -> dict[str, float]:
-    """Where the root is along each slide at `qpos = 0`, in OpenSim's ground: what its coordinates have more than qpos.
+    """Position of the root along each slide at `qpos = 0`, in OpenSim's ground: its coordinates minus qpos.
 
-    Raises `ValueError` for a root that is turned against OpenSim's ground, or slides that are not along its axes.
+    Raises `ValueError` for a root that is rotated in OpenSim's ground, or slides that are not along its axes.
     """
     model = body.mj_model
     turned = Y_UP_TO_Z_UP.T @ Rotation.from_quat(model.body_quat[1], scalar_first=True).as_matrix()
@@ -155,7 +155,7 @@ def _turns(body: Body) -> np.ndarray:
 
 
 def _shape(model: mujoco.MjModel, geom: int, scale: float, turn: np.ndarray) -> ET.Element:
-    """A shape to look at: capsules, which OpenSim lacks, as ellipsoids of the same length and width."""
+    """Shape for display: capsules, which OpenSim lacks, as ellipsoids of the same length and width."""
     name, size = model.geom(geom).name, np.array(model.geom_size[geom])
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE:
         size = np.array([size[0], size[0], size[1] + size[0]])
@@ -181,7 +181,7 @@ def _joint(body: Body, index: int, own_scale: np.ndarray) -> ET.Element:
     element.append(coordinates)
     frame = ET.SubElement(ET.SubElement(element, "frames"), "PhysicalOffsetFrame", name=offset)
     place, turn = np.zeros(3), np.zeros(3)
-    if parent >= 0:  # where the root is at qpos 0 is part of its coordinates
+    if parent >= 0:  # the position of the root at qpos 0 is part of its coordinates
         place = own_scale[parent] * model.body_pos[index + 1]
         turn = Rotation.from_quat(model.body_quat[index + 1], scalar_first=True).as_euler("XYZ")
     _text(frame, "socket_parent", f"/bodyset/{body.body_names[parent]}" if parent >= 0 else "/ground")
@@ -193,9 +193,9 @@ def _joint(body: Body, index: int, own_scale: np.ndarray) -> ET.Element:
 
 @functools.cache
 def _movement(body: Body, index: int) -> tuple[ET.Element, ET.Element]:
-    """Coordinates and transform of a body's joint: what no scale changes.
+    """Coordinates and transform of a body's joint, which do not depend on the scale.
 
-    Raises `ValueError` for joints that no CustomJoint expresses.
+    Raises `ValueError` for joints that cannot be one CustomJoint.
     """
     model = body.mj_model
     joints = np.flatnonzero(body.joint_body == index)
@@ -204,7 +204,7 @@ def _movement(body: Body, index: int) -> tuple[ET.Element, ET.Element]:
     if not expressible or (len(slides) and len(hinges) and slides.max() > hinges.min()):
         raise ValueError(f"the joints of {body.body_names[index]} are not those of one CustomJoint")
     coordinates = ET.Element("coordinates")
-    # OpenSim numbers the coordinates of a joint as its transform meets them: rotations first.
+    # OpenSim numbers the coordinates of a joint in the order of its transform: rotations first.
     for joint in (*hinges, *sorted(slides, key=lambda j: body.joint_names[j])):
         coordinates.append(_coordinate(body, int(joint)))
     transform = ET.Element("SpatialTransform")
@@ -219,7 +219,7 @@ def _movement(body: Body, index: int) -> tuple[ET.Element, ET.Element]:
 def _rotations(axes: np.ndarray, hinges: np.ndarray) -> list[tuple[np.ndarray, int | None]]:
     """Three axes with their joints: those of the hinges, then axes at right angles to them that do not turn."""
     found: list[tuple[np.ndarray, int | None]] = [(a, int(j)) for a, j in zip(axes, hinges, strict=True)]
-    # The rows of V that belong to no singular value span what the axes do not.
+    # The remaining rows of V span the complement of the axes.
     _, _, rest = np.linalg.svd(np.reshape(axes, (-1, 3)))
     return [*found, *((axis, None) for axis in rest[len(found) :])]
 
@@ -261,7 +261,7 @@ def _marker(name: str, body_name: str, place_m: np.ndarray) -> ET.Element:
 
 
 def _lines(element: ET.Element, indent: str = "", out: list[str] | None = None) -> list[str]:
-    """The element as indented XML, a line each; one with children has no text. A third of the time of ElementTree."""
+    """Indented lines of XML; an element with children has no text. Takes a third of the time of ElementTree."""
     out = [] if out is None else out
     start = f"{indent}<{element.tag}"
     for name, value in element.items():

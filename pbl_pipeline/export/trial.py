@@ -1,4 +1,4 @@
-"""One trial as it is exported: the fit with what belongs to it, in the frames that the formats want."""
+"""Data of one trial for export: the fit and further results, in the frames of the formats."""
 
 from __future__ import annotations
 
@@ -19,42 +19,34 @@ from pbl_pipeline.kinetics import TrialKinetics
 from pbl_pipeline.video import PhoneLog
 from pbl_pipeline.visit import Recording, Visit
 
-#: Frames whose stamps are this close (s) to a grid of one rate are exported as they are.
+#: Largest difference of stamps (s) from a grid of one rate at which frames are exported as they are.
 EVEN_WITHIN_S = 5e-4
-#: Frames further apart than this are not joined when a trial is brought to an even rate (as for curves of cycles).
+#: Longest gap between frames that is interpolated when a trial is brought to an even rate (as for curves of cycles).
 MAX_GAP_S = 0.15
-#: How far along the axes of a body its further markers are (m).
+#: Distance of the further markers of a body along its axes (m).
 BODY_POINT_M = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportTrial:
-    """What is exported of one trial.
+    """Data of one trial for export; None for data that are not known."""
 
-    name: of its folder and files. fit: its movement. markers: where the fit's markers are on the body, None where the
-    table is not at hand. keypoints, measured (events, cycles, measures), log (of the phone that filmed): None where
-    they are not known. log_shift_s: added to the log's times it gives the video's. methods: name of a stage to the
-    method that made it, in words. activity: as stated of the recording. fitted_with: version and commit of the software
-    that fitted it, where that is known. kinetics, mass_kg: its forces and the person's mass, None where they are not
-    known.
-    """
-
-    name: str
+    name: str  # of its folder and files
     fit: TrialFit
-    markers: MarkerSet | None = None
+    markers: MarkerSet | None = None  # the lab's own marker table of the fit
     keypoints: Keypoints | None = None
     measured: TrialMetrics | None = None
-    log: PhoneLog | None = None
-    log_shift_s: float = 0.0
-    methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    fitted_with: str = ""
+    log: PhoneLog | None = None  # of the phone that filmed
+    log_shift_s: float = 0.0  # from the log's times to the video's
+    methods: Mapping[str, str] = dataclasses.field(default_factory=dict)  # stage -> method in words
+    fitted_with: str = ""  # version and commit of the software
     activity: str = ""
     kinetics: TrialKinetics | None = None
     mass_kg: float | None = None
 
     @classmethod
     def of(cls, recording: Recording, visit: Visit) -> ExportTrial:
-        """Return a fitted recording of a visit as it is exported. Raises what loading its arrays raises."""
+        """Return the data of a fitted recording of a visit. Raises as `Recording.fit`, `keypoints` and `log`."""
         assert recording.fit is not None
         log, shift = recording.log or (None, 0.0)
         forces = () if visit.kinetics is None else visit.kinetics.trials
@@ -91,28 +83,26 @@ class ExportTrial:
 
 @dataclasses.dataclass(frozen=True)
 class EvenTrial:
-    """A movement at one rate: frame i is at (first + i) / rate_hz on the video's clock.
-
-    time_s (N,); markers_m (N, J, 3) and the bodies' position_m (N, B, 3) and rotation (N, B, 3, 3), world with z up,
-    NaN where not known. resampled: whether it was interpolated because the frames are not evenly spaced.
-    """
+    """A movement at one rate: frame i is at (first + i) / rate_hz on the video's clock. World with z up, NaN where not
+    known."""
 
     rate_hz: float
     first: int
-    resampled: bool
-    markers_m: np.ndarray
-    position_m: np.ndarray
-    rotation: np.ndarray
+    resampled: bool  # interpolated, because the frames are not evenly spaced
+    markers_m: np.ndarray  # (N, J, 3)
+    position_m: np.ndarray  # (N, B, 3) of the bodies
+    rotation: np.ndarray  # (N, B, 3, 3) body to world
 
     @property
     def time_s(self) -> np.ndarray:
+        """(N,) times of the frames."""
         return (self.first + np.arange(len(self.markers_m))) / self.rate_hz
 
 
 def wanted_markers(trial: ExportTrial) -> MarkerSet:
-    """The places of the fit's markers on the body.
+    """Positions of the fit's markers on the body.
 
-    Raises `PblError` MARKER_SET_UNKNOWN where the body has no such markers or they have other names.
+    Raises `PblError` MARKER_SET_UNKNOWN if the body has no such markers or they have other names.
     """
     try:
         found = marker_set(trial.fit.marker_set) if trial.markers is None else trial.markers
@@ -123,15 +113,15 @@ def wanted_markers(trial: ExportTrial) -> MarkerSet:
             found=error.found,
             expected=error.expected,
             next_step="pass the table that the fit was made with, --marker-set TABLE.csv; --markers-only writes a .trc "
-            "without knowing where the markers are on the body",
+            "without the positions of the markers on the body",
             key=trial.name,
         ) from error
     return found
 
 
 def with_body_points(trial: ExportTrial) -> ExportTrial:
-    """The trial with three further markers on every body, NAME_o at its origin and NAME_x, NAME_y `BODY_POINT_M` along
-    its axes: they tell how every body lies, also where the marker set leaves that open (a wrist seen as one point).
+    """Add three markers to every body, NAME_o at its origin and NAME_x, NAME_y `BODY_POINT_M` along its axes: they
+    determine its orientation also if the marker set does not (a wrist seen as one point).
 
     Raises `PblError` MARKER_SET_UNKNOWN as `wanted_markers`.
     """
@@ -160,7 +150,7 @@ def with_body_points(trial: ExportTrial) -> ExportTrial:
 
 
 def site_positions(markers: MarkerSet, fit: TrialFit, scale_index: np.ndarray) -> Float[np.ndarray, "J 3"]:
-    """The fitted markers in the frames of the scaled bodies (m): scale * (position + offset)."""
+    """Positions of the fitted markers in the frames of the scaled bodies (m): scale * (position + offset)."""
     own = np.asarray(fit.scale, float)[scale_index[np.asarray(markers.body_index)]]
     return own[:, None] * (markers.position_m + np.asarray(fit.site_offset_m, float))
 
@@ -193,8 +183,8 @@ def _rate(time: np.ndarray) -> float:
 
 
 def _interpolated(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """(N, C) of (T, C) at the times `at`: cubic splines over frames that are known and not further apart than
-    `MAX_GAP_S`, NaN elsewhere."""
+    """(N, C) of (T, C) at the times `at`: cubic splines over known frames that are not further apart than `MAX_GAP_S`,
+    NaN elsewhere."""
     out = np.full((len(at), values.shape[1]), np.nan)
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     for part in np.split(known, np.flatnonzero(np.diff(time[known]) > MAX_GAP_S) + 1):

@@ -1,5 +1,5 @@
-"""The long and wide tables of a visit: angles, events, cycles, curves, measures. Units are in the names of columns, or
-stand in a column `unit` beside the values."""
+"""Long and wide tables of a visit: angles, events, cycles, curves, measures. Units are in the names of columns, or in a
+column `unit` next to the values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .columns import Column, Labels, Table, joined
 from .trial import ExportTrial
 
 _MEANINGS = json.loads(shipped_text("export/meanings.json"))
-#: The direction in which a joint value grows, by the joint's name without its side.
+#: Positive direction of a joint value, by the joint's name without its side.
 JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
 _SIDES = {"r": "right", "l": "left"}
 _STATISTICS: dict[str, str] = _MEANINGS["statistics"]
@@ -31,7 +31,7 @@ _TRIAL = "name of the trial"
 def session_tables(
     trials: Sequence[ExportTrial], metrics: GaitMetrics | None, kinetics: Kinetics | None = None
 ) -> list[Table]:
-    """All tables of a visit. Those of gait are there where its trials were measured."""
+    """Make all tables of a visit. Those of gait need measured trials."""
     wide = [_angles_wide(t) for t in trials]
     made = [joined(wide), joined([_angles_long(w, t) for w, t in zip(wide, trials, strict=True)])]
     measured = [(t.name, t.measured) for t in trials if t.measured is not None]
@@ -63,7 +63,7 @@ def _angles_wide(trial: ExportTrial) -> Table:
 
 
 def _angles_long(wide: Table, trial: ExportTrial) -> Table:
-    """The frames with a pose, one joint after the other."""
+    """Frames with a pose, one joint after the other."""
     fit, seen = trial.fit, np.flatnonzero(trial.known)
     joints = [(c, c.name.removesuffix(f"_{c.unit}")) for c in wide.columns if c.unit in ("deg", "m")]
     n, j = len(seen), len(joints)
@@ -100,7 +100,7 @@ def _sided(joint: str) -> tuple[str, str]:
 
 
 def joint_sign(joint: str) -> str:
-    """Return the direction in which a joint value grows."""
+    """Return the positive direction of a joint value."""
     return JOINT_SIGNS.get(_sided(joint)[0], "")
 
 
@@ -153,7 +153,7 @@ def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[
 
 
 def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
-    """`pooled`: names of the trials that the measures of the visit are made of."""
+    """`pooled`: names of the trials whose cycles are pooled for the measures of the visit."""
     values = [measures_of(c.cycle) for c in cycles]
     columns = _cycle_keys([c[:2] for c in cycles])
     columns.append(Column("bout", _integers(c.cycle.bout for c in cycles), "", "walking bout, from 0"))
@@ -253,7 +253,7 @@ _OF_FORCES = {
 
 
 def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
-    """Measure, statistic, value and, where there is none, the reason."""
+    """Measure, statistic, value and, if there is none, the reason."""
     _, _, spatiotemporal, gdi, kinetics = part
     for name, measure in spatiotemporal.measures.items():
         if measure is None:

@@ -65,28 +65,28 @@ def origin_of(trial: ExportTrial, body: Body) -> dict[str, str]:
 
 
 def fit_method(fit: TrialFit) -> str:
-    """Solver and paramset of a fit, the paramset by its name where this version ships it."""
+    """Solver and paramset of a fit, the paramset by its name if this version has it."""
     named = next((m.key for m in METHODS.values() if m.hash == fit.params_hash), "")
     return f"{fit.solver}, {named}" if named else f"{fit.solver}, parameters {fit.params_hash}"
 
 
 def _named(stage: Stage[Any], name: str, sha: str) -> str:
-    """Return a method by its key where this version ships it, else by its name and hash."""
+    """Return a method by its key if this version has it, else by its name and hash."""
     return next((m.key for m in stage.values() if m.hash == sha), f"{name} ({sha})")
 
 
 def one_line(text: str) -> str:
-    """Text for a header: one line of ASCII."""
+    """Convert a text to one line of ASCII for a header."""
     return " ".join(text.encode("ascii", "replace").decode().split())
 
 
 def summary(trial: ExportTrial) -> Mapping[str, object]:
-    """The trial's frames in numbers, for `export.json`."""
+    """Numbers of the trial's frames, for `export.json`."""
     time = np.asarray(trial.fit.time_s, float)
     return {"frames": len(time), "frames_with_a_pose": int(trial.known.sum()), "seconds": float(time[-1] - time[0])}
 
 
-#: What can be exported, and what of it one trial is: the ending of its file, "" for the tables of the visit.
+#: Format -> ending of the file of one trial, "" for those of the visit.
 FORMATS: Mapping[str, str] = {
     "trc": ".trc",
     "mot": ".mot",
@@ -100,35 +100,28 @@ FORMATS: Mapping[str, str] = {
 }
 #: Formats that need events, cycles and measures.
 GAIT_FORMATS = frozenset({"forces", "c3d", "csv", "parquet", "bids"})
-#: Formats with heights, which count from the floor.
-_WITH_GROUND = frozenset({"trc", "mot", "forces", "osim", "c3d"})
-#: Formats whose readers take ASCII in names only, and not in every system's paths.
-_ASCII = ("trc", "mot", "forces", "osim", "c3d")
-#: What OpenSim refuses in the name of a component.
+#: Formats with heights, which count from the floor; their readers require ASCII in names, some also in paths.
+_WITH_GROUND = ("trc", "mot", "forces", "osim", "c3d")
+#: Characters that OpenSim refuses in the name of a component.
 _NOT_IN_OPENSIM = frozenset(" \t/\\*+")
 _LONGEST_NAME = 64
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """How to export.
+    """Options of an export."""
 
-    name: written into headers (C3D's subject, titles); empty: nothing that identifies a person. number_trials: call the
-    trials trial_1, trial_2, ... in place of their recordings' names. body_points: three further markers on every body
-    in `.trc` and `.osim`. allow_failed: also a fit with a check that failed. overwrite: into a folder with files. bids:
-    folder of the data set and labels of the visit for `bids`; None: one of the visit alone, in the folder `bids`.
-    """
-
-    name: str = ""
-    number_trials: bool = False
-    body_points: bool = True
-    allow_failed: bool = False
-    overwrite: bool = False
+    name: str = ""  # in headers (C3D's subject, titles); "": nothing that identifies a person
+    number_trials: bool = False  # name the trials trial_1, trial_2, ... instead of by their recordings
+    body_points: bool = True  # three further markers on every body in `.trc` and `.osim`
+    allow_failed: bool = False  # also export a fit with a failed check
+    overwrite: bool = False  # write into a folder with files
+    #: Folder of the data set and labels of the visit for `bids`; None: one of the visit alone, in the folder `bids`.
     bids: tuple[Path, Labels] | None = None
 
 
 def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> None:
-    """What can be wrong before anything is read: unknown formats, missing packages, the folder, the name.
+    """Check the formats, their packages, the folder and the name before anything is read.
 
     Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE.
     """
@@ -165,7 +158,7 @@ def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> N
 def write_export(visit: Visit, formats: Sequence[str], out: Path, options: ExportOptions | None = None) -> list[Path]:
     """Write the fitted recordings of a visit and return the paths, `export.json` last.
 
-    `<recording>/<recording>.trc` and so on for each, the tables with their data dictionary and `export.json` above.
+    `<recording>/<recording>.trc` and so on for each; the tables with their data dictionary and `export.json` in `out`.
 
     Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without
     one pose, of another body, measures whose events or cycles are missing, or names that a format cannot hold;
@@ -190,7 +183,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
         about[trial.name] = {**origin, **summary(trial)}
         folder = out / trial.name
         standing, headers = trial, origin
-        if _WITH_GROUND & set(formats):
+        if set(_WITH_GROUND) & set(formats):
             standing, ground = on_floor(trial)
             headers = {**origin, "ground": one_line(ground)}
             grounds[trial.name] = {"ground": ground}
@@ -223,7 +216,7 @@ def _writers(
     options: ExportOptions,
     floor: np.ndarray,
 ) -> dict[str, Callable[[Path], object]]:
-    """Ending of a file to what writes it, of one trial; `floor` (T,): what was taken off its heights."""
+    """Ending of each file of one trial -> its writer; `floor` (T,): heights subtracted from the trial's."""
     name = options.name
     full = with_body_points(trial) if options.body_points and {"trc", "osim"} & set(formats) else trial
     every: dict[str, Callable[[Path], object]] = {
@@ -261,7 +254,7 @@ def _write_tables(
 
 
 def _written(path: Path, write: Callable[[Path], object]) -> Path:
-    """The file under its name once it is whole: who reads the folder meanwhile never sees half of one."""
+    """Write a file that appears under its name when it is complete."""
     part = path.with_name(f".part-{path.name}")
     try:
         write(part)
@@ -275,7 +268,7 @@ def _written(path: Path, write: Callable[[Path], object]) -> Path:
 
 
 def _common(about: Mapping[str, Mapping[str, object]]) -> dict[str, str]:
-    """What all trials have in common, for the metadata of the tables."""
+    """Facts that all trials have in common, for the metadata of the tables."""
     first, *others = [{k: v for k, v in a.items() if isinstance(v, str)} for a in about.values()]
     return {k: v for k, v in first.items() if all(o.get(k) == v for o in others)}
 
@@ -325,7 +318,7 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
         check_frames(trial)
     if GAIT_FORMATS & set(formats) and trial.measured is not None:
         _check_gait(trial.measured, formats)
-    if ascii_only := [f for f in formats if f in _ASCII]:
+    if ascii_only := [f for f in formats if f in _WITH_GROUND]:
         _check_names(trial, ascii_only)
     if "dlc" in formats and trial.keypoints is None:
         raise _input(

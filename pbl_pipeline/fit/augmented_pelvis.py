@@ -1,9 +1,9 @@
-"""How the pelvis of a person who sits down or squats is tipped, as the marker augmenter has it.
+"""Tilt and list of the pelvis of a person who sits down or squats, from the marker augmenter.
 
-Two hip points do not tell. The 15 points that the network sees are those of the body of a first solution, whose legs
-and trunk were seen; of its 35 markers the four iliac spines place the pelvis. It is not asked about people who walk:
-how far each of them tips the pelvis it does not know (slope 0.30 over eight persons), how the pelvis turns in a squat
-it does (`research/benchmarks/marker_augmenter.py`).
+Two hip points do not determine them. The network sees 15 points of the body of a first solution, whose legs and trunk
+were observed; of its 35 markers the four iliac spines place the pelvis. It is not applied to walking: it predicts how
+the pelvis turns in a squat, but not how far each walker tips the pelvis (slope 0.30 over eight persons;
+`research/benchmarks/marker_augmenter.py`).
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from .session import Session
 
 #: Markers of `opencap_35` on the pelvis.
 SPINES = ("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS")
-#: Both knees bent by so much (rad) at once, in more than this share of the frames: no walk, nor one in a crouch.
+#: A trial with both knees bent by more than this (rad) at once, in more than this share of the frames, is not a walk,
+#: not even in a crouch.
 FOLDED_RAD, FOLDED_SHARE = np.deg2rad(60.0), 0.05
 
 
 def with_augmented_pelvis(
     session: Session, p: Problem, qpos: Float[np.ndarray, "F Q"], scale: Float[np.ndarray, " S"]
 ) -> Problem:
-    """The problem with the pelvis' tilt and list of the augmenter, from the joint values (padded) and scale of a first
-    solution. A trial in which nobody sits or squats has none, nor has one that the network cannot be asked about (too
-    short, a person of a size that it does not know); it is fitted without.
+    """The problem with the augmenter's tilt and list of the pelvis, from the joint values (padded) and scale of a first
+    solution. A trial without sitting or squatting has none, nor has one that the network does not support (too short,
+    or a person outside its range of sizes); it is fitted without.
 
-    Raises those of `assets.fetch` where the network cannot be had.
+    Raises the errors of `assets.fetch` if the network is not available.
     """
     asked = [i for i, a in enumerate(session.arrays) if folds(session.body, qpos[session.frames(i)][a.used])]
     if not asked:
@@ -59,14 +60,14 @@ def with_augmented_pelvis(
 
 
 def folds(body: Body, qpos: Float[np.ndarray, "T Q"]) -> bool:
-    """Whether a person sits or squats for a part of the time."""
+    """True if the person sits or squats for a part of the time."""
     knees = -qpos[:, [body.joint_names.index(n) for n in ("knee_angle_r", "knee_angle_l")]].max(axis=1)
     return bool(np.mean(knees > FOLDED_RAD) > FOLDED_SHARE)
 
 
 def pelvis_of(markers: Float[np.ndarray, "T 35 3"]) -> Float[np.ndarray, "T 3 3"]:
-    """Orientation of the pelvis (columns: its axes forward, up, right; in the world) with which the iliac spines
-    lie best, in least squares, on those of `opencap_35` (Kabsch 1976, Acta Cryst A32:922); NaN where unknown."""
+    """Orientation of the pelvis (columns: its axes forward, up, right; in the world) that best fits the iliac spines to
+    those of `opencap_35` in least squares (Kabsch 1976, Acta Cryst A32:922); NaN where unknown."""
     table = marker_set("opencap_35")
     rows = [table.names.index(n) for n in SPINES]
     site = table.position_m[rows] - table.position_m[rows].mean(axis=0)

@@ -1,7 +1,7 @@
 """Threads of the linear algebra library.
 
-JAX calls LAPACK for each of many small matrices. A LAPACK that splits each of them over threads of its own, beside
-JAX's, is slower by a factor of ten and more where cores are shared (measured: 110 ms became 1,800 ms).
+JAX calls LAPACK for each of many small matrices. A LAPACK that splits each of them over its own threads, beside JAX's,
+is slower by a factor of ten and more where cores are shared (measured: 110 ms became 1,800 ms).
 """
 
 from __future__ import annotations

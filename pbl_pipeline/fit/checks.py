@@ -31,7 +31,7 @@ FALL_WARN, TRACE_NEEDED = 0.2, 8
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
 SD_WARN_DEG = 20.0
 CLOCK_WARN_S = 0.3
-#: Standard deviation of the focal length as a share of it. By so much depth and the person's size are off.
+#: Standard deviation of the focal length as a share of it, which is also that of depth and of the person's size.
 FOCAL_SD_WARN = 0.02
 
 #: Angle (deg) between where the person faces and the camera's axis, from the front (0) to the side (90), below which
@@ -62,7 +62,7 @@ def check_fit(
         checks += _pelvis_told(session, trials, solution.pelvis_told)
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
-    # Advice is for whom a check asks to act.
+    # Only a check that did not pass has advice.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
 
@@ -89,7 +89,7 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
 
 
 def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> Check:
-    """In centimetres of the fit, which are the same for small and tall people."""
+    """Check the 3D residual in centimetres of the fit, which are the same for small and tall people."""
     counts = np.asarray(session.markers.weight_3d) > 0
     medians = [
         100 * np.median(r[np.isfinite(r)]) / metre for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()
@@ -108,7 +108,7 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> 
 
 
 def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
-    """Of trials of one camera whose detector gave no 3D: whether the view can stand in for it. Nothing without such."""
+    """Check the view of trials of one camera whose detector has no 3D points; empty if there are none."""
     facing = []
     for trial, fit in zip(session.trials, trials, strict=True):
         known = np.isfinite(fit.qpos[:, 0])
@@ -151,7 +151,7 @@ def _scale(scale: np.ndarray) -> Check:
 
 
 def _height(session: Session, scale: np.ndarray, taller: float | None) -> list[Check]:
-    """The proportions, and a stated height against what was seen."""
+    """Check the proportions, and a stated height against the observed one."""
     if taller is None:
         return [_scale(scale)]
     return [
@@ -162,13 +162,13 @@ def _height(session: Session, scale: np.ndarray, taller: float | None) -> list[C
             taller,
             SCALE_HIGH if taller > 1 else SCALE_LOW,
             "the stated height is far from what is seen (value: their ratio): a mistyped height, another person, or a "
-            "child, whom a phone's detector takes for an adult and on whom nobody has measured its index",
+            "child, whom a phone's detector takes for an adult, and whose index was never validated",
         ),
     ]
 
 
 def _pelvis_told(session: Session, trials: Sequence[TrialFit], told: np.ndarray) -> list[Check]:
-    """Of the trials in which somebody sits or squats; none where nobody does."""
+    """Check the trials with sitting or squatting; empty if there are none."""
     folded = [i for i, t in enumerate(trials) if folds(session.body, t.qpos[np.isfinite(t.qpos[:, 0])])]
     silent = sum(not np.any(told[session.frames(i)]) for i in folded)
     check = Check(
@@ -217,13 +217,13 @@ def _intrinsics(trials: Sequence[TrialFit]) -> Check:
 
 
 def _assumed(session: Session) -> list[Check]:
-    """Fields of keypoints files for which a default stands; nothing where all are stated."""
+    """Report fields of keypoints files that are replaced by a default; empty if all are stated."""
     views = [v for t in session.trials for v in (t.views if isinstance(t, MultiView) else [t])]
     fields = sorted({f for v in views if isinstance(v, Keypoints) for f in v.assumed})
     if not fields:
         return []
     advice = (
-        f"the keypoints do not state {', '.join(fields)}: a lens without distortion, a camera that nobody measured and "
+        f"the keypoints do not state {', '.join(fields)}: a lens without distortion, an unmeasured camera and "
         "the box around the points stand for them; write the fields (docs/files.md)"
     )
     return [Check("keypoints_fields_assumed", WARN, float(len(fields)), 0.0, advice)]

@@ -14,7 +14,7 @@ from .problem import Problem, State
 
 
 class DetectorError(NamedTuple):
-    """How a marker less its detected point (world axes) moves with the lean of its trial and with its own depth; and
+    """Derivatives of a marker less its detected point (world axes) by the lean of its trial and by its own depth; and
     the trial of each frame as rows of 0 and 1. L is 3 and D the number of trials, or both are 0 without these unknowns.
     """
 
@@ -39,8 +39,9 @@ def detector_error(p: Problem, state: State, R_nc: Array) -> DetectorError:
 def detector_blocks(
     detector: DetectorError, b: Array, W: Array, U_t: Array, cross: Array, G: Array, f: Array, q: int
 ) -> tuple[Array, Array, Array, Array]:
-    """What the E = 3 + M unknowns of each of D trials add to the normal equations: products with the q unknowns of a
-    frame (F, q, D E), with scale and offsets (S + 3 M, D E) and with each other (D E, D E), and the gradient (D E,).
+    """Contribution of the E = 3 + M unknowns of each of D trials to the normal equations: products with the q unknowns
+    of a frame (F, q, D E), with scale and offsets (S + 3 M, D E) and with each other (D E, D E), and the gradient (D
+    E,).
 
     `b`: weights of the mean that is removed; `W`: curvature of each marker's 3D residual; `U_t`: each marker by its
     offset, transposed; `cross`: force on each marker in 3D where the unknowns of frame, scale and lean move, the mean

@@ -28,7 +28,7 @@ def later(a: Array) -> Array:
 
 
 def slide_contact(p: Problem) -> Float[Array, "F P"]:
-    """How surely a point of the soles stands in a frame and the next one of its trial."""
+    """Certainty that a point of the soles stands in a frame and the next one of its trial."""
     return p.contact * later(p.contact) * ((p.rate > 0) * later(p.weight))[:, None]
 
 

@@ -57,7 +57,7 @@ class Draw(eqx.Module):
 
 
 class Data(eqx.Module):
-    """What does not change: F frames and N trials with M phone samples each, all padded.
+    """Constants of the problem: F frames and N trials with M phone samples each, all padded.
 
     code: the encoded times of all frames, then of all phone samples (row F + i M + k). order: numbers of the frames
     that count, trial after trial; first, count: where each trial's lie in it. phone_count: samples that count, the
@@ -93,7 +93,7 @@ class Data(eqx.Module):
 def solve_sessions(
     sessions: Sequence[Session], params: ImplicitAdamParams, starts: Sequence[State]
 ) -> list[Solution | PblError]:
-    """Fit sessions one after the other, from the paramset's own start; an error in the place of one that has none."""
+    """Fit sessions one after the other, from the paramset's own start; an error takes the place of a failed one."""
     out: list[Solution | PblError] = []
     for session in sessions:
         try:

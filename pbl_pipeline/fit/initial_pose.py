@@ -1,4 +1,4 @@
-"""Where a fit starts: the standing body, placed and turned in each frame by the points of the trunk, its arms in the
+"""Start of a fit: the standing body, placed and turned in each frame by the points of the trunk, its arms in the
 nearest of some postures.
 """
 
@@ -20,27 +20,27 @@ from .standing import bodies_at, marker_places, standing_markers, trunk_of
 
 #: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
 BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
-#: Bodies whose markers tell how an arm is held.
+#: Bodies whose markers show the posture of an arm.
 ARM_BODIES = ("humerus", "ulna", "radius", "hand")
-#: An arm that does not hang starts in the nearest of these postures (deg, all combinations). From arms that hang the
-#: solver took bent ones for bent backwards, and frames found out one after the other, a step each.
+#: An arm that does not hang starts in the nearest of these postures (deg, all combinations). From hanging arms the
+#: solver converged to elbows bent backwards, and frames recovered one after the other, a step each.
 ARM_DEG = {
     "arm_flex": (-30.0, 0.0, 40.0, 90.0, 140.0),
     "arm_add": (-80.0, -40.0, 0.0),
     "arm_rot": (-40.0, 0.0, 40.0),
     "elbow_flex": (20.0, 60.0, 110.0),
 }
-#: Mean distance (m) of an arm's points from a posture that is taken: less than from hanging by the first at least, and
-#: below the second, which the walks of the tests do not reach on a body that faces the wrong way.
+#: A posture is accepted if the mean distance (m) of an arm's points from it is less than from hanging by the first at
+#: least, and below the second, which the walks of the tests do not reach on a body that faces the wrong way.
 NEARER_M, FURTHEST_M = 0.10, 0.15
-#: Marker sets whose places in the postures are kept.
+#: Number of marker sets whose places in the postures are cached.
 SETS = 8
-#: The body is placed, and its arms are looked at, every so many frames, and interpolated.
+#: The body is placed, and its arms are compared, every so many frames, and interpolated.
 PLACED_EVERY, ARMS_EVERY = 3, 15
 
 
 def placed_poses(session: Session, trial: int, flip: bool = False, every: int = PLACED_EVERY) -> np.ndarray:
-    """qpos (T, 40) of one trial; `flip`: facing the other way; `every`: look at every so many frames."""
+    """qpos (T, 40) of one trial; `flip`: facing the other way; `every`: use every so many frames."""
     n = len(session.arrays[trial].used)
     looked = np.arange(0, n, every)
     arrays = _at(session.arrays[trial], looked)
@@ -120,7 +120,7 @@ def _arms(body: Body, markers: MarkerSet) -> list[_Arm]:
 
 
 def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
-    """World positions (T, J, 3) in m and confidences (T, J) of what was seen, from whatever the trial holds."""
+    """World positions (T, J, 3) in m and confidences (T, J) of the observed points, whatever the kind of trial."""
     if np.any(arrays.c_world > 0):
         return arrays.x_world, arrays.c_world
     v = int(np.argmax(np.sum(arrays.c_3d, axis=(0, 2))))
@@ -275,7 +275,7 @@ def median_pose(session: Session, trial: int) -> np.ndarray:
 def median_orientation(session: Session, trial: int) -> np.ndarray:
     """Rotation vector (3,) in rad of the median orientation R_nc of a trial's camera over the frames that count.
 
-    The median of each component of the rotations away from the mean orientation. Zero where there is no camera.
+    The median of each component of the rotations away from the mean orientation. Zero without a camera.
     """
     arrays = session.arrays[trial]
     if arrays.R_nc.shape[1] == 0:

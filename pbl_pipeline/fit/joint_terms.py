@@ -13,7 +13,7 @@ from .term import At, Term, Unknowns
 def beyond_limit_deg(
     qpos: Float[Array, "*n Q"], low: Float[Array, " Q"], high: Float[Array, " Q"]
 ) -> Float[Array, "*n Q"]:
-    """How far a joint is beyond its limit (deg, negative below the lower one), 0 inside."""
+    """Angle of a joint beyond its limit (deg, negative below the lower one), 0 inside."""
     return jnp.rad2deg(jnp.maximum(qpos - high, 0.0) + jnp.minimum(qpos - low, 0.0))
 
 
@@ -34,7 +34,7 @@ def shift(a: Array, by: int) -> Array:
 
 
 def rises(pelvis: Float[Array, "*n 3"]) -> Float[Array, "*n 2"]:
-    """How far the pelvis' forward axis rises and its right axis falls, from its three turns (`PELVIS_TURNS`, rad): the
+    """Rise of the pelvis' forward axis and fall of its right axis, from its three turns (`PELVIS_TURNS`, rad): the
     sines of its tilt (backwards positive) and list against the vertical, whichever way it faces."""
     tilt, list_, rotation = (pelvis[..., i] for i in range(3))
     forward = jnp.sin(tilt) * jnp.cos(rotation) + jnp.cos(tilt) * jnp.sin(list_) * jnp.sin(rotation)

@@ -45,8 +45,8 @@ def residual_2d_px(
 def residual_3d_cm(
     x: Float[Array, "*n J 3"], detected: Float[Array, "*n J 3"], depth_ratio: ArrayLike = 1.0
 ) -> Float[Array, "*n J 3"]:
-    """Model points minus detected ones. `depth_ratio`: what a distance along the last axis, a camera's, counts against
-    one across it (1: the paper's)."""
+    """Model points minus detected ones. `depth_ratio`: weight of a distance along the last axis, a camera's, relative
+    to one across it (1: the paper's)."""
     per_m = 100.0 * jnp.concatenate([jnp.ones(2), jnp.reshape(jnp.asarray(depth_ratio, x.dtype), 1)])
     return (x - detected) * per_m
 

@@ -1,9 +1,9 @@
-"""From the metres of the fit to the person's: the detector's guess of her size, or her measured height.
+"""Conversion of the metres of the fit to the person's: by the measured height, else by the detector's guess of size.
 
-One camera sees no lengths: a person half as large at half the distance gives the same pixels, and how large the
-detector's 3D points are is the detector's guess (those of `blazepose-heavy` were 6 % too small on six recordings,
-`research.detector_errors`). A height that was measured says it. The whole scene is enlarged about the camera, so that
-pixels and joint angles stay what they are, and every length (strides, speed, the distance from the camera) follows.
+One camera sees no lengths: a person half as large at half the distance has the same pixels, and the size of the
+detector's 3D points is a guess (those of `blazepose-heavy` were 6 % too small on six recordings,
+`research.detector_errors`). A measured height determines it. The whole scene is enlarged about the camera, so that
+pixels and joint angles do not change, and every length (strides, speed, the distance from the camera) follows.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from .solution import Solution
 
 
 def in_metres(session: Session, solution: Solution, height_m: float | None) -> tuple[Solution, float | None]:
-    """The solution in metres of a body of the person's height, or of the detector's where it is not known; and that
-    height over what the detector takes it for (None: unknown).
+    """The solution in metres of a body of the person's height, or in the detector's if that is not known; and the ratio
+    of that height to the detector's (None: unknown).
 
-    What several cameras or laboratory markers measured stays as it is.
+    Lengths that several cameras or laboratory markers measured do not change.
     """
     detectors = 1.0 / session.metre
     taller = None if height_m is None else height_m / (detectors * stature_m(session.body, solution.scale))

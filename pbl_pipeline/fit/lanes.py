@@ -40,8 +40,8 @@ _Lanes = tuple[Problem, Progress]
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Where an iteration ended, on the host; the points there or, where it was the last one, the variances (F, U) of
-    the frames' unknowns and the outcome."""
+    """End of an iteration, on the host; with the points there or, for the last one, the variances (F, U) of the frames'
+    unknowns and the outcome."""
 
     end: Progress
     x: np.ndarray | None  # (F, P, 3)
@@ -56,7 +56,7 @@ class Found:
 
 
 def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
-    """What `fit_problem` begins with."""
+    """State in which `fit_problem` begins."""
     return before_first(lambda state: linearise(body, p, w, state), start)
 
 
@@ -66,8 +66,8 @@ def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Lim
 
 
 def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
-    """Variances of the frames' unknowns as far as the residuals tell (dispersion times the inverse curvature's
-    diagonal), and the outcome."""
+    """Variances of the frames' unknowns by the residuals (dispersion times the inverse curvature's diagonal), and the
+    outcome."""
     system = latest.system
     own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
     # An unknown that no residual holds gets a variance that is large, not infinite: each joint on its own scale, so
@@ -85,7 +85,7 @@ _finish_many = jax.jit(jax.vmap(finish))
 
 
 def fetch(p: Problem, end: Progress, last: bool, several: bool = False) -> Found:
-    """What is to be known on the host of an iteration that ended; of `several` lanes with a first axis more."""
+    """Fetch the end of an iteration to the host; with `several` lanes arrays have a further first axis."""
     rest = (_finish_many if several else _finish_one)(p, end.latest, end.state.R_nc) if last else ()
     kept = dataclasses.replace(end, latest=None, candidate=None, direction=None)
     return Found(*jax.device_get((kept, None if last else end.latest.x, *rest)))

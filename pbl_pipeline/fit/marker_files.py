@@ -29,7 +29,7 @@ class MarkerFile:
         return tuple(sorted(set(self.in_file) - set(self.markers.names)))
 
     def text(self) -> str:
-        """How many markers of the set the file has, such as "40 of 41 markers of our_lab"."""
+        """Number of the set's markers in the file, such as "40 of 41 markers of our_lab"."""
         n = len(self.markers)
         return f"{n - len(self.absent)} of {n} markers of {self.markers.name}"
 

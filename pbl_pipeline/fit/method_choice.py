@@ -1,4 +1,4 @@
-"""The method that suits what was seen: the default where none is named, and what a named one is compared with."""
+"""The fit method that suits the points: the default if none is named, and a warning if a named one does not suit."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Points = tuple[str, bool] | None
 def default_fit(*points: Points, solver: str | None = None) -> str:
     """Return the name of the method for trials with these points; every default of the fit is resolved here.
 
-    `markers` for a laboratory's markers, `gauss-newton` for what it was tuned for, MeTRAbs' 87 points with 3D in the
-    camera's frame, and the project's default, with BlazePose's priors, for all else and for trials that differ. Where
-    that method is of another solver than `solver`, the first method of that solver.
+    `markers` for a laboratory's markers, `gauss-newton` for MeTRAbs' 87 points with 3D in the camera's frame, for which
+    it was tuned, and the project's default, with BlazePose's priors, for all others and for mixed trials. If that
+    method is of another solver than `solver`, the first method of that solver.
     """
     suited = {_suited(p) for p in points}
     name = suited.pop() if len(suited) == 1 else METHODS.default
@@ -33,9 +33,9 @@ def points_of(trials: Sequence[Trial]) -> list[Points]:
 
 
 def unsuited(method: str, points: Points) -> str:
-    """Return a warning where a method (its name) was made for other points than these, else "".
+    """Return a warning if a method (its name) was made for other points than these, else "".
 
-    The methods of the paper were made for no points in particular, and neither were methods of a laboratory.
+    Methods of the paper and of a laboratory are not for particular points.
     """
     suits = _suited(points)
     if method == suits or method not in _MADE_FOR:

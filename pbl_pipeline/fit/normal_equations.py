@@ -231,7 +231,7 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     frames, markers = x.shape[:2]
     flat = lambda a: a.reshape(frames, markers * 3, -1)  # noqa: E731
     W_all = jnp.sum(W, axis=1)
-    # What the detector gets wrong moves the 3D residuals alone.
+    # The detector's errors move the 3D residuals alone.
     wide = lambda a: jnp.pad(a, [(0, 0)] * 3 + [(0, detector.by_lean.shape[-1])])  # noqa: E731
     of_2d = wide(times(M, A))
     A = jnp.concatenate([A, detector.by_lean], axis=-1)
@@ -403,8 +403,8 @@ def _add_shared(sum_: _Blocks, at: At, columns: _Columns) -> tuple[_Blocks, Arra
 
 
 def _held(p: Problem, columns: _Columns) -> Float[Array, "F U"]:
-    """What is added to the diagonal of each frame: a frame that counts for nothing stays where it is, and one without
-    an orientation keeps its camera."""
+    """Addition to the diagonal of each frame: a frame without weight stays where it is, and one without an orientation
+    keeps its camera."""
     bent = p.bend[:, 1] ** 2 + shift(p.bend[:, 0], -1) ** 2 + shift(p.bend[:, 2], 1) ** 2
     empty = ((p.weight == 0) & (bent == 0))[:, None]
     turns = (1e-3 + 1e6 * (1 - p.has_phone[p.trial]))[:, None] if p.moving else 0.0

@@ -20,8 +20,8 @@ class CostParams:
     squares in standard deviations. The 2D cost of 33 independent markers with 5 px noise is about 10 times less than
     its negative log-likelihood, so a prior of weight 0.1 counts as its standard deviations say.
 
-    `pixel`: what a px is, "file", "1080x1920" or "crop"; `metre`: whose the metres and cm of a single camera's points
-    are, "detector" or "body" (`units.py`).
+    `pixel`: unit of px, "file", "1080x1920" or "crop"; `metre`: unit of the metres and cm of a single camera's points,
+    "detector" or "body" (`units.py`).
     """
 
     pixel: str = later("file")
@@ -32,7 +32,7 @@ class CostParams:
     #: On the marker set's places. 100 is a standard deviation of about 2 cm per axis, by the same count; 25 of 4 cm.
     weight_offset_per_m2: float = 100.0
     weight_phone: float = 1.0
-    #: What a 3D distance along the camera's axis counts against one across it.
+    #: Weight of a 3D distance along the camera's axis relative to one across it.
     depth_ratio: float = 1.0
     huber_3d_cm: float = 10.0
     huber_2d_px: float = 5.0
@@ -49,7 +49,7 @@ class CostParams:
 
 @dataclasses.dataclass(frozen=True)
 class ViewParams:
-    """Which frames count: whole person in view, shorter gaps of partial view bridged (paper, Keypoint Detection).
+    """Selection of frames: whole person in view, shorter gaps of partial view bridged (paper, Keypoint Detection).
 
     `max_blind_s` is our own addition: longer runs in which nothing was detected are left unknown.
     """
@@ -86,20 +86,20 @@ class ImplicitAdamParams:
     view: ViewParams = ViewParams()
 
 
-#: What 33 points with two on the pelvis, three on a hand and two on a foot hardly tell: turns of the trunk against
-#: the pelvis, turns of a limb about its own axis, sideways joints. Without a prior these take up whatever the detector
-#: gets wrong (a pelvis tipped back by 25 deg in sitting). Standard deviations are round numbers of the project's own,
-#: set by anatomy and not by fitting: about how far a joint moves in walking and standing up, together with how people
-#: differ in their standing pose. Hip and knee flexion, ankle, shoulders and elbows are seen well and have none, but for
-#: the turn of the upper arm, which a straight elbow hides. Forearm: 90 deg turns the palms to the body, as they hang.
+#: Of joints that 33 points, with two on the pelvis, three on a hand and two on a foot, hardly determine: turns of the
+#: trunk against the pelvis, turns of a limb about its own axis, sideways joints. Without a prior these absorb the
+#: detector's errors (a pelvis tipped back by 25 deg in sitting). Standard deviations are the project's own round
+#: numbers, set by anatomy and not by fitting: about the movement of a joint in walking and standing up, together with
+#: the differences between people's standing poses. Hip and knee flexion, ankle, shoulders and elbows are seen well and
+#: have none, except the turn of the upper arm, which a straight elbow hides. Forearm: 90 deg turns the palms inwards.
 #: Lumbar spine: the mean of two walks fitted from a laboratory's markers (-7 and -5 deg; nimblephysics' OpenSim data).
 POSE_PRIOR_DEG: tuple[tuple[str, float, float], ...] = tuple((n, *v) for n, v in _TABLES["pose_prior_deg"].items())
 
-#: What `qpos_sd` is multiplied by, per group of joints, unless a paramset says otherwise: such that 90 % intervals of
-#: `gauss-newton` 1 held the truth in 90 % of the samples of the synthetic walker, whose pixels erred without a memory.
+#: Factor of `qpos_sd`, per group of joints, unless a paramset has its own: such that 90 % intervals of `gauss-newton` 1
+#: held the truth in 90 % of the samples of the synthetic walker, with independent pixel noise.
 SD_FACTOR: tuple[tuple[str, float], ...] = tuple(_TABLES["sd_factor"].items())
-#: The same of `gauss-newton`, of pixels that err with a memory (`python -m research.benchmarks.uncertainty` prints them
-#: and checks them on other walks).
+#: The same for `gauss-newton` with temporally correlated pixel noise (`python -m research.benchmarks.uncertainty`
+#: prints them and checks them on other walks).
 SD_FACTOR_METRABS: tuple[tuple[str, float], ...] = tuple(_TABLES["sd_factor_metrabs"].items())
 #: Least standard deviations of `blazepose` (deg, slides cm): a detector that leans a person, or marks another place
 #: than the model, does so in every frame, and no residual shows it. Such that 90 % intervals hold 90 % of the samples
@@ -116,9 +116,9 @@ class GaussNewtonParams:
     solver: str = "gauss-newton"
     #: At most 200, the space that the solver keeps for its trace.
     max_iterations: int = 60
-    #: It ends after a step in which no joint moved further (rad; m for the pelvis) ...
+    #: The solver ends after a step in which no joint moved further (rad; m for the pelvis) ...
     tolerance_rad: float = 1e-3
-    #: ... or three in a row whose gain was below this share of the cost.
+    #: ... or after three in a row whose gain was below this share of the cost.
     tolerance_cost: float = 1e-5
     #: Weight of half the squared second difference of each joint over frames at 30 Hz, per rad^2 and m^2.
     smooth_per_rad2: float = 200.0
@@ -129,24 +129,24 @@ class GaussNewtonParams:
     huber_phone_deg: float = 0.5
     #: Standard deviation (s) of the offset between the phone's clock and the video's.
     clock_sd_s: float = 0.2
-    #: Feet on the floor (`feet_terms.py`): height over it, and way of a sole that stands, per cm^2. 0: none.
+    #: Feet on the floor (`feet_terms.py`): height over it, and movement of a standing sole, per cm^2. 0: none.
     weight_floor: float = 0.0
     weight_slide: float = 0.0
     huber_floor_cm: float = 2.0
     huber_slide_cm: float = 1.0
     slope_sd_deg: float = 5.0
-    #: What a detector's 3D points of one camera are wrong by in all frames of a trial, as unknowns with a prior: a lean
-    #: of the whole person, and the depth of each marker. The prior counts as the pose's does. 0: no such unknowns.
+    #: Constant error of a detector's 3D points of one camera over a trial, as unknowns with a prior: a lean of the
+    #: whole person, and the depth of each marker. The prior counts as the pose's does. 0: no such unknowns.
     weight_detector: float = later(0.0)
     lean_sd_deg: float = later(5.0)
     depth_sd_m: float = later(0.08)
-    #: Of the pelvis' tilt and list, where a person sits or squats, as the marker augmenter has them from a first
-    #: solution (`augmented_pelvis.py`): half squares in standard deviations. 0: the augmenter is not asked.
+    #: Of the augmenter's tilt and list of the pelvis if a person sits or squats (`augmented_pelvis.py`): half squares
+    #: in standard deviations. 0: the augmenter is not used.
     weight_pelvis: float = later(0.0)
     pelvis_sd_deg: float = later(6.0)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
-    #: Least standard deviation in deg (slides: cm), added in squares: what a detector gets wrong in the same way in
-    #: many frames, which no number of frames mends.
+    #: Least standard deviation in deg (slides: cm), added in squares: detector errors that are common to many frames,
+    #: which averaging does not reduce.
     sd_floor: tuple[tuple[str, float], ...] = ()
     cost: CostParams = CostParams()
     view: ViewParams = ViewParams()
@@ -155,7 +155,7 @@ class GaussNewtonParams:
 #: The paper's own. Its pixels are those of pictures of 1080 x 1920, so in a picture of another size they count as many
 #: of the file as make the same share of it. With `pixel="file"` they count as they are, as version 1 did.
 PAPER_2025 = ImplicitAdamParams(cost=CostParams(pixel="1080x1920"))
-#: The paper's costs as they are, for comparison: what `gauss-newton` finds where `paper-2025` looks.
+#: The paper's costs unchanged, for comparison: the optimum of `paper-2025` found by `gauss-newton`.
 PAPER_GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=30.0, smooth_per_m2=3_000.0, cost=CostParams(pixel="1080x1920"))
 #: For 87 points of MeTRAbs. Pixels count more against 3D than in the paper, and depth less than what lies across the
 #: line of sight, because it errs more and together (docs/benchmarks.md). Tuned on the synthetic walker, with temporally
@@ -180,8 +180,8 @@ GAUSS_NEWTON = GaussNewtonParams(
 #: held by postures of people. Its depth is much less certain than its pixels, so it counts half. Its points were marked
 #: by eye in pictures and not felt on bone, so they may lie further from the marker set's places than a laboratory's.
 #: Weights were chosen on the two phone clips with marker mocap and on recorded walks with the detector's errors,
-#: persons held out of the prior (`research.corpus`, research/benchmarks/real_clips); that of the augmenter's pelvis on
-#: recorded squats with the same errors, too. Its 33 points weigh less than MeTRAbs's 87, and so does what smooths them.
+#: persons held out of the prior (`research.corpus`, research/benchmarks/real_clips); that of the augmenter's pelvis
+#: also on recorded squats with the same errors. Its 33 points and their smoothing weigh less than MeTRAbs's 87.
 BLAZEPOSE = GaussNewtonParams(
     smooth_per_rad2=20.0,
     weight_floor=0.03,

@@ -44,15 +44,15 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
-    again from a start that faces the other way, and the better one of the two is kept. Where the paramset has feet on
-    the floor or a pelvis as the marker augmenter has it, a first solution tells when each foot stands and what the
-    augmenter sees, and a second one uses it.
+    again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
+    floor or the augmenter's pelvis, a first solution shows when each foot stands and what the augmenter sees, and a
+    second one uses it.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
     begin, compiled = time.perf_counter(), compile_seconds()
     twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
-    several = len(sessions) > 1  # then in lanes, also a part of them: each way has other programs to compile
+    several = len(sessions) > 1  # then in lanes, also for a part of them: each way compiles other programs
     solve = functools.partial(_solve, params=params, several=several)
     starts = [_with_detector(s, params) for s in starts]
     found = solve(sessions, [s.problem for s in sessions], starts, last=not twice)
@@ -96,7 +96,7 @@ def start_of(session: Session, flip: bool = False) -> State:
         "site_offset_m": zeros((n_markers, 3)),
         "clock_s": zeros(n_trials),
         "floor": zeros((n_trials, 3)),
-        # On the host as all of it: what lies on a device comes back one by one before a batch is stacked.
+        # On the host like the others: arrays of a device are fetched one by one before a batch is stacked.
         "lean": zeros((0, 3)),
         "depth_m": zeros((0, 0)),
     }
@@ -104,7 +104,7 @@ def start_of(session: Session, flip: bool = False) -> State:
 
 
 def _with_detector(start: State, params: GaussNewtonParams) -> State:
-    """With what the detector of a single camera may get wrong among the unknowns, where the paramset asks for it."""
+    """Add the errors of a single camera's detector to the unknowns, if the paramset has them."""
     if params.weight_detector == 0 or start.R_nc.shape[1] != 1:
         return start
     trials, markers = start.floor.shape[0], start.site_offset_m.shape[0]
@@ -114,7 +114,7 @@ def _with_detector(start: State, params: GaussNewtonParams) -> State:
 
 
 def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """`fit_one` with a bar that moves with each iteration; all at once where no bar is shown."""
+    """`fit_one` with a bar that moves with each iteration; all at once if no bar is shown."""
     if not progress.enabled():
         return fit_one(body, p, w, begin, limits)
     most, at = int(limits.iterations), begin
@@ -146,7 +146,7 @@ def _solve(
 
 
 def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
-    """The problem with the frames in which feet stand, as a solution shows them, and that solution to start from."""
+    """The problem with the frames in which feet stand in a solution, and that solution to start from."""
     p, state = session.problem, found.end.state
     assert found.x is not None
     soles = p.split(found.x)[1]
@@ -161,7 +161,7 @@ def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
 
 
 def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> Float[np.ndarray, "T P"]:
-    """How surely (0 to 1) each point of the soles stands: one half where it is just slow enough."""
+    """Certainty (0 to 1) that each point of the soles stands: one half where it is just slow enough."""
     smooth = gaussian_filter1d(x, STANDING_S / np.median(np.diff(time_s)), axis=0, mode="nearest")
     speed = np.linalg.norm(np.gradient(smooth, time_s, axis=0), axis=-1)
     limit = np.maximum(STANDING_FRACTION * np.percentile(speed, 95, axis=0), STANDING_M_PER_S)
@@ -195,14 +195,14 @@ def _solution(
         iterations=len(trace),
         result=Result(int(found.end.result)),
         outcome=found.outcome,
-        # The phone's part was in the recordings on which the factors were found, so they are of both.
+        # The factors were found on recordings that contain the phone's part, so they apply to both.
         qpos_sd=np.sqrt((variance + phone_variance(session, state.qpos)) * factor**2 + floor**2),
         pelvis_told=pelvis_told,
     )
 
 
 def limits_of(params: GaussNewtonParams) -> Limits:
-    """When to end, on the device."""
+    """The limits of the iteration, on the device."""
     return Limits(
         jnp.asarray(params.tolerance_rad, jnp.float32),
         jnp.asarray(params.tolerance_cost, jnp.float32),
@@ -224,7 +224,7 @@ def floors_of(body: Body, sd_floor: Sequence[tuple[str, float]]) -> np.ndarray:
 
 
 def suspicious(session: Session, qpos: Float[np.ndarray, "F Q"]) -> bool:
-    """Whether the body may face the wrong way: pixels alone do not tell, and knees then stay at their straight end."""
+    """True if the body may face the wrong way, unseen in pixels alone: knees then stay at their straight end."""
     if pixels_alone(session.problem):
         return True
     used = np.asarray(session.problem.weight) > 0

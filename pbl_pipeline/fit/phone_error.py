@@ -1,6 +1,6 @@
-"""What the error of a phone's orientation adds to the uncertainty of where the pelvis is and how it is turned.
+"""Uncertainty of the pelvis' position and orientation from the error of a phone's orientation.
 
-It turns the whole recording about the camera, which no residual shows: the solver's own curvature cannot know of it.
+It turns the whole recording about the camera, which no residual shows, so the solver's curvature does not contain it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from pbl_pipeline.body import SLIDES
 from .initial_pose import pelvis_path, pelvis_rest
 from .session import MEASURED, Session
 
-#: Standard deviation (deg) of a phone's slow error about the vertical, which nothing holds, and about the level axes,
-#: which gravity holds. Those of the synthetic phone (`synthetic.PhoneSensor`); magnets and cars make it worse.
+#: Standard deviation (deg) of a phone's slow error about the vertical, which nothing corrects, and about the level
+#: axes, which gravity corrects. Those of the synthetic phone (`synthetic.PhoneSensor`); magnets and cars increase it.
 HEADING_SD_DEG, LEVEL_SD_DEG = 0.5, 0.1
 
 

@@ -27,7 +27,7 @@ def measured_orientation(p: Problem, clock_s: Float[Array, " F"]) -> jaxlie.SO3:
 
 
 def phone_at(p: Problem, state: State) -> Phone | None:
-    """The phone of a problem at its frames and the clocks of a state; None where no camera turns."""
+    """The phone of a problem at its frames and the clocks of a state; None if no camera turns."""
     if not p.moving:
         return None
     clock_s = state.clock_s[p.trial]

@@ -19,14 +19,14 @@ DATA = Path(__file__).parent / "data"
 def pose_prior(
     joint_names: Sequence[str], pose_prior_deg: Sequence[tuple[str, float, float]], learned: str = ""
 ) -> tuple[Float[np.ndarray, "C Q"], Float[np.ndarray, "C Q Q"], Float[np.ndarray, " C"]]:
-    """Middle (C, Q) in rad, whitening matrix (C, Q, Q) in 1/rad, rows of 0 where there is no prior, and logarithmic
-    weight (C,) of each component.
+    """Middle (C, Q) in rad, whitening matrix (C, Q, Q) in 1/rad, with rows of 0 for joints without a prior, and
+    logarithmic weight (C,) of each component.
 
     A name of `pose_prior_deg` means the joint of that name, or both sides of it (`hip_rotation` for `hip_rotation_r`
     and `_l`); the later entry wins. `learned`: a mixture of `data/`, whose normal distributions with their full
     covariance take the place of the independent ones of their joints.
 
-    Raises `PblError` FIT_INPUT: no such joint or prior, or a standard deviation that is not positive.
+    Raises `PblError` FIT_INPUT: an unknown joint or prior, or a standard deviation that is not positive.
     """
     neutral, precision = np.zeros(len(joint_names)), np.zeros((len(joint_names),) * 2)
     for name, mean_deg, sd_deg in pose_prior_deg:
@@ -67,7 +67,7 @@ def learned_poses(name: str) -> dict[str, Any]:
     """A mixture that was learned from people: `joints`, and `components` with `weight`, `mean_deg` and
     `covariance_deg2` of these joints.
 
-    Raises `PblError` FIT_INPUT: there is no such prior.
+    Raises `PblError` FIT_INPUT: an unknown prior.
     """
     path = DATA / f"{name}.json"
     if not path.is_file():

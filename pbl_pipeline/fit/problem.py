@@ -1,5 +1,4 @@
-"""A session as arrays: what was seen in the frames of all trials, one after another, and the points that are fitted to
-it.
+"""A session as arrays: the observations in the frames of all trials, one after another, and the points fitted to them.
 
 Frames, markers and trials are padded to a few sizes, so that a worker compiles a handful of programs. Padding has
 weight 0 everywhere and never changes a result. On a GPU the sizes are fewer: there a program takes ten seconds to
@@ -54,18 +53,18 @@ class Problem:
     """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J
     where markers were measured in the world, which have no views, and 0 otherwise.
 
-    `points`: what is fitted; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
+    `points`: the fitted ones; `weight_3d`: of each marker, as in `MarkerSet`. time_s counts from each trial's first
     frame; `trial` is the number of a frame's trial; `weight` is 1 for a frame that counts and 0 for others. `c_*` are
     confidences over the numbers of markers and views, so that a sum over both is the paper's mean; 0 where nothing was
     seen, where values are finite and do not count. `xy_px` and `camera_matrix` are of an ideal pinhole camera
     (undistorted), in the pixels of the cost, which are `pixel_px` pixels of the file (`units.py`). `bend`
     holds the weights of the frames before, at and after a frame in the second difference there (per 1/30 s squared), 0
     where it is not formed; `rate` is 1/30 s over the time to the next frame of the trial, 0 where there is none.
-    `contact`: how surely each of the soles' points stands (0 to 1), 0 until a first solution tells; `pelvis`: tilt
-    and list of the pelvis (rad) as the marker augmenter has them, and `c_pelvis`, 1 where it has. `sample_*`: the
-    phone's orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; there where `has_phone` is 1.
-    `clock_sd_s`: of its clock's offset where the log's makers know it, 0 elsewhere.
-    M is 0 where no camera of the session turns.
+    `contact`: certainty (0 to 1) that each of the soles' points stands, 0 before a first solution; `pelvis`: tilt and
+    list of the pelvis (rad) by the marker augmenter, and `c_pelvis`, 1 where it has them. `sample_*`: the phone's
+    orientation R_nc as quaternions at a fixed interval, from `sample_start_s` on; valid where `has_phone` is 1.
+    `clock_sd_s`: of its clock's offset if the log states it, else 0.
+    M is 0 if no camera of the session turns.
     """
 
     points: PointTable
@@ -96,7 +95,7 @@ class Problem:
 
     @property
     def moving(self) -> bool:
-        """Whether a camera turns and its orientation was measured."""
+        """True if a camera turns and its orientation was measured."""
         return self.sample_quat_wxyz.shape[-2] > 0
 
     def split(self, x: Any) -> tuple[Any, Any, Any]:
@@ -115,9 +114,9 @@ class State:
     """The unknowns of a session at F frames. `s`: the paper's scale parameters; `clock_s`: sensor time minus video time
     of each trial; `floor`: its height (m) and slopes along the world's x and y, of each trial.
 
-    What a detector's 3D points are wrong by in all frames of a trial, where the paramset asks for it (D is N, else 0):
-    `lean`, the rotation (rotation vector in rad, camera axes) that sets them upright, and `depth_m`, what must be added
-    to each marker's depth.
+    Constant errors of a detector's 3D points over a trial, if the paramset has them (D is N, else 0): `lean`, the
+    rotation (rotation vector in rad, camera axes) that sets them upright, and `depth_m`, the correction of each
+    marker's depth.
     """
 
     qpos: Float[Array, "F Q"]
@@ -156,11 +155,11 @@ class TrialArrays:
     phone_clock_sd_s: float = math.nan
 
 
-#: Interval (s) of the phone's orientation as the solvers see it, and how far beyond the trial it is kept (s): the
-#: largest offset between the two clocks.
+#: Interval (s) of the phone's orientation as the solvers see it, and its margin beyond the trial (s): the largest
+#: offset between the two clocks.
 SAMPLE_S, CLOCK_RANGE_S = 0.01, 0.5
-#: Width (s, standard deviation) over which the phone's orientation is averaged. Interpolated as it is, its noise is
-#: least half way between two samples, and the clock's offset would lock to those places. A hand's 3 Hz lose 7 %.
+#: Width (s, standard deviation) over which the phone's orientation is averaged. Without it, interpolated noise is least
+#: half way between two samples, and the clock's offset would lock to those places. A hand's 3 Hz lose 7 %.
 SMOOTH_S = 0.02
 
 
@@ -210,11 +209,6 @@ def bend_weights(time_s: np.ndarray, used: np.ndarray) -> np.ndarray:
     scale = 2 * FRAME_S**2 / (before + after)
     out[t] = np.stack([scale / before, -scale * (1 / before + 1 / after), scale / after], axis=1)
     return out
-
-
-def step_rates(time_s: np.ndarray) -> np.ndarray:
-    """(T,): 1/30 s over the time from each frame to the next one of the trial, 0 at the last one."""
-    return np.append(FRAME_S / np.diff(time_s), 0.0)
 
 
 @functools.lru_cache(16)
@@ -267,7 +261,7 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "camera_matrix": rows(_matrix_of_cost, edge=True),
         "pixel_px": rows(lambda t: t.pixel_px, edge=True),
         "bend": rows(lambda t: bend_weights(t.time_s, t.used)),
-        "rate": rows(lambda t: step_rates(t.time_s)),
+        "rate": rows(lambda t: np.append(FRAME_S / np.diff(t.time_s), 0.0)),
         "contact": np.zeros((frames, soles)),
         "pelvis": np.zeros((frames, 2)),
         "c_pelvis": np.zeros(frames),
@@ -323,6 +317,6 @@ def frames_at(p: Problem, index: Int[Array, " K"]) -> Problem:
 
 
 def pixels_alone(problem: Problem) -> bool:
-    """Whether one camera without 3D points is all there is."""
+    """True if one camera without 3D points is the only observation."""
     none = lambda c: not np.any(np.asarray(c) > 0)  # noqa: E731
     return none(problem.c_3d) and none(problem.c_world) and problem.c_2d.shape[1] == 1

@@ -19,14 +19,14 @@ class TrialFit:
     """The fitted movement of one trial. World frame: z up, origin at the camera, metres.
 
     time_s (T,); joint_names (40,); qpos (T, 40) in m and rad, NaN in frames outside the time the person is in view;
-    qpos_sd (T, 40), NaN where the solver gives none; marker_names (J,); markers_world_m (T, J, 3);
+    qpos_sd (T, 40), NaN where the solver computes none; marker_names (J,); markers_world_m (T, J, 3);
     phone_quat_wxyz (T, 4) camera to world; scale (8,) multipliers of the groups in `body.SCALE_NAMES` (1 = the
     unscaled body; a group's bodies have this scale, all others that of "overall"); site_offset_m (J, 3) in the
     marker's body frame; residual_2d_px (T, J) and residual_3d_m (T, J), NaN where nothing was seen. Of several cameras
     residual_2d_px is the mean over them, and camera, phone_quat_wxyz and camera_position_m (3,) are the first one's;
     laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
-    estimated. orientation_source: where the world's vertical comes from. height_m: the person's stated body height,
-    which sets the size of what one camera sees (`known_height.py`), NaN where it was not stated.
+    estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
+    the scale of a fit to one camera (`known_height.py`), NaN if it was not stated.
     """
 
     name: str
@@ -68,7 +68,7 @@ class TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
         wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
         fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        # Files of before heights could be stated lack it.
+        # Older files, from before heights could be stated, lack it.
         data = {"height_m": np.asarray(np.nan), **load_npz(path, fields)}
         missing = [k for k in fields if k not in data]
         if missing:

@@ -30,10 +30,10 @@ from .units import BODY, FILE, body_metres, check_units, pixel_px
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-#: What a trial may be.
+#: Kinds of trials.
 Trial = Keypoints | MultiView | WorldMarkers
 
-#: Where the camera's orientation comes from (`TrialFit.orientation_source`).
+#: Sources of the camera's orientation (`TrialFit.orientation_source`).
 MEASURED, CALIBRATED, LEVEL, GAIT = "measured: phone", "measured: calibration", "assumed: level", "estimated: gait"
 
 #: Share of a trial's used time that the phone's log must cover.
@@ -42,8 +42,8 @@ PHONE_COVERAGE = 0.9
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """One session. `used` (T_i,) bool: frames that count, unpadded; `orientation`: source of each camera's; `metre`:
-    metres of the fit in one of the detector's (`units.body_metres`)."""
+    """One session. `orientation`: source of each camera's; `metre`: metres of the fit in one of the detector's
+    (`units.body_metres`)."""
 
     body: Body
     markers: MarkerSet
@@ -56,7 +56,7 @@ class Session:
     metre: float = 1.0
 
     def frames(self, i: int) -> slice:
-        """Where trial `i` lies in the packed frames."""
+        """Position of trial `i` in the packed frames."""
         start = sum(len(a.time_s) for a in self.arrays[:i])
         return slice(start, start + len(self.arrays[i].time_s))
 
@@ -115,9 +115,9 @@ def make_session(
 def check_trial(
     trial: Trial, name: str, view: ViewParams, markers: MarkerSet | None = None
 ) -> tuple[np.ndarray, float]:
-    """Which frames (T,) bool of a trial a fit would use, and the share of frames with the whole person in view.
+    """Frames (T,) bool of a trial that a fit would use, and the share of frames with the whole person in view.
 
-    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN or PHONE_LOG where the trial cannot be fitted.
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN or PHONE_LOG if the trial cannot be fitted.
     """
     (markers or marker_set(trial.marker_set)).check_names(trial.names)
     step = np.diff(trial.time_s)
@@ -151,7 +151,7 @@ def check_trial(
 
 
 def _long_enough(used: np.ndarray, time_s: np.ndarray, name: str, view: ViewParams) -> np.ndarray:
-    """`used` (T,), where it has a run that can be fitted. Raises `PblError` FIT_INPUT."""
+    """Return `used` (T,) if it has a run that can be fitted. Raises `PblError` FIT_INPUT."""
     longest = longest_run_s(used, time_s)
     if longest < view.min_in_view_s:
         raise _input_error(
@@ -164,14 +164,14 @@ def _long_enough(used: np.ndarray, time_s: np.ndarray, name: str, view: ViewPara
 
 
 def _mean_seen(confidence: np.ndarray) -> np.ndarray:
-    """Mean confidence of the markers seen in each frame: a laboratory's missing marker says nothing of the others."""
+    """Mean confidence of the markers seen in each frame: a missing marker does not make the others less certain."""
     count = np.maximum(np.sum(confidence > 0, axis=1), 1)
     return np.sum(confidence, axis=1) / count
 
 
 def has_3d(trial: Keypoints) -> bool:
-    """Whether the detector gave 3D points at all."""
-    frames = zip(trial.xyz_cam_m, trial.confidence, strict=True)  # one by one: the first one mostly tells
+    """True if the trial has any 3D points."""
+    frames = zip(trial.xyz_cam_m, trial.confidence, strict=True)  # one by one: mostly the first one decides
     return any(np.isfinite(x[c > 0]).any() for x, c in frames)
 
 
@@ -193,7 +193,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str = FILE) -> tuple[TrialArrays, str]:
-    """The arrays of a trial and where its camera's orientation comes from."""
+    """The arrays of a trial and the source of its camera's orientation."""
     t, j = len(trial.time_s), len(trial.names)
     if isinstance(trial, WorldMarkers):
         seen = trial.confidence > 0

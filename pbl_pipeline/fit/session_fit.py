@@ -37,9 +37,9 @@ from .vertical import upright
 #: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
 #: packed meanwhile.
 BATCH = 128
-#: Batches that are solved at a time on a GPU: while the host works for one, the device iterates the other.
+#: Batches that are solved at a time on a GPU: while the host works on one, the device iterates the other.
 SOLVERS = 2
-#: Threads that pack them and make their results: numpy's larger steps run beside each other.
+#: Threads that pack sessions and make their results: numpy's larger steps run in parallel.
 PACKERS = 4
 
 
@@ -74,15 +74,15 @@ def fit_session(
     paramset
         What `METHODS.find` takes: the name of a method, a `Paramset`, parameters of a solver; None for the default.
     camera_motion
-        "static" or "handheld", for all trials or each. The orientation of a handheld phone that was logged
+        "static" or "handheld", for all trials or each. The logged orientation of a handheld phone
         (`Keypoints.phone_quat_wxyz`) is part of the fit, together with the offset between its clock and the video's;
-        that of a static one gives its tilt. Without a log the camera counts as one that does not turn, and level
-        unless the walk tells its tilt; a check says which.
+        of a static one it determines the tilt. Without a log the camera counts as one that does not turn, and as level
+        unless the walk shows its tilt; a check reports which.
     markers
-        Where the markers sit on the body, for a set of the laboratory's own (`body.load_marker_set`).
+        A laboratory's marker set (`body.load_marker_set`); None: a shipped one, by its name in the trials.
     height_m
-        The person's measured body height (m): lengths of a fit to one camera then are those of a person so tall, where
-        they otherwise are the detector's guess (`known_height`). Angles do not depend on it.
+        The person's measured body height (m), which scales the lengths of a fit to one camera; without it they have the
+        detector's guess (`known_height`). Angles do not depend on it.
     """
     result = fit_sessions([SessionInput(trials, names, camera_motion, markers, height_m)], paramset)[0]
     if isinstance(result, PblError):
@@ -97,7 +97,7 @@ def fit_sessions(
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
-    A session that cannot be fitted gives its `PblError` in its place. `batch`: most sessions at once
+    A session that cannot be fitted has its `PblError` in its place. `batch`: most sessions at once
     (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
 
     Raises `PblError` SOLVER_UNKNOWN.
@@ -121,9 +121,10 @@ def fit_sessions(
                 part = next(parts, None)
             if part is None:
                 return
-            list(threads.map(finish, part, _solve(part, method)))  # raises what was raised there
+            solutions = method.function([p.session for p in part], method.params, [p.start for p in part])
+            list(threads.map(finish, part, solutions))  # raises what was raised there
 
-    # While batches are solved, the results of those before are made and the next one is packed.
+    # While batches are solved, the results of earlier ones are made and the next one is packed.
     with (
         ThreadPoolExecutor(PACKERS) as threads,
         contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
@@ -135,7 +136,7 @@ def fit_sessions(
 
 @dataclasses.dataclass(frozen=True)
 class _Packed:
-    """A session ready for a solver, with where to start; `seconds`: what it took to get here."""
+    """A session ready for a solver, with its start; `seconds`: time that packing took."""
 
     index: int
     session: Session
@@ -152,7 +153,7 @@ def _batches(
 ) -> Iterator[list[_Packed]]:
     """Up to `batch` sessions of the same sizes and terms at a time; errors of the others go to `out`."""
     waiting: dict[tuple, list[_Packed]] = {}
-    load_body()  # before the threads, each of which would load a body of its own, and compile for it
+    load_body()  # before the threads, each of which would load its own body and compile for it
 
     def pack(i: int) -> _Packed | PblError:
         begin, given = time.perf_counter(), sessions[i]
@@ -183,19 +184,15 @@ def _motions(given: SessionInput) -> list[str]:
     return [motion] * len(given.trials) if isinstance(motion, str) else list(motion)
 
 
-def _solve(part: Sequence[_Packed], method: Method[Params]) -> Sequence[Solution | PblError]:
-    return method.function([p.session for p in part], method.params, [p.start for p in part])
-
-
 def check_trial(
     trial: Trial,
     name: str,
     paramset: Method[Params] | Paramset | Params | str | None = None,
     markers: MarkerSet | None = None,
 ) -> tuple[np.ndarray, float]:
-    """Which frames (T,) bool of a trial the fit would use, and the share of frames with the whole person in view.
+    """Frames (T,) bool of a trial that the fit would use, and the share of frames with the whole person in view.
 
-    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN where the trial cannot be fitted.
+    Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN if the trial cannot be fitted.
     """
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 

@@ -9,7 +9,7 @@ from .term import At, SharedTerm, frame_count
 
 #: Cost of a floor's slope one standard deviation from level: that of a marker 3 px off in one frame.
 SLOPE_COST = 0.03
-#: A floor's height is free, and held near 0 where nobody stands (per m^2).
+#: A floor's height is free, and held near 0 without standing feet (per m^2).
 FLOOR_HEIGHT_PRECISION = 1e-6
 
 

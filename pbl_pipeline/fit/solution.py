@@ -1,4 +1,4 @@
-"""What every solver returns, and what it looks like beside the keypoints."""
+"""Result of every solver, and its residuals against the keypoints."""
 
 from __future__ import annotations
 
@@ -37,9 +37,8 @@ class Solution:
 
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
-    deviations, None where the solver computes none; pelvis_told: 1 where the marker augmenter told how the pelvis is
-    tipped, None where the method does not ask it; metre: metres of the solution in one of the fit; result: why the
-    solver ended.
+    deviations, None if the solver computes none; pelvis_told: 1 in frames with the augmenter's tilt of the pelvis, None
+    if the method does not use it; metre: metres of the solution in one of the fit; result: reason why the solver ended.
     """
 
     qpos: Float[np.ndarray, "F Q"]
@@ -60,7 +59,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the solver ended at a minimum."""
+        """True if the solver ended at a minimum."""
         return self.result.converged
 
 

@@ -1,17 +1,13 @@
 """The unscaled body as it stands at joint values of 0, its bodies and markers in some poses, by C MuJoCo."""
 
-# MuJoCo is a compiled module without type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from __future__ import annotations
 
 import functools
 
-import mujoco
 import numpy as np
 from jaxtyping import Bool
 
-from pbl_pipeline.body import Body, MarkerSet
+from pbl_pipeline.body import Body, MarkerSet, body_frames
 
 #: Bodies whose markers turn with the trunk; limbs would pull the heading towards where they swing.
 TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
@@ -34,14 +30,9 @@ def _standing(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bodies_at(body: Body, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (K, B, 3) from the pelvis and rotations (K, B, 3, 3) of the unscaled body in K poses, by C MuJoCo."""
-    data, x, R = mujoco.MjData(body.mj_model), [], []
-    for pose in qpos:
-        data.qpos[:] = pose
-        mujoco.mj_kinematics(body.mj_model, data)
-        x.append(data.xpos[1:] - data.xpos[1])
-        R.append(data.xmat[1:].reshape(-1, 3, 3).copy())
-    return np.array(x), np.array(R)
+    """Positions (K, B, 3) from the pelvis and rotations (K, B, 3, 3) of the unscaled body in K poses."""
+    at = body_frames(body, qpos, np.ones(len(body.scale_names)))
+    return at.position_m - at.position_m[:, :1], at.rotation
 
 
 def marker_places(x: np.ndarray, R: np.ndarray, markers: MarkerSet, at: np.ndarray | slice = slice(None)) -> np.ndarray:

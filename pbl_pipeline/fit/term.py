@@ -1,7 +1,7 @@
 """A term of the cost: a residual, its weight, its robust width and the unknowns it depends on, stated once.
 
 `objective.py` lists the terms and adds up their values; `normal_equations.py` adds up their derivatives, which follow
-from the same statement. A term is added as one object in one file and a line of the list; its parameters are fields of
+from the same definition. A term is added as one object in one file and a line of the list; its parameters are fields of
 the paramset (`params.py`), which a term reads by name (`Weights`).
 """
 
@@ -47,7 +47,7 @@ class Phone(NamedTuple):
 
 class At(NamedTuple):
     """Arguments of the terms: the frames of a problem, the parameters, the unknowns, and the markers and
-    soles where the unknowns put them in the world (m). `phone`: None where no camera turns."""
+    soles where the unknowns put them in the world (m). `phone`: None if no camera turns."""
 
     problem: Problem
     weights: Weights
@@ -94,8 +94,8 @@ def frame_count(problem: Problem) -> Float[Array, ""]:
 class Term:
     """A mean over frames of robust costs of residuals.
 
-    Its value is ``sum over frames of frames(at) sum(count(at) robust(|residual|^2)) / number of frames``. Where
-    `count` is empty the problem has nothing that the term compares, and it is left out.
+    Its value is ``sum over frames of frames(at) sum(count(at) robust(|residual|^2)) / number of frames``. If `count`
+    is empty, the problem has no data for the term, and it is left out.
     """
 
     name: str
@@ -142,7 +142,7 @@ class Term:
         return weight_of(self, at) * self.frames(at)
 
     def empty(self, at: At) -> bool:
-        """Whether the problem has nothing that the term compares."""
+        """True if the problem has no data for the term."""
         return jnp.size(self.count(at)) == 0
 
     def _of_frames(self, at: At, cost: Float[Array, "F ..."]) -> Float[Array, " F"]:

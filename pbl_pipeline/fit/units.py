@@ -1,4 +1,4 @@
-"""The units of the cost: what a pixel is, and what a metre is. The only place that makes them.
+"""The units of the cost: its pixel and its metre, defined only here.
 
 A detector cuts the person out of the picture, looks at the crop at a fixed size, and errs by a fraction of that crop:
 in pixels of the file the same error is four times as large at 4K as at 540p, or when the person is four times nearer.
@@ -6,8 +6,8 @@ So residuals of the picture, their weight and their Huber width are in pixels of
 On recordings with a truth, at several sizes each, that unit predicts the error as well as the person's box or distance
 does, and far better than the file's pixel (docs/benchmarks.md); it needs neither depth nor focal length.
 
-In the same way the metres of a single camera's 3D points are those of the person whom the detector assumes. They are
-scaled to the size of the unscaled body, so that a detector that assumes a taller person gives the same angles.
+In the same way the metres of a single camera's 3D points depend on the body size that the detector assumes. They are
+scaled to the size of the unscaled body, so that a detector that assumes a taller person yields the same angles.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from pbl_pipeline.keypoints import Keypoints
 from .params import CostParams
 from .standing import standing_markers, trunk_of
 
-#: What a pixel of the cost is (`CostParams.pixel`): one of the file; one of a picture of 1080 x 1920, as the paper's
-#: were; one of a crop of `CROP_SIZE`.
+#: Pixel of the cost (`CostParams.pixel`): one of the file; one of a picture of 1080 x 1920, as the paper's were; one of
+#: a crop of `CROP_SIZE`.
 PIXELS = FILE, PAPER, CROP = "file", "1080x1920", "crop"
-#: What a metre of the cost is (`CostParams.metre`): the detector's, or that of a person as large as the unscaled body.
+#: Metre of the cost (`CostParams.metre`): the detector's, or that of a person as large as the unscaled body.
 METRES = DETECTOR, BODY = "detector", "body"
 #: Side of a crop that is not resized: the input of BlazePose's landmark networks.
 CROP_SIZE = 256
@@ -41,7 +41,7 @@ CROP_OF_BOX, BOX_PERCENT, BOX_S = 1.48, (5.0, 95.0), 1.0
 
 
 def check_units(cost: CostParams) -> None:
-    """Raises `PblError` FIT_INPUT where the parameters name a unit that does not exist."""
+    """Raise `PblError` FIT_INPUT if the parameters name an unknown unit."""
     for name, value, known in (("pixel", cost.pixel, PIXELS), ("metre", cost.metre, METRES)):
         if value not in known:
             raise PblError(
@@ -65,7 +65,7 @@ def pixel_px(view: Keypoints, pixel: str) -> Float[np.ndarray, " T"]:
 def crop_px(view: Keypoints) -> Float[np.ndarray, " T"]:
     """Side (px) of the crop in which the detector saw the person, in each frame: as stated, else from the points.
 
-    Frames in which nothing was seen have what lies between their neighbours.
+    Frames in which nothing was seen are interpolated from their neighbours.
     """
     stated = None if view.crop_px is None else np.asarray(view.crop_px, np.float64)
     side = stated if stated is not None and np.isfinite(stated).any() else CROP_OF_BOX * box_side_px(view)
@@ -104,10 +104,10 @@ def _percentiles(x: Float[np.ndarray, "D T J"], seen: np.ndarray, percent: Seque
 def body_metres(
     body: Body, markers: MarkerSet, x_cam: Sequence[Float[np.ndarray, "T 1 J 3"]], c: Sequence[np.ndarray]
 ) -> float:
-    """How many metres of the unscaled body one of the detector's is: by the points of the trunk, whose distances from
-    their middle (root mean square) hardly change with the posture; the median over the frames of all trials.
+    """Metres of the unscaled body in one of the detector's: by the points of the trunk, whose distances from their
+    middle (root mean square) hardly change with the posture; the median over the frames of all trials.
 
-    1 where no frame shows three of them in different places.
+    1 if no frame shows three of them in different places.
     """
     trunk = trunk_of(markers)
     template, ratios = standing_markers(body, markers)[trunk], []

@@ -32,13 +32,13 @@ class Weights:
     neutral: Float[Array, "C Q"]
     whitener: Float[Array, "C Q Q"]
     pose_log_weight: Float[Array, " C"]
-    #: Tilt, list and rotation of the pelvis among the joints, where a term needs its inclination, else none.
+    #: Tilt, list and rotation of the pelvis among the joints if a term needs its inclination, else none.
     pelvis: Int[Array, " P"]
     slides: Bool[Array, " Q"]
     #: Joint limits (rad).
     low: Float[Array, " Q"]
     high: Float[Array, " Q"]
-    #: Inverse covariance of the scale parameters, and inverse variance of the first where nothing seen tells it.
+    #: Inverse covariance of the scale parameters, and inverse variance of the first if it is not observed.
     scale_precision: Float[Array, "S S"]
     size_precision: Float[Array, ""]
 
@@ -48,9 +48,9 @@ class Weights:
     @classmethod
     @functools.lru_cache(16)
     def of(cls, body: Body, params: GaussNewtonParams | ImplicitAdamParams, size_unseen: bool = False) -> Weights:
-        """Return those of a paramset. `size_unseen`: nothing seen tells the person's size, so a prior does.
+        """Return those of a paramset. `size_unseen`: the person's size is not observed and needs a prior.
 
-        Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
+        Raises `PblError` FIT_INPUT: the paramset has a prior of an unknown joint.
         """
         cost = params.cost
         # The paper's solver evaluates the paper's terms and priors alone, which need no other number of these.

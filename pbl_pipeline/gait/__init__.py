@@ -1,7 +1,7 @@
 """Gait: feet, events, cycles, spatiotemporal measures and the Gait Deviation Index, of three angles or nine.
 
-Each step is a function of its own with a frozen result: `feet_from_fit` or `feet_from_keypoints`, `detect_events`,
-`find_cycles`, `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
+Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keypoints`, `detect_events`, `find_cycles`,
+`spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
 """
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
@@ -16,7 +16,6 @@ from ._gdi import (
     Gdi,
     GdiCycle,
     GdiParams,
-    gdi_vector,
     interval_90,
     intervals_with_one_more,
     score_gdi,
@@ -36,15 +35,7 @@ from .cycle_measures import (
     spatiotemporal,
 )
 from .events import METHODS as EVENT_METHODS
-from .events import (
-    EventParams,
-    GaitEvent,
-    GaitEvents,
-    apply_correction,
-    check_correction,
-    detect_events,
-    load_events,
-)
+from .events import EventParams, GaitEvent, GaitEvents, apply_correction, check_correction, detect_events, load_events
 from .ground import cycle_lengths
 from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
 from .measurement import IMPORTANT_CHANGE, Chances, chances, change_sd
@@ -58,17 +49,8 @@ from .metrics import (
     gait_metrics,
     pool_trials,
 )
-from .motion import (
-    FOOT_MARKER_SETS,
-    BodyPoses,
-    FootTrajectories,
-    feet_from_fit,
-    feet_from_keypoints,
-    feet_from_markers,
-    trial_poses,
-)
+from .motion import BodyPoses, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers, trial_poses
 from .normative import (
-    ANGLE_MODELS,
     BODY_ANGLES,
     DEFAULT_NORM,
     NINE_ANGLES,

@@ -1,4 +1,4 @@
-"""The angles that gait people look at, per side, in degrees and with their signs."""
+"""Joint and pelvis angles of gait analysis, per side, in degrees and with their signs."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ ANGLE_NAMES: dict[str, str] = {
 class AngleSeries:
     """Angles over a trial: `time_s` (T,), `left` and `right` map `ANGLE_NAMES` to (T,) degrees, NaN where unseen.
 
-    `angle_model` says how pelvis and hip are defined (`normative.ANGLE_MODELS`). `sd` maps sides to names to the
-    standard deviation (T,) deg of the angles whose uncertainty is known.
+    `angle_model`: definition of pelvis and hip (`normative.ANGLE_MODELS`). `sd` maps sides to names to the standard
+    deviation (T,) deg of the angles whose uncertainty is known.
     """
 
     time_s: np.ndarray
@@ -65,7 +65,7 @@ def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
 
 
 def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
-    """The standard deviation (deg) of each of `leg_angles`, NaN where the fit knows none."""
+    """The standard deviation (deg) of each of `leg_angles`, NaN where the fit has none."""
     from pbl_pipeline.body import joint_angles_sd
 
     return _of_legs(joint_angles_sd(fit.joint_names, fit.qpos_sd))
@@ -131,7 +131,7 @@ def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray
 
 
 def toes_out(heel_to_toe: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """How far each foot (T, 2, 3) [left, right] points outwards of `forward` (T, 3) seen from above: (T, 2) deg."""
+    """Angle (T, 2) deg by which each foot (T, 2, 3) [left, right] points outwards of `forward` (T, 3), from above."""
     up = np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, up)
     aside = np.einsum("tsi,ti->ts", heel_to_toe, right) * np.array([-1.0, 1.0])

@@ -29,9 +29,9 @@ class NormalBands:
     """Normal curves at one speed.
 
     `percent` (P,) of the cycle; `curves` maps `ANGLE_NAMES` to mean and sd (P,) in degrees, the sd between people.
-    `speed` is dimensionless, v / sqrt(g L) with the leg length L; `matched` says by what it was found ("speed",
-    "cadence", or "" for the speed that people choose where neither is known), and `clipped` that the person is slower
-    or faster than the slowest or fastest of the five groups, whose curves these then are.
+    `speed` is dimensionless, v / sqrt(g L) with the leg length L; `matched` is what it was found by ("speed",
+    "cadence", or "" for the speed that people choose, if neither is known). `clipped`: the person is slower or faster
+    than the slowest or fastest of the five groups, whose curves these then are.
     """
 
     percent: np.ndarray
@@ -43,7 +43,7 @@ class NormalBands:
     licence: str
 
     def words(self) -> str:
-        """How the bands were matched, as the end of a sentence."""
+        """Matching of the bands, as the end of a sentence."""
         if not self.matched:
             return "at the speed that they choose"
         limit = (
@@ -94,9 +94,9 @@ def normal_bands(
 ) -> NormalBands:
     """Mean and sd of healthy people's angles at the speed of the measures.
 
-    Schwartz et al. 2008, J Biomech 41:1639-1650. Speed where it is known, else cadence: both are made dimensionless by
-    the leg length, because people of other sizes walk alike at the same v / sqrt(g L) (Hof 1996, Gait & Posture
-    4:222-223). By cadence a person with short steps is compared with faster walkers than by speed. The angles are
+    Schwartz et al. 2008, J Biomech 41:1639-1650. By speed if it is known, else by cadence: both are made dimensionless
+    by the leg length, because people of other sizes walk alike at the same v / sqrt(g L) (Hof 1996, Gait & Posture
+    4:222-223). By cadence, a person with short steps is compared with faster walkers than by speed. The angles are
     mapped to `angle_model` (the published ones are Plug-in Gait's).
     """
     norm = gait_norm()

@@ -1,4 +1,4 @@
-"""Gait cycles between foot downs of one side, the joint-angle curves over them, and which are not like the others."""
+"""Gait cycles between foot downs of one side, their joint-angle curves, and the exclusion of unlike cycles."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .types import NO_POSITIONS, Exclusion, GaitCycle, Lengths
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
-#: A stride longer than this times the typical one may hold a step that was missed, one shorter than its inverse an
-#: event that is none: the feet decide. Strides of one walk vary by a few percent, in ataxia ten.
+#: A stride longer than this times the typical one may hold a missed step, one shorter than its inverse a false event:
+#: the feet decide. Strides of one walk vary by a few percent, in ataxia ten.
 STRIDE_RATIO = 1.35
 #: The feet pass each other this often in a stride; in one that hides a missed pair of steps twice as often.
 _PASSES = 2
@@ -35,9 +35,9 @@ _SEEN = 0.8
 #: Fewest cycles of a bout for a separate typical stride; shorter bouts are compared with the whole trial.
 _OWN_MEDIAN = 5
 
-#: Angles whose curves are compared: those that move most and that every source of curves knows.
+#: Angles whose curves are compared: those that move most and that every source of curves has.
 CURVE_ANGLES = ("hip_flexion", "knee_flexion", "ankle_dorsiflexion")
-#: Fewest cycles of a side with curves that say what is usual.
+#: Fewest cycles of a side with curves that define what is usual.
 MIN_CURVES = 5
 #: A cycle is unlike the others where its curves are further from the median curves than this many robust standard
 #: deviations above the usual distance, and at least this far. Both, so that neither a very regular walk nor a very
@@ -48,9 +48,9 @@ CURVE_SD, CURVE_MIN_DEG = 6.0, 8.0
 def without_missed_steps(cycles: Sequence[GaitCycle], feet: FootTrajectories | None = None) -> list[GaitCycle]:
     """Return the cycles, those of an odd length that are not one stride marked as not used.
 
-    A cycle beyond `STRIDE_RATIO` times the typical stride (the median of its bout, or of the trial where the bout is
-    short) is a stride all the same if the feet pass each other as often as in one (`foot_passes`): it is used, and
-    its length counts in every spread. Where the feet are not known the cycle is left out as `length_unproven`, and
+    A cycle beyond `STRIDE_RATIO` times the typical stride (the median of its bout, or of the trial if the bout is
+    short) still is one stride if the feet pass each other as often as in one (`foot_passes`): it is used, and its
+    length counts in every spread. If the feet are not known, the cycle is left out as `length_unproven`, and
     `spatiotemporal` returns no spread.
     """
     out = []
@@ -67,7 +67,7 @@ def without_missed_steps(cycles: Sequence[GaitCycle], feet: FootTrajectories | N
 
 
 def foot_passes(feet: FootTrajectories, start_s: float, end_s: float) -> int | None:
-    """Return how often the feet pass each other from `start_s` to `end_s`; None where they are hardly seen.
+    """Return how often the feet pass each other from `start_s` to `end_s`; None if they are hardly seen.
 
     Counted about the middle of the range of the heels' distance along the heading, so that a foot that is always
     placed behind the other one passes it as well.
@@ -107,9 +107,8 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
 
 
 def without_unusual_cadence(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
-    """Return the cycles of a recording, none used where their mean cadence is too high for walking: steps counted
-    twice, or left and right that the detector exchanged at each step, make every measure another one. A low one is
-    that of many patients."""
+    """Return the cycles of a recording, none of them used if their mean cadence is too high for walking: steps counted
+    twice, or sides exchanged at each step, make every measure wrong. A low cadence is that of many patients."""
     own = [120.0 / c.stride_time_s for c in cycles if c.used]
     mean = float(np.mean(own)) if own else 0.0
     bound = unusual_bound(mean)
@@ -119,14 +118,14 @@ def without_unusual_cadence(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
 
 
 def refused_cadence(cycles: Sequence[GaitCycle]) -> float | None:
-    """Return the mean cadence (steps/min, to 0.01) of the cycles that `without_unusual_cadence` left out; None where it
+    """Return the mean cadence (steps/min, to 0.01) of the cycles that `without_unusual_cadence` left out; None if it
     left out none."""
     own = [120.0 / c.stride_time_s for c in cycles if c.exclusion == Exclusion(failed_checks=(CADENCE,))]
     return round(float(np.mean(own)), 2) if own else None
 
 
 def with_cadence_accepted(cycles: Sequence[GaitCycle]) -> tuple[GaitCycle, ...]:
-    """Return the cycles, those used again that only `without_unusual_cadence` left out: a person counted the steps."""
+    """Return the cycles, using those again that only `without_unusual_cadence` left out: a person counted the steps."""
     return tuple(not_used(c, failed_checks=()) if CADENCE in c.exclusion.failed_checks else c for c in cycles)
 
 
@@ -152,7 +151,7 @@ def find_cycles(
     feet: FootTrajectories | None = None,
     keep_ends: bool = False,
 ) -> tuple[GaitCycle, ...]:
-    """All cycles whose four inner events are there in order, with curves and lengths where a fit is given.
+    """All cycles whose inner events are complete and in order, with curves and lengths if a fit is given.
 
     First and last step of each bout are left out of the measures (Cotton et al.: "first and last step of a trial are
     discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
@@ -161,24 +160,25 @@ def find_cycles(
     (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that
     both counts can be shown.
 
-    `keep_ends` uses them all the same: for a recording that begins and ends while the person walks, such as a
-    laboratory's, where the first step in view is not the first step of the walk.
+    With `keep_ends` they are used: for a recording that begins and ends while the person walks, such as a laboratory's,
+    where the first step in view is not the first step of the walk.
 
     A cycle longer than 1.35 times the median stride of its bout, or shorter than its inverse, is not used either
     unless the feet pass each other in it as in one stride: a pair of steps that was not detected would pass as a slow
     stride, and a slow stride belongs to the spread. Nor is one whose curves are far from the others'.
 
-    `series` and `feet` stand for the fit's angles and feet where there is none (a laboratory's recording; positions in
-    metres in a world that stands still).
+    `series` and `feet` replace the fit's angles and feet if there is no fit (a laboratory's recording; positions in
+    metres in a fixed world).
 
-    Where one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Of a
-    fit none is used either where the cadence is too high for walking (`with_cadence_accepted` takes that back).
+    If one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Nor is
+    one of a fit whose cadence is too high for walking (`with_cadence_accepted` takes that back).
     """
     found = events.events if isinstance(events, GaitEvents) else tuple(events)
     name = trial or (fit.name if fit is not None else "")
     no_lengths, metric, stated, far = "" if feet is not None else NO_POSITIONS, True, False, None
-    errors = ""
+    errors, time_s = "", np.empty(0)
     if fit is not None:
+        time_s = fit.time_s
         poses = poses or trial_poses(fit)
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
@@ -223,7 +223,7 @@ def find_cycles(
                 curves_sd=curves_sd,
                 lengths=lengths,
                 angle_model=series.angle_model if series is not None else BODY_ANGLES,
-                far_leg="" if fit is None or far is None else mostly(_during(far, fit.time_s, start, end)),
+                far_leg="" if far is None else mostly(far[(time_s >= start.time_s) & (time_s <= end.time_s)]),
                 error_model=errors if curves_sd else "",
             )
             cycles.append(cycle)
@@ -237,10 +237,8 @@ def find_cycles(
     return tuple(dataclasses.replace(c, number=number) for number, c in enumerate(cycles))
 
 
-def cycle_curves(
-    series: AngleSeries, side: str, start_s: float, end_s: float, percent: np.ndarray = REPORT_PERCENT
-) -> tuple[dict[str, np.ndarray], str]:
-    """Curves of one side at `percent` of the time from `start_s` to `end_s`, in degrees, and why they are missing.
+def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -> tuple[dict[str, np.ndarray], str]:
+    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if missing.
 
     Interpolation is monotone cubic (PCHIP) between the frames' own time stamps. Frames missing for longer than
     `MAX_CURVE_GAP_S` inside the cycle, or at its ends, give no curves.
@@ -256,13 +254,9 @@ def cycle_curves(
     if np.max(np.diff(time[first : last + 1])) > MAX_CURVE_GAP_S:
         return {}, f"frames are missing for more than {MAX_CURVE_GAP_S:g} s"
     part = slice(max(0, first - 2), last + 3)
-    at = start_s + percent / 100.0 * (end_s - start_s)
+    at = start_s + REPORT_PERCENT / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
     return dict(zip(table, curves.T, strict=True)), ""
-
-
-def _during(values: np.ndarray, time_s: np.ndarray, start: GaitEvent, end: GaitEvent) -> np.ndarray:
-    return values[(time_s >= start.time_s) & (time_s <= end.time_s)]
 
 
 def _curves_sd(series: AngleSeries, start: GaitEvent, end: GaitEvent) -> dict[str, np.ndarray]:

@@ -26,7 +26,15 @@ from .normative import (
     load_norm,
     norm_names,
 )
-from .types import ANY_PACE, SELF_SELECTED, GaitCycle, MovementProfile, movement_profile, variable_scores
+from .types import (
+    ANY_PACE,
+    SELF_SELECTED,
+    GaitCycle,
+    MovementProfile,
+    feature_vector,
+    movement_profile,
+    variable_scores,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,14 +44,14 @@ class GdiParams:
     norm
         Name of the normative set.
     min_cycles_per_side
-        Fewer used cycles of either side give no index.
+        With fewer used cycles of either side there is no index.
     advised_cycles
-        Fewer in all give a warning: single cycles vary by several points.
+        With fewer in all there is a warning: single cycles vary by several points.
     min_explained
-        A smaller fraction of a cycle's deviation inside the normative components gives a warning.
+        Least fraction of a cycle's deviation inside the normative components, below which there is a warning.
     repeated
-        Fraction of the variance of the angles' error that two visits of one person have in common, filmed alike: what
-        the body's places and the priors get wrong of this person, not the detector's chance.
+        Fraction of the variance of the angles' error that two visits of one person, filmed alike, have in common:
+        errors of the marker positions and priors for this person, not the detector's random ones.
     lasting
         Fraction of the variance of a sample's error (`GaitCycle.curves_sd`) that counts as the same over a cycle and in
         all cycles of a side; the rest differs from sample to sample, and means of curves lose it.
@@ -52,13 +60,13 @@ class GdiParams:
     lengthening
         Fraction of the variance of a sample's error that counts as lengthening the distance from the norm (`_shorter`).
     pace
-        Measures and index of a session pool the trials that are walked at this pace: one of `PACES`, a word of one's
-        own, or "any".
+        Measures and index of a session pool the trials that are walked at this pace: one of `PACES`, another word, or
+        "any".
     average
-        What is averaged over cycles: their indices ("cycles", the paper's way) or, of each side, their curves
-        ("curves"). What differs by chance from cycle to cycle adds to the distance of each cycle from the norm, and so
-        lowers a mean of indices, most of all near 100. "passes": the index expected from all passes together by the
-        measured model of their error (`gait/measurement.py`); as "curves" where these cycles or this norm have none.
+        Average over cycles: of their indices ("cycles", as in the paper) or, for each side, of their curves ("curves").
+        Random differences between cycles add to the distance of each cycle from the norm, and so lower a mean of
+        indices, most of all near 100. "passes": the index expected from all passes together by the measured model of
+        their error (`gait/measurement.py`); as "curves" if these cycles or this norm have none.
     """
 
     norm: str = DEFAULT_NORM
@@ -73,8 +81,8 @@ class GdiParams:
     lengthening: float = later(0.0)
 
 
-#: Errors count as at most so many times the squared distance that was found, which makes an index 15 points higher: of
-#: a fit that is less sure than that, more would be a guess.
+#: Errors count as at most so many times the squared distance that was found, which makes an index 15 points higher: a
+#: larger correction would be a guess.
 MOST_LONGER = 2.0
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
@@ -108,7 +116,7 @@ _NAMES = {
 @dataclasses.dataclass(frozen=True)
 class GdiCycle:
     """The index of one cycle. `z` is the standardised log distance; `explained` the fraction (0..1) of the squared
-    deviation from the normative mean that lies in the normative components: what is outside does not count."""
+    deviation from the normative mean that lies in the normative components; the rest does not count."""
 
     trial: str
     number: int
@@ -120,12 +128,12 @@ class GdiCycle:
 
 @dataclasses.dataclass(frozen=True)
 class Gdi:
-    """The index of one trial or session, of its `n` used cycles; None where too few (`reason`).
+    """The index of one trial or session, of its `n` used cycles; None if these are too few (`reason`).
 
     `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
-    a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile` says which angle deviates by
-    how much, None where there is no index. `sd` is the standard deviation of the error of `mean`, None where the
-    angles' is not known; `minimal_change` what two visits filmed alike differ by, beyond chance in 9 of 10 cases.
+    a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
+    index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
+    detectable change (90 %) between two visits filmed alike.
     """
 
     status: str
@@ -147,12 +155,12 @@ class Gdi:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """That holds the true index in 9 of 10 cases; None where `sd` is not known."""
+        """90 % interval of the true index; None if `sd` is not known."""
         return interval_90(self.mean, self.sd)
 
     @property
     def title(self) -> str:
-        """The index by a name that says which of the two it is."""
+        """Display name of the index."""
         return _NAMES.get(self.model, self.model)
 
     def to_dict(self) -> dict:
@@ -166,7 +174,7 @@ class Gdi:
 
 
 def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
-    """The 90 % interval of an index whose error has the standard deviation `sd`; None where one is not known."""
+    """The 90 % interval of an index whose error has the standard deviation `sd`; None if one is not known."""
     if mean is None or sd is None or not np.isfinite(sd):
         return None
     return mean - Z90 * sd, mean + Z90 * sd
@@ -191,10 +199,10 @@ def score_gdi(
     compared with each other.
 
     The components come from the norm, so deviations in directions in which its people do not vary are not counted;
-    `GdiCycle.explained` says how much was. Where the fit knows how sure its angles are, what their errors lengthen is
-    taken back from the distance (`GdiParams.lengthening`; docs/measures.md).
+    `GdiCycle.explained` is the fraction that was. If the fit has standard deviations of its angles, the lengthening of
+    the distance by their errors is taken back (`GdiParams.lengthening`; docs/measures.md).
 
-    Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the norm has not the model's angles; SOLVER_UNKNOWN for another
+    Raises `PblError` NORM_UNKNOWN; NORM_INVALID for a norm without the model's angles; SOLVER_UNKNOWN for another
     model; ANGLE_UNITS for curves that are not in degrees.
 
     Parameters
@@ -204,10 +212,10 @@ def score_gdi(
     norm
         A set or its name; None for that of `params`.
     params
-        None for those of `model`, and without one for those of the index that the norm's angles make.
+        None for those of `model`, or without one for those of the index with the norm's angles.
     model, version
         A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
-        the norm's angles decide; a norm of other angles than the two indices have gives an index of its own name.
+        the norm's angles decide; a norm of other angles than the two indices have makes an index with another name.
     """
     method = GDI_METHODS.find(model)
     basis = norm_of(norm, params or method.params)
@@ -217,7 +225,7 @@ def score_gdi(
     model = method.name if model else family
     version = version or (known.version if known else 1)
     paramset = Paramset.of("gdi", model, version, dataclasses.replace(params, norm=basis.name))
-    if model != family:  # a method of one's own names its family, as its row does
+    if model != family:  # a custom method names its family, as its row does
         paramset = dataclasses.replace(paramset, params={GDI_METHODS.kind: family, **paramset.params})
     usable = [c for c in cycles if c.used and all(v in c.curves for v in basis.variables)]
     vectors = [_vector(c, basis) for c in usable]
@@ -261,13 +269,13 @@ def score_gdi(
 
 
 def norm_of(norm: NormativeSet | str | None, params: GdiParams) -> NormativeSet:
-    """A set, by its name, or None for that of the parameters."""
+    """A set or the one of that name; None: that of the parameters."""
     wanted = params.norm if norm is None else norm
     return load_norm(wanted) if isinstance(wanted, str) else wanted
 
 
 def params_of(norm: NormativeSet, model: Method[GdiParams] | str | None) -> GdiParams:
-    """Parameters of a model; without one, of the index that the norm's angles make, if one is named so."""
+    """Parameters of a model; without one, of the index with the norm's angles, if there is one."""
     method = GDI_METHODS.find(model)
     return method.params if model is not None else GDI_METHODS.get(_model_of(norm, None), method).params
 
@@ -330,10 +338,10 @@ def _passes(cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: No
 
 
 class _Part(NamedTuple):
-    """What an index is the weighted mean of: one cycle, or the mean curves of one side.
+    """Term of the weighted mean that is an index: one cycle, or the mean curves of one side.
 
-    `change`: what one standard deviation of each angle's curve changes it by, None where that is not known; `chance`:
-    variance that cycles give it.
+    `change`: its change by one standard deviation of each angle's curve, None if that is not known; `chance`: its
+    variance by the spread of cycles.
     """
 
     side: str
@@ -347,7 +355,11 @@ def _parts(
     cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet, params: GdiParams
 ) -> list[_Part]:
     x, sides = np.array(vectors), np.array([c.side for c in cycles])
-    stated = [_at_percent(c.curves_sd, norm) for c in cycles if all(v in c.curves_sd for v in norm.variables)]
+    stated = [
+        feature_vector(c.curves_sd, norm.variables, norm.percent)
+        for c in cycles
+        if all(v in c.curves_sd for v in norm.variables)
+    ]
     known = len(stated) == len(cycles) and bool(np.isfinite(stated).all())
     spread = np.array(stated) if known else np.zeros_like(x)
 
@@ -376,16 +388,16 @@ def _parts(
 
 def _shorter(vectors: Float[np.ndarray, "*n D"], longer: float, norm: NormativeSet) -> Float[np.ndarray, " n"]:
     """The index of vectors whose squared distance d^2 from the norm is d^4 / (d^2 + longer): errors lengthen a distance
-    in the mean, a short one by most. That is d^2 - `longer` for long distances, and always positive (as a Wiener
-    filter's)."""
+    on average, short ones most. That is d^2 - `longer` for long distances, and always positive (as in a Wiener
+    filter)."""
     return norm.index(vectors) + 5.0 / norm.ln_sd * np.log1p(longer * np.exp(-2.0 * norm.log_distance(vectors)))
 
 
 def _changes(
     gdi: float, vector: np.ndarray, slope: np.ndarray, each: np.ndarray, longer: float, norm: NormativeSet
 ) -> Float[np.ndarray, " V"]:
-    """What an error of one standard deviation of each angle's curve (`each`) changes an index by: the root mean square
-    of both directions, because near the norm a derivative would go beyond all bounds; with the derivative's sign."""
+    """Change of an index by an error of one standard deviation of each angle's curve (`each`): the root mean square of
+    both directions, because near the norm a derivative is unbounded; with the derivative's sign."""
     both = _shorter(np.concatenate([vector + each, vector - each]), longer, norm).reshape(2, -1) - gdi
     return np.sqrt(np.mean(both**2, axis=0)) * np.where(each @ slope < 0, -1.0, 1.0)
 
@@ -399,12 +411,10 @@ def _weighted(parts: Sequence[_Part]) -> float | None:
 
 
 def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, float | None]:
-    """Standard deviation of the error of the index, and the change that two such visits exceed by chance in one of ten
-    cases.
+    """Standard deviation of the error of the index, and the minimal detectable change (90 %) between two such visits.
 
-    What a fit is unsure of (`curves_sd`: the detector's errors, the lean) counts as far as it lasts, and is the same in
-    all cycles of a side, and partly on both sides, of an angle; what differs from cycle to cycle is in the cycles'
-    spread.
+    The lasting part of the fit's uncertainty (`curves_sd`: the detector's errors, the lean) is the same in all cycles
+    of a side and partly on both sides; the part that differs from cycle to cycle is in the cycles' spread.
     """
     changes = np.array([p.weight * p.change for p in parts if p.change is not None])
     if len(changes) < len(parts):
@@ -419,7 +429,8 @@ def _errors(parts: Sequence[_Part], params: GdiParams) -> tuple[float | None, fl
 
 
 def minimal_change_of(sd_anew: float) -> float:
-    """Return the minimal detectable change (90 %) between two visits, whose errors that are anew have an sd each."""
+    """Return the minimal detectable change (90 %) between two visits, whose new errors have the standard deviation
+    `sd_anew` each."""
     from pbl_pipeline.stats import minimal_detectable_change  # loads pandas, which every command would wait for
 
     return minimal_detectable_change(sd_anew, 0.9)
@@ -427,12 +438,7 @@ def minimal_change_of(sd_anew: float) -> float:
 
 def gdi_vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:
     """The feature vector of a cycle: the norm's angles one after another, each at the norm's percents."""
-    return _at_percent(cycle.curves, norm)
-
-
-def _at_percent(curves: dict[str, np.ndarray], norm: NormativeSet) -> np.ndarray:
-    phase = np.linspace(0.0, 100.0, len(next(iter(curves.values()))))
-    return np.concatenate([np.interp(norm.percent, phase, curves[v]) for v in norm.variables])
+    return feature_vector(cycle.curves, norm.variables, norm.percent)
 
 
 def _vector(cycle: GaitCycle, norm: NormativeSet) -> np.ndarray:
@@ -492,8 +498,8 @@ def _checks(
 
 
 def _convention(angle_models: set[str], norm: NormativeSet) -> Check:
-    """Whether the angles of cycles and norm mean the same. The default norm, which is mapped, passes: the description
-    of the index says so once."""
+    """Check that the angles of cycles and norm have the same definition. The default norm, which is mapped, passes: the
+    description of the index mentions it once."""
     advice = ""
     if len(angle_models) > 1:
         advice = "cycles of several ways of measuring are mixed: score those of the laboratory and of the video apart"

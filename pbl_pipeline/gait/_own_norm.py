@@ -1,4 +1,4 @@
-"""A normative set from gait cycles of one's own."""
+"""A normative set from a laboratory's own gait cycles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pbl_pipeline.qc import Check, warn_if
 
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
-from .types import GaitCycle
+from .types import GaitCycle, feature_vector
 
 #: Fewer people, or a larger fraction of the cycles from one person, give a warning.
 ADVISED_PEOPLE, MAX_SHARE = 20, 0.2
@@ -37,7 +37,7 @@ def norm_from_cycles(
 ) -> tuple[NormativeSet, tuple[Check, ...]]:
     """The set that the used cycles of healthy people make, and checks of it.
 
-    Raises `PblError` NORM_INVALID: fewer than 30 usable cycles, no more cycles than components, angles of several
+    Raises `PblError` NORM_INVALID: fewer than 30 usable cycles or too few for the components, angles of several
     definitions, or other angles than an index has. ANGLE_UNITS.
 
     Parameters
@@ -64,7 +64,7 @@ def norm_from_cycles(
     counts = Counter(p for _, p in known)
     model = models.pop()
     norm = fit_norm(
-        np.array([_vector(c, variables, at) for c, _ in known]),
+        np.array([feature_vector(c.curves, variables, at) for c, _ in known]),
         name=name,
         version=version,
         variables=variables,
@@ -76,7 +76,7 @@ def norm_from_cycles(
         curves=_bands([c for c, _ in known], percent),
         variance=variance,
         n_components=n_components,
-        pooled=np.array([_vector(c, variables, at) for c in others]) if others else None,
+        pooled=np.array([feature_vector(c.curves, variables, at) for c in others]) if others else None,
         angle_model=model,
     )
     n, most = len(counts), max(counts.values()) / len(known)
@@ -92,16 +92,11 @@ def _usable(cycle: GaitCycle, variables: Sequence[str]) -> bool:
     return cycle.used and all(v in cycle.curves and np.isfinite(cycle.curves[v]).all() for v in variables)
 
 
-def _vector(cycle: GaitCycle, variables: Sequence[str], percent: np.ndarray) -> np.ndarray:
-    phase = np.linspace(0.0, 100.0, len(cycle.curves[variables[0]]))
-    return np.concatenate([np.interp(percent, phase, cycle.curves[v]) for v in variables])
-
-
 def _bands(cycles: Sequence[GaitCycle], percent: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     """Mean and standard deviation (n - 1) of each angle that all cycles have."""
     names = [n for n in cycles[0].curves if all(n in c.curves for c in cycles)]
     bands = {}
     for name in names:
-        curves = np.array([_vector(c, (name,), percent) for c in cycles])
+        curves = np.array([feature_vector(c.curves, (name,), percent) for c in cycles])
         bands[name] = {"percent": percent, "mean_deg": curves.mean(axis=0), "sd_deg": curves.std(axis=0, ddof=1)}
     return bands

@@ -23,7 +23,7 @@ SHARE = 0.7
 
 def camera_side(pelvis_m: np.ndarray, forward: np.ndarray, camera_m: np.ndarray) -> np.ndarray:
     """(T,) "front", "back", "left" or "right": the direction from the person to the camera, in the horizontal plane,
-    within 45 deg of the heading, of its opposite, or to that side; empty where one of them is not known.
+    within 45 deg of the heading, of its opposite, or to that side; empty where either is not known.
 
     `pelvis_m` and `forward` are (T, 3) in a z-up world, metres and any length; `camera_m` (3,) or (T, 3) in it.
     """
@@ -38,7 +38,7 @@ def camera_side(pelvis_m: np.ndarray, forward: np.ndarray, camera_m: np.ndarray)
 
 
 def far_leg(fit: TrialFit, poses: BodyPoses) -> np.ndarray:
-    """(T,) "left" or "right", the leg behind the other as one camera sees them; empty where neither is, in unknown
+    """(T,) "left" or "right", the leg behind the other as seen by one camera; empty where neither is, in unknown
     frames, and for several cameras or a laboratory's markers."""
     pelvis = poses.index("pelvis")
     at = camera_side(poses.position_m[:, pelvis], poses.rotation[:, pelvis, :, 0], fit.camera_position_m)
@@ -48,7 +48,7 @@ def far_leg(fit: TrialFit, poses: BodyPoses) -> np.ndarray:
 
 
 def mostly(names: np.ndarray) -> str:
-    """The name that `SHARE` of them are; empty where there is none."""
+    """The name that at least `SHARE` of them have; empty if there is none."""
     found, counts = np.unique(names, return_counts=True)
     return str(found[np.argmax(counts)]) if len(found) and counts.max() >= SHARE * len(names) else ""
 
@@ -72,9 +72,9 @@ MEASURES: tuple[str, ...] = (
     "step_length_m",
     "step_width_m",
 )
-#: Measures that need to know where the feet stand on the floor.
+#: Measures that need the positions of the feet on the floor.
 LENGTHS = ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m")
-#: Measures of one leg, of which left and right may differ: those that have an asymmetry.
+#: Measures of one leg, which have an asymmetry.
 SIDED = (
     "step_time_s",
     "stance_time_s",
@@ -86,7 +86,7 @@ SIDED = (
 )
 #: Cadences (steps/min) that are usual for walking.
 CADENCE_PER_MIN = (60.0, 150.0)
-#: Key of `Spatiotemporal.reasons` that says why the measures have no spread.
+#: Key in `Spatiotemporal.reasons` of the reason why the measures have no spread.
 SPREAD = "spread"
 NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
 
@@ -96,12 +96,12 @@ class Measure:
     """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side.
 
     `variability` is the sd within a side, both sides together: the root of the mean of their variances (n - 1), which
-    an asymmetry does not touch; None with fewer than two values of a side. `cv_percent` is that in percent of the mean.
-    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and where
-    one camera saw the same leg behind the other in most cycles (`far_leg_of`).
-    `error_sd` is the standard deviation of the error of `mean`: of what camera, detector and fit do, as measured, and
-    of the chance of n values; `minimal_change` the minimal detectable change (90 %) between two visits filmed alike.
-    None where the error was not measured.
+    does not contain an asymmetry; None with fewer than two values of a side. `cv_percent` is that in percent of the
+    mean. `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and
+    if one camera saw the same leg behind the other in most cycles (`far_leg_of`).
+    `error_sd` is the standard deviation of the error of `mean`: the measured error of camera, detector and fit, and the
+    sampling error of n values; `minimal_change` the minimal detectable change (90 %) between two visits filmed alike.
+    None if the error was not measured.
     """
 
     left: float | None
@@ -120,11 +120,11 @@ class Measure:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """90 % interval of the mean: of its whole error where that was measured (`error_sd`). Else over repetitions,
-        mean +- t sd / sqrt(n) by Student's t, as far as the values vary from cycle to cycle: what camera, detector and
-        fit do to all of them alike is not in it.
+        """90 % interval of the mean: of its whole error if that was measured (`error_sd`). Else over repetitions,
+        mean +- t sd / sqrt(n) by Student's t, from the spread of the cycles: a constant error of camera, detector and
+        fit is not contained.
 
-        The sd is `variability` where it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
+        The sd is `variability` if it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
         """
         if self.error_sd is not None:
             return self.mean - Z90 * self.error_sd, self.mean + Z90 * self.error_sd
@@ -139,13 +139,13 @@ class Measure:
 
 @dataclasses.dataclass(frozen=True)
 class Spatiotemporal:
-    """Measures by name (`MEASURES`); None where one cannot be trusted, with the reason in `reasons`.
+    """Measures by name (`MEASURES`); None if one cannot be trusted, with the reason in `reasons`.
 
-    Those of a trial of a task have its measures (`TASK_MEASURES`) after them, whatever their `status`, which is that of
+    In a trial of a task the measures of the task (`TASK_MEASURES`) follow, whatever the `status`, which is that of
     walking.
 
-    `reasons["spread"]`, where it is there, says why no measure has a spread. `n_cycles_found` and `n_cycles_used` count
-    before and after the exclusions of `find_cycles`.
+    `reasons["spread"]`, if present, is the reason why no measure has a spread. `n_cycles_found` and `n_cycles_used`
+    count before and after the exclusions of `find_cycles`.
     """
 
     status: str
@@ -179,10 +179,10 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     of this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
     length by stride time.
 
-    A cycle of odd length that may be a true stride (`Exclusion.length_unproven`) leaves every measure without sd,
-    variability and CV, as without it the spread would be too small.
+    With a cycle of odd length that may be a true stride (`Exclusion.length_unproven`) no measure has sd, variability or
+    CV, as without it the spread would be too small.
 
-    Status EMPTY with a reason where no cycle is used.
+    Status EMPTY with a reason if no cycle is used.
     """
     used = [c for c in cycles if c.used]
     reasons: dict[str, str] = {}
@@ -215,19 +215,19 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
 
 
 def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
-    """The leg that was behind the other in most of the used cycles; empty where both were seen alike."""
+    """The leg that was behind the other in most of the used cycles; empty if both were seen alike."""
     return mostly(np.array([c.far_leg for c in cycles if c.used]))
 
 
 def unusual_bound(cadence_per_min: float) -> float | None:
-    """Return which of the bounds `CADENCE_PER_MIN` a cadence is beyond; None where it is usual for walking."""
+    """Return the bound of `CADENCE_PER_MIN` that a cadence is beyond; None if it is usual for walking."""
     low, high = CADENCE_PER_MIN
     return low if cadence_per_min < low else high if cadence_per_min > high else None
 
 
 def cycle_measures(c: GaitCycle) -> dict[str, float]:
-    """The measures of one cycle by name (`MEASURES`) but its step times, which belong to two cycles; those that are not
-    known are left out."""
+    """The measures of one cycle by name (`MEASURES`) except its step times, which belong to two cycles; unknown ones
+    are left out."""
     stride, stance = c.stride_time_s, c.foot_up_s - c.start_s
     both = (c.opposite_foot_up_s - c.start_s) + (c.foot_up_s - c.opposite_foot_down_s)
     alone = c.opposite_foot_down_s - c.opposite_foot_up_s

@@ -1,4 +1,4 @@
-"""Where the feet stand on the floor: stride length, step length and step width of a cycle."""
+"""Positions of the feet on the floor: stride length, step length and step width of a cycle."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 #: The part of a stride after its foot down in which the foot lies flat (fraction of the stride).
 FLAT_FROM, FLAT_TO = 0.08, 0.32
-#: Where the standing feet of a trial move over the floor at more than this fraction of their speed against the pelvis
+#: If the standing feet of a trial move over the floor at more than this fraction of their speed against the pelvis
 #: (median), they do not stand: a treadmill's belt carries them, or the camera moves (1 and more for both; 0.2 at most
-#: in fits of synthetic walkers). One foot alone may seem to: while the other leg passes, a detector can take it for
-#: that one for a tenth of a second, which a median place does not mind.
+#: in fits of synthetic walkers). One foot alone may appear to: while the other leg passes, a detector can confuse the
+#: two for a tenth of a second, which does not change a median place.
 MAX_SLIDE = 0.6
 #: Fewest frames of a standing foot.
 _MIN_FRAMES = 3
@@ -30,12 +30,12 @@ UNSEEN = "too few frames of the standing foot"
 
 
 def is_metric(fit: TrialFit) -> bool:
-    """Whether the metres of a fit were measured: by several calibrated cameras or a laboratory's markers."""
+    """True if the metres of a fit were measured: by several calibrated cameras or a laboratory's markers."""
     return fit.orientation_source == "measured: calibration"
 
 
 def why_no_lengths(fit: TrialFit) -> str:
-    """Why a fit tells no lengths on the floor; empty where it does (a camera that stands still, or no camera)."""
+    """Reason why a fit has no lengths on the floor; empty if it has (a camera that stands still, or no camera)."""
     return "" if fit.camera_motion == "static" else FOLLOWS
 
 
@@ -47,11 +47,11 @@ def cycle_lengths(
     The other foot comes down at `other_down_s`. The slide is the speed of the standing feet over the floor against that
     relative to the pelvis (median of the three), None without lengths.
 
-    The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the own foot's
-    places at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length
-    the part of C - B along A to C, step width the distance of B from that line (Huxham et al. 2006, Gait & Posture
-    23:159-163), which holds on a curved path, too. Positions must be in a world that stands still. `metric`: of the
-    result; without `width` the step width is left out: of one camera its error is too large a part of it.
+    The place of a foot is the median of its heel over the frames in which it lies flat. With A and C the places of this
+    foot at the start and the end and B the other's in between, all on the floor: stride length |C - A|, step length the
+    part of C - B along A to C, step width the distance of B from that line (Huxham et al. 2006, Gait & Posture
+    23:159-163), which also holds on a curved path. Positions must be in a fixed world. `metric`: of the result; without
+    `width` the step width is left out: with one camera its error is too large a part of it.
     """
     stride_s = end_s - start_s
     own, other = (0, 1) if side == LEFT else (1, 0)
@@ -75,7 +75,7 @@ def cycle_lengths(
 def where_feet_stand(cycles: Sequence[GaitCycle], slides: Sequence[float | None]) -> list[GaitCycle]:
     """Return the cycles of a trial, without lengths where its standing feet slide (`MAX_SLIDE`).
 
-    `slides`: of each cycle what `cycle_lengths` returned, None where it has no lengths.
+    `slides`: of each cycle what `cycle_lengths` returned, None if it has no lengths.
     """
     known = [s for s in slides if s is not None]
     if not known or np.median(known) <= MAX_SLIDE:

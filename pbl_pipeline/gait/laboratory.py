@@ -77,8 +77,8 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
     (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs by
-    `method` (`detect_events`). Whosever the events are, there are none where the markers show somebody who lies or
-    walks backwards, or a world whose vertical is not z. A sample that the file marks as invalid is NaN.
+    `method` (`detect_events`). Whatever their source, there are none if the markers show a person who lies or walks
+    backwards, or a world whose vertical is not z. A sample that the file marks as invalid is NaN.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT
     (neither labels nor foot markers; markers upside down or mirrored).
@@ -144,7 +144,7 @@ def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], n
             if (values := reader.get(key)) is not None:
                 names += [str(s).strip() for s in np.ravel(values.string_array)]
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # a file without analog channels is none of our concern
+            warnings.simplefilter("ignore", UserWarning)  # of a file without analog channels
             column = {name: i for i, name in enumerate(names[: reader.point_used]) if name in wanted}
             frames = _frames(reader, len(data))
             rows = np.full((frames, len(column), 4), np.nan, np.float32)
@@ -155,8 +155,7 @@ def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], n
                 rows[got - 1] = points[kept, :4]
             rows = rows[:got].astype(float)
         rate = float(reader.point_rate)
-    # The package raises whatever it stumbles over.
-    except Exception as error:
+    except Exception as error:  # the package raises anything for a damaged file
         raise _format_error(f"{type(error).__name__}: {error}", "a C3D file", key=path) from error
     if not len(rows) or not 0 < rate < math.inf:
         raise _format_error("no frames", "points over time", key=path)
@@ -165,7 +164,7 @@ def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], n
 
 
 def _frames(reader: Any, n_bytes: int) -> int:
-    """How many frames to read: those that the header counts, as far as the file holds them."""
+    """Number of frames to read: those that the header counts, as far as the file has them."""
     words = 4 * int(reader.point_used) + int(reader.analog_used) * reader.analog_per_frame
     if reader.point_used < 1 or reader.analog_per_frame < 0:
         raise ValueError("no points")

@@ -1,15 +1,15 @@
-"""Measurement model of the index: scores of a person, their error, how likely a change is real.
+"""Measurement model of the index: scores of a person, their error, and the probability that a change is real.
 
 A pass p in view v shows the scores y of a person's mean curves, of both sides in the components of a normative set:
 
     y_p = m + b_v + G_v (s - m) + person + visit + view + pass_p
 
-s are the true scores, m their mean over people; b_v and G_v what detector and fit make of them (a prior draws postures
+s are the true scores, m their mean over people; b_v and G_v bias and gain of detector and fit (a prior pulls postures
 together, so G is not 1); `person` is the same in all passes of a person, `visit` in all that are fitted together, with
-one body, `view` in all of one view, `pass_p` is drawn anew. All terms are normal; their covariances are variance
+one body, `view` in all of one view, `pass_p` is new in each pass. All terms are normal; their covariances are variance
 components of walks whose truth is known, on persons who are not held out (`research.corpus.measurement`;
-docs/measures.md). Of several passes, s is estimated at once: the mean and covariance of a normal posterior (Rasmussen &
-Williams 2006, Gaussian Processes for Machine Learning, eq. A.6).
+docs/measures.md). From several passes, s is estimated at once: the mean and covariance of a normal posterior (Rasmussen
+& Williams 2006, Gaussian Processes for Machine Learning, eq. A.6).
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from .cycle_measures import Z90
 from .events import LEFT, RIGHT
 from .normative import NormativeSet
 
-#: Change of the index that matters: half a standard deviation of healthy people, of which 10 points are one. A
-#: convention (Norman, Sloan & Wyrwich 2003, Medical Care 41:582-592), not measured with patients.
+#: Minimal important change of the index: half a standard deviation of healthy people, which is 10 points. A convention
+#: (Norman, Sloan & Wyrwich 2003, Medical Care 41:582-592), not measured with patients.
 IMPORTANT_CHANGE = 5.0
-#: Fraction of the variance of what two visits' errors have in common that does not cancel when the person walks
-#: otherwise: the one of 0, 0.1 ... with the least logarithmic loss of the two probabilities over pairs of walks of
-#: tuning persons (`research.corpus.measurement`).
+#: Fraction of the variance of two visits' common errors that does not cancel when the gait has changed: the one of 0,
+#: 0.1 ... with the least logarithmic loss of the two probabilities over pairs of walks of tuning persons
+#: (`research.corpus.measurement`).
 REMAINS = 0.3
 
 
 class Chances(NamedTuple):
-    """Probabilities that the true change goes the way of the found one, and that it goes that way by at least the
-    minimal important change; None where there is none."""
+    """Probabilities that the true change has the sign of the measured one, and that it also is at least the minimal
+    important change; None if that is not defined."""
 
     real: float
     important: float | None
 
 
 def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float]) -> float:
-    """Return the standard deviation of a true change about the found one, between two visits filmed alike.
+    """Return the standard deviation of a true change about the measured one, between two visits filmed alike.
 
     Parameters
     ----------
     minimal_changes
-        Minimal detectable change (90 %) of each visit, which holds what is anew in it.
+        Minimal detectable change (90 %) of each visit, from its new error.
     sds
         Standard deviation of the whole error of each.
     """
@@ -63,7 +63,7 @@ def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float]) ->
 
 
 def chances(by: float, sd: float, important: float | None = None) -> Chances:
-    """Return the probabilities of a true change, normal about the found one `by` with the standard deviation `sd`."""
+    """Return the probabilities of a true change, normal about the measured one `by` with standard deviation `sd`."""
     beyond = [0.5 * math.erfc((limit - abs(by)) / (math.sqrt(2.0) * sd)) for limit in (0.0, important or 0.0)]
     return Chances(beyond[0], None if important is None else beyond[1])
 
@@ -74,8 +74,8 @@ _FOLDER = resources.files("pbl_pipeline.gait").joinpath("measurement_models")
 
 
 class Pass(NamedTuple):
-    """Scores (K,) of the mean curves of the left and the right side, NaN where a side has no cycle, the number of
-    cycles of each, and the leg behind the other (`GaitCycle.far_leg`), which tells the view."""
+    """Scores (K,) of the mean curves of the left and the right side, NaN for a side without cycles, the number of
+    cycles of each, and the leg behind the other (`GaitCycle.far_leg`), which defines the view."""
 
     scores: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]
     n_cycles: tuple[int, int]
@@ -85,7 +85,7 @@ class Pass(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class View:
     """Terms of one view for the scores of both sides, left before right: `bias` (2K,), `gain` (2K, 2K), and the
-    covariances (2K, 2K) of what a view and what a pass adds."""
+    covariances (2K, 2K) of the errors of a view and of a pass."""
 
     bias: np.ndarray
     gain: np.ndarray
@@ -199,8 +199,8 @@ def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
 
 
 def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
-    """Return the index of scores that are known with an error: its expectation, not the index of the expected scores,
-    because an error of any direction lengthens a short distance from the norm."""
+    """Return the index of scores with an error: its expectation, not the index of the expected scores, because an
+    error in any direction lengthens a short distance from the norm."""
     # The same draws at each call, and each with its opposite: an index changes only with its scores.
     half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
     spread = np.concatenate([half, -half]) @ _root(posterior.covariance).T
@@ -219,7 +219,7 @@ def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1
 
 
 def measure_error(model: MeasurementModel, name: str, cycles: Mapping[str, int]) -> tuple[float, float] | None:
-    """Return the standard deviation of the error of a gait measure, and of the part that is anew at another visit, both
+    """Return the standard deviation of the error of a gait measure, and of the part that is new at another visit, both
     in its unit; None if it was not measured in a view.
 
     cycles: number of used cycles of both sides by the leg behind the other. The lasting part is the same in all views.
@@ -236,7 +236,7 @@ def measure_error(model: MeasurementModel, name: str, cycles: Mapping[str, int])
 
 def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:
     """Return the standard deviation that the index would have after one more pass, by the leg that is behind in it:
-    that of scores as estimated now, with the covariance that such passes leave."""
+    that of the present scores with the posterior covariance after such a pass."""
     now, unseen = estimate(model, passes), np.zeros(len(model.mean) // 2)
     cycles = round(model.n_cycles)
     out = {}
@@ -248,7 +248,7 @@ def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: Normati
 
 
 def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
-    """Covariance (2K, 2K) that a pass of fewer cycles than the measured ones has beside theirs."""
+    """Covariance (2K, 2K) that a pass with fewer cycles than the measured ones has in addition."""
     more = [max(0.0, 1.0 / max(n, 1) - 1.0 / model.n_cycles) for n in seen.n_cycles]
     return _blocks(m * model.cycle for m in more)
 
@@ -258,7 +258,7 @@ def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """A matrix whose product with its transpose is a covariance, singular ones too."""
+    """A matrix whose product with its transpose is a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
 

@@ -61,7 +61,7 @@ class GaitParams:
 
 @dataclasses.dataclass(frozen=True)
 class TrialCycles:
-    """Cycles of one trial, as a session pools them (`pool_trials`). `reason`: why none is used, empty where one is."""
+    """Cycles of one trial, as a session pools them (`pool_trials`). `reason`: why none is used, empty if one is."""
 
     name: str
     reason: str
@@ -70,8 +70,8 @@ class TrialCycles:
 
 @dataclasses.dataclass(frozen=True)
 class TrialMetrics(TrialCycles):
-    """Everything of one trial. `pooled` is false where the session's measures leave it out: no walking, or walking at
-    another pace than that of the method."""
+    """All results of one trial. `pooled` is false if the session's measures leave it out: no walking, or walking at
+    another pace than the method's."""
 
     status: str
     events: GaitEvents
@@ -110,7 +110,7 @@ class SessionMetrics:
 
 @dataclasses.dataclass(frozen=True)
 class GaitMetrics(SessionMetrics):
-    """The measures of a session and its trials. `before`: checks of the stages before (`with_checks`)."""
+    """The measures of a session and its trials. `before`: checks of the earlier stages (`with_checks`)."""
 
     trials: tuple[TrialMetrics, ...]
     before: tuple[Check, ...] = ()
@@ -121,7 +121,7 @@ class GaitMetrics(SessionMetrics):
 
     @property
     def cycles(self) -> list[GaitCycle]:
-        """The cycles of the pooled trials, those that are not used as well."""
+        """The cycles of the pooled trials, including unused ones."""
         return [c for t in self.trials if t.pooled for c in t.cycles]
 
     @property
@@ -193,20 +193,19 @@ def gait_metrics(
     params: GaitParams | None = None,
     fit_checks: Sequence[Check] = (),
     model: Method[GdiParams] | str | None = None,
-    version: int | None = None,
     conditions: Sequence[Condition] | None = None,
     accept_cadence: bool = False,
 ) -> GaitMetrics:
     """Measures of the trials of one session and of the session: events, cycles and measures of each trial, then
     `pool_trials`.
 
-    Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` and `version` are
-    those of `score_gdi`, `conditions` those of `pool_trials`. `accept_cadence`: a person counted the steps
-    of trials whose cadence is too high for walking (`find_cycles`).
+    Trials are fits, or recordings of a laboratory, whose first and last steps in view count. `model` is that of
+    `score_gdi`, `conditions` those of `pool_trials`. `accept_cadence`: a person counted the steps of trials whose
+    cadence is too high for walking (`find_cycles`).
 
-    A trial without walking has status EMPTY and takes no part in the session. Where one of `fit_checks`, the checks of
-    the session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError`
-    NORM_UNKNOWN, NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
+    A trial without walking has status EMPTY and takes no part in the session. If one of `fit_checks`, the checks of the
+    session fit, FAILs, no cycle is used: measures and index are None with that reason. Raises `PblError` NORM_UNKNOWN,
+    NORM_INVALID, GAIT_INPUT (no finite frame in a trial).
     """
     if not trials:
         raise PblError(
@@ -214,7 +213,7 @@ def gait_metrics(
         )
     basis = norm_of(norm, params.gdi if params else GDI_METHODS.find(model).params)
     params = params or GaitParams(gdi=params_of(basis, model))
-    index = {"norm": basis, "params": params.gdi, "model": model, "version": version}
+    index = {"norm": basis, "params": params.gdi, "model": model}
     given = [Condition()] * len(trials) if conditions is None else conditions
     done = tuple(
         dataclasses.replace(
@@ -222,7 +221,7 @@ def gait_metrics(
         )
         for t, c in zip(trials, given, strict=True)
     )
-    return GaitMetrics(**vars(pool_trials(done, basis, params, model, version, given)), trials=done)
+    return GaitMetrics(**vars(pool_trials(done, basis, params, model, conditions=given)), trials=done)
 
 
 def pool_trials(
@@ -230,28 +229,28 @@ def pool_trials(
     norm: NormativeSet,
     params: GaitParams,
     model: Method[GdiParams] | str | None = None,
-    version: int | None = None,
     conditions: Sequence[Condition] | None = None,
 ) -> SessionMetrics:
     """Measures and index of a session over all used cycles of its pooled trials.
 
-    Returns EMPTY, with a reason, where no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
+    Returns EMPTY, with a reason, if no pooled trial has a used cycle. Raises `PblError` as `score_gdi`.
 
     Parameters
     ----------
     trials
         Cycles of each trial; two trials may have one name.
-    norm, params, model, version
+    norm, params, model
         Norm and method of the index (`score_gdi`); `params.events` only enters `params_hash`.
     conditions
-        What is done in each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
+        Activity and pace of each trial (None: unknown): walking at the pace of `params.gdi` is pooled.
     """
     given = [Condition()] * len(trials) if conditions is None else conditions
     pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
     cycles = [c for t in pooled for c in t.cycles]
-    # Two trials may carry one name; their cycles are told apart by it.
-    measures = with_errors(spatiotemporal(_distinct(pooled)), cycles, params.events)
-    gdi = score_gdi(cycles, norm, params.gdi, model, version)
+    # Two trials may have one name, by which their cycles are distinguished.
+    distinct = [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(pooled) for c in t.cycles]
+    measures = with_errors(spatiotemporal(distinct), cycles, params.events)
+    gdi = score_gdi(cycles, norm, params.gdi, model)
     status = PASS if measures.status == PASS else EMPTY
     reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
     if not pooled:
@@ -270,7 +269,7 @@ def pool_trials(
 
 
 def with_errors(measures: Spatiotemporal, cycles: Sequence[GaitCycle], events: Paramset) -> Spatiotemporal:
-    """Return the measures of a session with the error of each, where one was measured for all its used cycles (fit and
+    """Return the measures of a session with the error of each, if one was measured for all its used cycles (fit and
     event method; lengths in metres that the detector assumes)."""
     used = [c for c in cycles if c.used]
     names = {c.error_model for c in used}
@@ -331,10 +330,6 @@ def _events(trial: TrialFit, method: Paramset) -> tuple[BodyPoses, GaitEvents]:
         raise error.about(trial.name) from error.__cause__
 
 
-def _distinct(trials: Sequence[TrialCycles]) -> list[GaitCycle]:
-    return [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(trials) for c in t.cycles]
-
-
 def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
     """Checks of the cycles that `measures` were made of: `cycles_used`, `cycles_of_odd_length`,
     `cycles_of_odd_curves`, `legs_seen_alike`, `cadence_plausible`, `lengths_scale`."""
@@ -369,7 +364,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
 
 
 def _cadence_check(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:
-    """Return `CADENCE` as a tuple: FAIL where cycles are left out for it, empty where no cadence is known."""
+    """Return the check `CADENCE` as a tuple: FAIL if cycles are left out for it, empty if no cadence is known."""
     if (refused := refused_cadence(cycles)) is not None:
         advice = (
             "unusual for walking, so that measures and index are withheld: count the steps in the overlay; where they "

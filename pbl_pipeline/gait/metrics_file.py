@@ -101,7 +101,7 @@ def metrics_of(
     Raises
     ------
     KeyError, TypeError, ValueError, AttributeError
-        Where the content is not that of a metrics.json.
+        The content is not that of a metrics.json.
     """
     session, model = content["session"], str(content["gdi_model"])
     trials = tuple(_trial(t, model, events.get(t["name"], ()), curves.get(t["name"], {})) for t in content["trials"])

@@ -1,7 +1,7 @@
 """Timed tasks: sit-to-stand, timed up and go and squats, from their own events (docs/measures.md, "Tasks").
 
-The events are times at which the height of the hips, or the heading of the pelvis, has gone a first or all but a last
-part of its way from one level to the next.
+The events are times at which the height of the hips, or the heading of the pelvis, has covered 15 % or 85 % of the way
+from one level to the next.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.qc import FAIL, Check
+from pbl_pipeline.qc import Check, failed
 
 from .cycle_measures import MEASURES, Measure
 from .motion import BodyPoses, trial_poses
@@ -55,8 +55,8 @@ TRIAL_MEASURES = (
     "squat_knee_flexion_deg",
     "peak_trunk_lean_deg",
 )
-#: By how much the hips are lowered between standing and sitting, and how far apart the levels of the two must be, both
-#: as a fraction of the leg's length.
+#: Lowering of the hips that separates sitting from standing, and least distance of the levels of the two, both as
+#: fractions of the leg's length.
 LOWERED, APART = 0.25, 0.2
 #: Fractions of the way between two levels at which a movement begins and ends.
 BEGIN, END = 0.15, 0.85
@@ -76,7 +76,7 @@ class TaskMotion:
     #: (T,) inclination of the line from the middle of the hips to the middle of the shoulders from the vertical.
     lean_deg: Float[np.ndarray, " T"]
     knee_deg: Float[np.ndarray, " T"]  # (T,) angle between thigh and shank, mean of both: knee flexion
-    heading_deg: Float[np.ndarray, " T"]  # (T,) direction that the pelvis faces on the floor, without jumps of 360
+    heading_deg: Float[np.ndarray, " T"]  # (T,) heading of the pelvis on the floor, without jumps of 360
 
     @classmethod
     def of_points(
@@ -107,7 +107,7 @@ class TaskMotion:
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """One movement between two levels: when it began and ended (s), and in which direction (1 to the higher level)."""
+    """One movement between two levels: its begin and end (s), and its direction (1 to the higher level)."""
 
     begin_s: float
     end_s: float
@@ -127,16 +127,16 @@ def task_motion(fit: TrialFit, poses: BodyPoses | None = None) -> TaskMotion:
 def task_measures(
     motion: TaskMotion, activity: str, fit_checks: Sequence[Check] = ()
 ) -> tuple[dict[str, Measure | None], dict[str, str]]:
-    """Return the measures of a task by name (`TASK_MEASURES`) and why those that are None are not known.
+    """Return the measures of a task by name (`TASK_MEASURES`) and the reasons of those that are None.
 
-    Both are empty for an activity that is none of the tasks. Where one of `fit_checks` FAILs, nothing is known.
+    Both are empty for an activity that is not a task. If one of `fit_checks` FAILs, no measure is known.
     """
     names = TASK_MEASURES.get(activity, ())
     measures: dict[str, Measure | None] = dict.fromkeys(names)
     if not names:
         return measures, {}
-    if failed := [c.check for c in fit_checks if c.outcome == FAIL]:
-        return measures, dict.fromkeys(names, f"a check of the fit failed: {', '.join(failed)}")
+    if checks := failed(fit_checks):
+        return measures, dict.fromkeys(names, f"a check of the fit failed: {', '.join(checks)}")
     reasons: dict[str, str] = {}
     for name, (values, reason) in _TASKS[activity](motion).items():
         if reason or not values:
@@ -275,19 +275,19 @@ def _moves(time_s: np.ndarray, values: np.ndarray, middle: float, apart: float, 
 
 
 def _last_before(time: np.ndarray, values: np.ndarray, a: int, b: int, level: float, direction: int) -> float | None:
-    """Return when values[a:b] is at the level for the last time; None where it never is beyond it."""
+    """Return the last time at which values[a:b] is at the level; None if it never is beyond it."""
     beyond = np.flatnonzero(direction * (values[a:b] - level) <= 0)
     return None if not len(beyond) else _crossing(time, values, a + int(beyond[-1]), level)
 
 
 def _first_after(time: np.ndarray, values: np.ndarray, a: int, b: int, level: float, direction: int) -> float | None:
-    """Return when values[a:b] is at the level for the first time; None where it never is."""
+    """Return the first time at which values[a:b] is at the level; None if it never is."""
     beyond = np.flatnonzero(direction * (values[a:b] - level) >= 0)
     return None if not len(beyond) else _crossing(time, values, max(a + int(beyond[0]) - 1, 0), level)
 
 
 def _crossing(time: np.ndarray, values: np.ndarray, i: int, level: float) -> float:
-    """Return when the line from sample i to the next is at the level (s)."""
+    """Return the time at which the line from sample i to the next is at the level (s)."""
     j = min(i + 1, len(values) - 1)
     step = values[j] - values[i]
     part = 0.0 if step == 0 else float(np.clip((level - values[i]) / step, 0.0, 1.0))
@@ -309,7 +309,7 @@ def _smooth(time_s: np.ndarray, values: np.ndarray, sd_s: float) -> np.ndarray:
 
 
 def _gap(motion: TaskMotion, begin_s: float, end_s: float) -> str:
-    """Return why a time from begin to end is not known; empty where the person was in view throughout."""
+    """Return the reason why a time from begin to end is not known; empty if the person was in view throughout."""
     seen = motion.time_s[np.isfinite(motion.lowered)]
     inside = seen[(seen >= begin_s - BRIDGED_S) & (seen <= end_s + BRIDGED_S)]
     longest = float(np.diff(inside).max()) if len(inside) > 1 else 0.0

@@ -1,9 +1,9 @@
-"""A gait cycle with its curves, lengths and exclusion; what is done in a trial; the Movement Analysis Profile."""
+"""A gait cycle with its curves, lengths and exclusion; the activity of a trial; the Movement Analysis Profile."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -38,6 +38,12 @@ class MovementProfile:
     def to_dict(self) -> dict:
         """`profile_deg` of metrics.json."""
         return {k: _rounded(v) for k, v in dataclasses.asdict(self).items()}
+
+
+def feature_vector(curves: Mapping[str, np.ndarray], variables: Sequence[str], percent: np.ndarray) -> np.ndarray:
+    """The curves (deg) of some angles one after another, each at these percents of the cycle."""
+    phase = np.linspace(0.0, 100.0, len(next(iter(curves.values()))))
+    return np.concatenate([np.interp(percent, phase, curves[v]) for v in variables])
 
 
 def variable_scores(vectors: np.ndarray, norm: NormativeSet) -> np.ndarray:
@@ -104,18 +110,18 @@ class Condition:
 
     @property
     def walks(self) -> bool:
-        """Whether the activity is walking."""
+        """True if the activity is walking."""
         return self.activity == UNKNOWN or any(word in self.activity for word in _WALKING)
 
     @property
     def pool(self) -> str:
-        """The pace under which a method pools this trial; "" where it is not walking, which none pools."""
+        """The pace under which a method pools this trial; "" unless it is walking."""
         if not self.walks:
             return ""
         return SELF_SELECTED if self.pace == UNKNOWN else self.pace
 
     def pooled(self, pace: str) -> bool:
-        """Whether a method with this pace pools the trial."""
+        """True if a method with this pace pools the trial."""
         return bool(self.pool) and pace in (ANY_PACE, self.pool)
 
     def __str__(self) -> str:
@@ -124,12 +130,12 @@ class Condition:
 
 @dataclasses.dataclass(frozen=True)
 class Exclusion:
-    """Reasons against a cycle; none where it is used.
+    """Reasons against a cycle; none if it is used.
 
     `first_step`, `last_step`: it touches the first or last step of its walking bout. `length_ratio`: its length over
-    the typical stride's, where that is odd and the feet do not show one stride; `length_unproven`: they are not known,
-    so that it may be one. `curve_distance_deg`: how far its curves are from the median curves of the `n_curves` cycles
-    of its side, where that is far. `failed_checks`: checks of the fit that FAIL, or `CADENCE`.
+    the typical stride's, if that is odd and the feet do not show one stride; `length_unproven`: the feet are not known,
+    so it may be one. `curve_distance_deg`: distance of its curves from the median curves of the `n_curves` cycles of
+    its side, if that is large. `failed_checks`: checks of the fit that FAIL, or `CADENCE`.
     """
 
     first_step: bool = False
@@ -141,12 +147,12 @@ class Exclusion:
     failed_checks: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Whether there is a reason."""
+        """True if there is a reason."""
         return self != Exclusion()
 
     @property
     def text(self) -> str:
-        """The reasons in words, empty where there is none. A check that failed is reason enough."""
+        """The reasons in words, empty if there is none; of a failed check that alone."""
         if CADENCE in self.failed_checks:
             return "the cadence is unusual for walking, and no one has accepted it"
         if self.failed_checks:
@@ -161,18 +167,18 @@ class Exclusion:
         return " and ".join(reasons)
 
 
-#: Why a cycle without a fit has no lengths.
+#: Reason why a cycle without a fit has no lengths.
 NO_POSITIONS = "no positions on the floor"
 
 
 @dataclasses.dataclass(frozen=True)
 class Lengths:
-    """Lengths (m) of one cycle, None where not known (`missing` says why).
+    """Lengths (m) of one cycle, None if not known (`missing`: the reason).
 
-    `stride_length_m` between two places of the own foot; `step_length_m` of the step that ends the cycle, from the
-    other foot to the own one along the stride; `step_width_m` between that other foot and the line of the stride.
-    `metric` is False where the metres are those of a detector that guesses how tall a person is; where her height was
-    stated they are hers, but the step width stays unknown.
+    `stride_length_m` between two positions of the same foot; `step_length_m` of the step that ends the cycle, from the
+    other foot to this one along the stride; `step_width_m` between the other foot and the line of the stride. `metric`
+    is False if the metres are a detector's, which guesses the person's height; with a stated height they are true, but
+    the step width stays unknown.
     """
 
     stride_length_m: float | None = None
@@ -190,13 +196,13 @@ class GaitCycle:
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
     `used` is False for the cycles that touch the first or last step of their walking bout, for those that are far
     longer or shorter than the others and not one stride (`odd_length`) or whose curves are far from the others'
-    (`odd_curves`), and for all of a recording of which a check failed; `exclusion` says why, `excluded` in words.
-    `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty where there is
-    no fit or frames are missing (`curves_missing` says which); `curves_sd` maps them to their standard deviation (deg),
-    where it is known. `angle_model` says how the angles are defined.
-    `lengths` are those on the floor, None with the reason where they are not known. `far_leg`: "left" or "right" where
-    one camera saw that leg behind the other, else empty. `error_model`: the measured model of the error of such
-    curves (`measurement.model_names`), empty where there is none.
+    (`odd_curves`), and for all of a recording of which a check failed; `exclusion` has the reason, `excluded` in words.
+    `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty without a fit or if
+    frames are missing (`curves_missing`: the reason); `curves_sd` maps them to their standard deviation (deg), if it is
+    known. `angle_model`: the definition of the angles.
+    `lengths` are those on the floor, None with the reason if they are not known. `far_leg`: "left" or "right" if one
+    camera saw that leg behind the other, else empty. `error_model`: the measured model of the error of such curves
+    (`measurement.model_names`), empty if there is none.
     """
 
     trial: str
@@ -219,27 +225,27 @@ class GaitCycle:
 
     @property
     def used(self) -> bool:
-        """Whether the cycle takes part in the measures."""
+        """True if the cycle takes part in the measures."""
         return not self.exclusion
 
     @property
     def excluded(self) -> str:
-        """Why the cycle is left out, in words; empty where it is used."""
+        """Reason why the cycle is left out, in words; empty if it is used."""
         return self.exclusion.text
 
     @property
     def odd_length(self) -> bool:
-        """Whether the cycle is left out because of its length."""
+        """True if the cycle is left out because of its length."""
         return self.exclusion.length_ratio is not None
 
     @property
     def odd_curves(self) -> bool:
-        """Whether the cycle is left out because of its curves."""
+        """True if the cycle is left out because of its curves."""
         return self.exclusion.curve_distance_deg is not None
 
     @property
     def check_failed(self) -> bool:
-        """Whether the cycle is left out because a check of its recording failed."""
+        """True if the cycle is left out because a check of its recording failed."""
         return bool(self.exclusion.failed_checks)
 
     @property

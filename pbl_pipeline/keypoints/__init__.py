@@ -1,4 +1,4 @@
-"""Keypoints of the tracked person from any detector, views of several cameras, markers of a laboratory."""
+"""Keypoints of the tracked person from any detector, views of several cameras, and markers of a laboratory."""
 
 from .blazepose import BlazePoseLandmarks
 from .detect import detect_keypoints
@@ -14,15 +14,7 @@ from .in_view import (
 )
 from .marker_augmenter import AnatomicalMarkers, AugmenterParams, MarkerAugmenter
 from .methods import METHODS
-from .multi_view import (
-    MOST_MISS_M,
-    SAME_TIME_S,
-    MultiView,
-    cameras_of_files,
-    check_same_times,
-    check_views_agree,
-    ray_miss_m,
-)
+from .multi_view import MOST_MISS_M, MultiView, cameras_of_files, check_same_times, check_views_agree, ray_miss_m
 from .onnx_keypoints import ModelKeypointParams, ModelParams, OnnxKeypoints
 from .picture import Picture, PictureMeter
 from .protocol import KeypointDetector, KeypointParams

@@ -68,19 +68,19 @@ NAMES: tuple[str, ...] = (
 N_POINTS = len(NAMES)
 #: The network adds six points; the first two are the middle of the hips and a point of the region of interest.
 N_ALL = 39
-#: Sizes of the networks' outputs: points of the picture, of the world, and whether there is a person.
+#: Sizes of the networks' outputs: points of the picture, of the world, and the presence of a person.
 _OUTPUTS = (N_ALL * 5, N_ALL * 3, 1)
-#: For each point of the mirrored picture, whose it is: left and right change places.
+#: Index of the same point in the mirrored picture: left and right are exchanged.
 MIRROR = np.array(mirror_of(NAMES))
 
 
 class BlazePoseLandmarks:
     """`KeypointDetector` with BlazePose's 33 points, root-relative (origin between the hips).
 
-    The crop is shown twice, the second time mirrored, and `MirroredInference` puts the answers together; a quick one is
-    of `quick_path`'s network, where one is given, at the crop as it is. The confidence that
-    the network states is sigmoid(visibility logit) * sigmoid(presence logit): the point is not hidden; it lies in the
-    picture. presence = the network's own pose flag.
+    The crop is shown twice, the second time mirrored, and `MirroredInference` combines the results; a quick inference
+    is one of the network at `quick_path`, if given, without the mirror image. The network's confidence is
+    sigmoid(visibility logit) * sigmoid(presence logit): the point is not hidden, and is in the picture. `presence` is
+    the network's pose flag.
     """
 
     name = "blazepose"
@@ -88,7 +88,7 @@ class BlazePoseLandmarks:
     marker_set = MARKER_SET
     root_relative = ROOT_RELATIVE
 
-    #: One for each core: calls of one thread side by side are faster than one call of several threads.
+    #: One for each core: parallel calls of one thread are faster than one call of several threads.
     per_core = True
 
     def __init__(
@@ -96,12 +96,11 @@ class BlazePoseLandmarks:
         model_path: str | Path,
         agree_mm: float = 100.0,
         agree_width_mm: float = 20.0,
-        num_threads: int = 1,
         sha256: str = MODEL_SHA256,
         quick_path: str | Path | None = None,
     ) -> None:
         def load(path: str | Path, sha256: str) -> Network:
-            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=num_threads)
+            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=1)
 
         self._model = load(model_path, sha256)
         self._quick = load(quick_path, MODEL_SHA256) if quick_path else self._model
@@ -110,24 +109,24 @@ class BlazePoseLandmarks:
 
     @property
     def side_by_side(self) -> int:
-        """Calls at once that use the device whole; 1: a detector for each core is fastest."""
+        """Number of parallel calls that use the device fully; 1: a detector for each core is fastest."""
         return self._model.side_by_side
 
     @property
     def origin(self) -> str:
-        """Where these keypoints were computed, where that is not LiteRT on a machine without a GPU."""
+        """Device and runtime of the keypoints; "" for LiteRT on a machine without a GPU."""
         if self._model.on_gpu:
             return f"{self.name} on {self._model.device}"
         return f"{self.name} {self._model.note}" if self._model.note else ""
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
-        """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
+        """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR, black beyond it."""
         return self.detect_crop(cut_image(image, *self.crop_of(roi_px)), roi_px, camera, quick=quick)
 
     def crop_of(self, roi_px: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
         """See `CropDetector`."""
         matrix = crop_matrix(_with_margin(roi_px), INPUT_SIZE)
-        # A cut counts from pixel centres of the crop, the network from the crop's edge.
+        # A cut counts from the centre of the crop's first pixel, the network from the crop's edge.
         matrix[:, 2] += 0.5 * (matrix[:, 0] + matrix[:, 1])
         return matrix, (INPUT_SIZE, INPUT_SIZE)
 
@@ -178,7 +177,7 @@ def _with_margin(roi_px: np.ndarray) -> np.ndarray:
 
 
 def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
-    """The detector of the method, with the network that its parameters name by hash.
+    """Return the detector of the method, with the network that its parameters name by hash.
 
     Raises `PblError` SOLVER_UNKNOWN for another network, and those of `assets.fetch`.
     """

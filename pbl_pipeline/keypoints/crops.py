@@ -1,4 +1,4 @@
-"""Where to cut the person out of each frame: regions over time, smoothed, and corrected by a first pass."""
+"""Regions of the person in each frame: smoothed over time, and corrected by a first pass."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 from .protocol import KeypointParams
 from .types import PersonKeypoints
 
-#: The Gaussian kernel is cut off at so many standard deviations.
+#: Standard deviations at which the Gaussian kernel is cut off.
 REACH_SD = 4.0
-#: A tenth of a degree: at the edge of a crop of 256 pixels a quarter of one.
+#: A tenth of a degree, a quarter of a pixel at the edge of a crop of 256 pixels.
 ROTATION_STEP_RAD = 1 / 512
 
 
 def smooth_rois(roi: np.ndarray, time_s: np.ndarray, sigma_s: float) -> np.ndarray:
     """Regions (T, 4) smoothed over time by a Gaussian kernel; size as logarithm, rotation on the circle.
 
-    Frames without a region (NaN) stay so, and take no part.
+    Frames without a region (NaN) stay NaN and are ignored.
     """
     good = np.flatnonzero(np.isfinite(roi).all(axis=1))
     out = np.full(roi.shape, np.nan)
@@ -27,8 +27,8 @@ def smooth_rois(roi: np.ndarray, time_s: np.ndarray, sigma_s: float) -> np.ndarr
 
 
 def smooth_at(roi: np.ndarray, time_s: np.ndarray, at_s: float, sigma_s: float) -> np.ndarray:
-    """One region (4,) at `at_s` from the regions (K, 4) at `time_s` (K,), as `smooth_rois`; those within `REACH_SD`
-    standard deviations count, and where there is none the nearest. `sigma_s` 0: the nearest."""
+    """Smooth the regions (K, 4) at `time_s` (K,) as `smooth_rois` and return the one (4,) at `at_s`. Regions within
+    `REACH_SD` standard deviations count; without any, or with `sigma_s` 0, the nearest is returned."""
     near = slice(
         np.searchsorted(time_s, at_s - REACH_SD * sigma_s),
         np.searchsorted(time_s, at_s + REACH_SD * sigma_s, side="right"),
@@ -57,7 +57,7 @@ def rounded(roi: np.ndarray, step_px: float) -> np.ndarray:
 def corrected(
     roi: np.ndarray, found: PersonKeypoints, min_presence: float, max_drift: float, max_growth: float
 ) -> np.ndarray:
-    """Return the region (4,) that the keypoints show, or `roi` (4,) where they show no one or another person.
+    """Return the region (4,) that the keypoints show, or `roi` (4,) if they show no one or another person.
 
     `max_drift` and `max_growth` as in `KeypointParams`.
     """
@@ -69,8 +69,8 @@ def corrected(
 
 
 def first_pass_rows(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> np.ndarray:
-    """Those of the frames `rows` (K,) in which a first pass corrects the crop: one in each `interval_s`, and the first
-    and last of each run of frames that has no gap longer than that. 0: all of them."""
+    """Select those of the frames `rows` (K,) in which a first pass corrects the crop: one in each `interval_s`, and the
+    first and last of each run of frames without a longer gap. 0: all."""
     if interval_s <= 0 or len(rows) < 2:
         return rows
     time = time_s[rows]
@@ -95,7 +95,7 @@ class Regions:
     rows
         Frames in which the person is in view.
     first
-        Those of the first pass; empty where `params.passes` is 1, and then the second takes the track's regions.
+        Those of the first pass; empty if `params.passes` is 1, and then the second takes the track's regions.
     reach_s
         A region of the second pass depends on results of the first up to so much later.
     """
@@ -110,13 +110,13 @@ class Regions:
         self._corrected, self._n = np.empty((len(first), 4)), 0
 
     def correct(self, row: int, found: PersonKeypoints) -> None:
-        """Take the result of the first pass in the next of its frames."""
+        """Add the result of the first pass in the next of its frames."""
         p = self._params
         self._corrected[self._n] = corrected(self.track_px[row], found, p.min_presence, p.max_drift, p.max_growth)
         self._n += 1
 
     def at(self, row: int) -> np.ndarray:
-        """Region (4,) of a frame in the second pass, by the results taken so far."""
+        """Region (4,) of a frame in the second pass, by the results added so far."""
         if not self.first:
             return self.track_px[row]
         regions, at_s = self._corrected[: self._n], self._corrected_s[: self._n]

@@ -1,9 +1,9 @@
 """Keypoints of one tracked person over a video.
 
-Two passes, because the crop decides the quality: the first, over some of the frames, cuts along the person's track, and
-its keypoints show the true region of interest; the second, over every frame, cuts there, smoothed over time in both
-directions (nothing is live here). The crop never feeds on itself from frame to frame, so it cannot wander off to
-another person: where the first pass contradicts the track, the track wins.
+There are two passes, because the quality depends on the crop: the first, over some of the frames, crops along the
+person's track, and its keypoints show the true region of interest; the second, over every frame, crops that region,
+smoothed over time in both directions. The crop does not depend on the keypoints of the previous frame, so it cannot
+drift to another person: if the first pass contradicts the track, the track is used.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ def detect_keypoints(
 ) -> Keypoints:
     """Keypoints of person `person_id` in every frame; NaN with confidence 0 where she or the point is not in view.
 
-    `params` is what `METHODS.find` takes; `detector` replaces the method's. The video is decoded once, and frames of
-    about half a second are in memory.
+    `params` as for `METHODS.find`; `detector` replaces the method's. The video is decoded once, and frames of about
+    half a second are in memory.
 
-    Raises `PblError`: SUBJECT_UNKNOWN_PERSON; TRACK_TOO_SHORT when she is in view for less than `min_time_s`;
-    VIDEO_CHANGED when the video has other frames than the tracking; SOLVER_UNKNOWN for an unknown method or detector;
+    Raises `PblError`: SUBJECT_UNKNOWN_PERSON; TRACK_TOO_SHORT if she is in view for less than `min_time_s`;
+    VIDEO_CHANGED if the video has other frames than the tracking; SOLVER_UNKNOWN for an unknown method or detector;
     those of `video.read_frames` and `assets.fetch`.
     """
     method = METHODS.find(params)
@@ -55,7 +55,7 @@ def detect_keypoints(
             "SUBJECT_UNKNOWN_PERSON",
             found=f"person {person_id}",
             expected=f"one of {', '.join(str(p.person_id) for p in tracking.persons) or 'no one: no person was found'}",
-            next_step="choose one of the numbers that tracking gave",
+            next_step="choose one of the numbers that tracking returned",
             key=str(video_path),
         )
     in_view = time_in_view_s(track, tracking.time_s)
@@ -79,15 +79,15 @@ def detect_keypoints(
 
 
 def _rois(roi: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """The regions of interest; where a detector finds only boxes, the circle around an upright body in the box."""
+    """Regions of interest; of a detector that returns only boxes, the circle around an upright body in the box."""
     x0, y0, x1, y1 = box.T
     around = np.stack([(x0 + x1) / 2, (y0 + y1) / 2, np.maximum(x1 - x0, y1 - y0), np.zeros(len(box))], axis=1)
     return np.where(np.isfinite(roi).all(axis=1, keepdims=True), roi, around)
 
 
 def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
-    """The detector of the method; one for each core where it says that this is the fastest. One whose network is on a
-    GPU is shared: it is called from as many threads as it asks for."""
+    """Return the detector of the method, or one for each core if it states that this is fastest. One on a GPU is
+    repeated: as many threads as it asks for share it."""
     first = method.function(method.params)
     shared = getattr(first, "side_by_side", 1)
     if shared > 1:
@@ -105,7 +105,7 @@ def _detect_all(
     params: KeypointParams,
     meter: PictureMeter,
 ) -> list[PersonKeypoints | None]:
-    """What is seen in each frame, of the person whose region is `roi` (T, 4), NaN where she is not in view."""
+    """Detections in each frame of the person whose region is `roi` (T, 4), NaN where she is not in view."""
     regions = Regions(roi, time_s, params)
     found: list[PersonKeypoints | None] = [None] * len(roi)
     frames = meter.watch(_in_view(video_path, regions.rows), roi)
@@ -134,7 +134,7 @@ def _detect_all(
 
 
 def _close(time_s: np.ndarray, most_s: float) -> bool:
-    """Whether these frames follow each other within that time, most of them."""
+    """True if the median interval of these frames is at most `most_s`."""
     return len(time_s) > 1 and float(np.median(np.diff(time_s))) <= most_s
 
 
@@ -194,6 +194,6 @@ def _assemble(
 
 
 def _curve_of(detector: KeypointDetector, params: KeypointParams) -> str:
-    """The curve's name, where it is one of this detector. Raises `PblError` SOLVER_UNKNOWN."""
+    """Return the curve's name if it is of this detector, else "". Raises `PblError` SOLVER_UNKNOWN."""
     name = params.confidence_curve
     return name if name and confidence_curve(name).detector == detector.name else ""

@@ -1,18 +1,18 @@
-"""Left and right that a detector exchanged for some frames, told from the movement and put back.
+"""Correction of left and right that a detector exchanged for some frames, by the movement.
 
 A network may take one leg for the other where they cross, or a body seen from the front for one seen from behind. Then
-all points of a side jump to the other side within a frame and back some frames later, which no body does: whoever
-follows each point at its own speed sees it. So the exchanges (nothing, the legs, the rest, both) are chosen over the
-whole track together, such that the points move most smoothly in the picture and in depth, the exchanges begin and end
-seldom, and few frames differ from what the detector said (dynamic programming over pairs of neighbouring frames). Legs
-that cross in a view from the side are not exchanged: they pass each other at a steady speed, and keep their depth.
+all points of a side jump to the other side within a frame and back some frames later, which no body does. So the
+exchanges (none, the legs, the rest, both) are chosen over the whole track together such that the points move most
+smoothly in the picture and in depth, few exchanges begin and end, and few frames differ from the detector's result
+(dynamic programming over pairs of neighbouring frames). Legs that cross in a view from the side are not exchanged: they
+pass each other at a steady speed, and keep their depth.
 
-Lengths play no part, so legs of different length do not mislead it. Of synthetic walkers whose left thigh, shank or
-both were 10, 20 and 30 % shorter (three views, three seeds each, 9,720 frames) no frame was exchanged, and all 2,025
-stretches that were exchanged on purpose came back exactly; with further errors of 6 cm that last 0.2 s, 19 of 1,080
-did not, of walkers with equal legs 18 of 270. A missing leg or a prosthesis was not in these data.
+Lengths are not used, so legs of different length do not matter. Of synthetic walkers whose left thigh, shank or both
+were 10, 20 and 30 % shorter (three views, three seeds each, 9,720 frames) no frame was exchanged, and all 2,025
+stretches that were exchanged on purpose were restored exactly; with further errors of 6 cm that last 0.2 s, 19 of 1,080
+were not, of walkers with equal legs 18 of 270. A missing leg or a prosthesis was not in these data.
 
-Whether the sides are right for the greater part of the track cannot be told here; `check_keypoints` reports it.
+Sides that are wrong for the greater part of the track cannot be detected here; `check_keypoints` reports them.
 """
 
 from __future__ import annotations
@@ -27,44 +27,34 @@ _LEGS = ("knee", "ankle", "heel", "foot_index")
 #: (legs exchanged, rest exchanged)
 _STATES = np.array([(False, False), (True, False), (False, True), (True, True)])
 _N_STATES = len(_STATES)
-#: Of a person's points about their middle, where nothing in metres is known.
+#: Standard deviation of a person's points about their mean (m), if they have no 3D.
 _BODY_SPREAD_M = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class FlipParams:
-    """Parameters of `exchange_sides`.
+    """Parameters of `exchange_sides`."""
 
-    least_width: a body whose shoulders are less than this fraction of their usual distance apart is a mean of two that
-    face opposite ways. Such frames do not link others, and the confidence of their points is multiplied by
-    `lower_narrow`.
-    step_s: frames about so far apart are judged together first, those between them after that; much less, and noise
-    looks like speed.
-    max_gap_s: over a longer gap nothing is concluded.
-    min_confidence: frames whose mean confidence (of the legs, of the rest) is below do not link others.
-    depth_weight: of metres along the line of sight against metres across it.
-    most_m: a point that is further than this from where it is expected counts as so far.
-    switch_cost_m: for each beginning and each end of an exchange; a mean over points, as the distances.
-    change_cost_m: for each frame that differs from what the detector said.
-    lower: the confidence of exchanged points is multiplied by it.
-    """
-
+    # A body whose shoulders are less than this fraction of their usual distance apart is a mean of two that face
+    # opposite ways. Such frames do not link others, and the confidence of their points is multiplied by `lower_narrow`.
     least_width: float = 0.7
     lower_narrow: float = 0.2
+    # Frames about this far apart are judged first, those in between after that; over a shorter step noise looks like
+    # speed.
     step_s: float = 0.033
-    max_gap_s: float = 0.4
-    min_confidence: float = 0.1
-    depth_weight: float = 0.5
-    most_m: float = 0.3
-    switch_cost_m: float = 0.02
-    change_cost_m: float = 0.001
-    lower: float = 0.5
+    max_gap_s: float = 0.4  # frames farther apart do not constrain each other
+    min_confidence: float = 0.1  # frames of a lower mean confidence (of the legs, of the rest) do not link others
+    depth_weight: float = 0.5  # weight of metres along the line of sight against metres across it
+    most_m: float = 0.3  # largest distance of a point from its prediction that counts
+    switch_cost_m: float = 0.02  # for each beginning and each end of an exchange; a mean over points, as the distances
+    change_cost_m: float = 0.001  # for each frame that differs from the detector's result
+    lower: float = 0.5  # factor of the confidence of exchanged points
 
 
 @dataclasses.dataclass(frozen=True)
 class Exchange:
-    """Frames (T,) in which the legs, and the rest of the body, are to get the other side's name, and those in which the
-    body is so narrow that its sides cannot be told."""
+    """Frames (T,) in which the names of the legs, and of the rest of the body, are to be exchanged, and those in which
+    the body is so narrow that its sides cannot be distinguished."""
 
     legs: np.ndarray
     rest: np.ndarray
@@ -77,8 +67,8 @@ class Exchange:
 
 
 def mirror_of(names: Sequence[str]) -> np.ndarray | None:
-    """For each point the index of the same point of the other side, itself in the middle; None for names without
-    sides ("left_x" with "right_x")."""
+    """Index of the same point of the other side, for each point (its own in the middle); None for names without sides
+    ("left_x" with "right_x")."""
     index = {name: i for i, name in enumerate(names)}
     other = [n.replace("left", "~").replace("right", "left").replace("~", "right") for n in names]
     if any(o not in index for o in other) or list(names) == other:
@@ -87,7 +77,7 @@ def mirror_of(names: Sequence[str]) -> np.ndarray | None:
 
 
 def leg_points(names: Sequence[str]) -> np.ndarray:
-    """(J,) bool: knees and what is below them."""
+    """(J,) bool: knees and points below them."""
     return np.array([n.endswith(_LEGS) for n in names])
 
 
@@ -99,9 +89,10 @@ def exchange_sides(
     confidence: np.ndarray,
     params: FlipParams | None = None,
 ) -> Exchange:
-    """Where left and right have to be exchanged so that `xy_px` (T, J, 2) and `xyz_cam_m` (T, J, 3) move like a body.
+    """Find the frames in which left and right have to be exchanged for `xy_px` (T, J, 2) and `xyz_cam_m` (T, J, 3) to
+    move like a body.
 
-    NaN and confidence 0 where nothing was seen. Names without sides: nowhere.
+    Points that were not seen are NaN with confidence 0. With names without sides nothing is exchanged.
     """
     params = params or FlipParams()
     none = np.zeros(len(time_s), bool)
@@ -114,7 +105,7 @@ def exchange_sides(
         return Exchange(none, none, none)
     narrow = _narrow(names, xyz_cam_m, params.least_width)
     points = _in_metres(xy_px, xyz_cam_m, params.depth_weight)
-    # A pair of points counts alike under either name, and only where both are seen.
+    # A pair of points has one weight under either name, and counts only where both are seen.
     weight = np.sqrt(0.5 * (confidence + confidence[:, mirror]))
     lost = np.isnan(points.sum(axis=2))
     weight[lost | lost[:, mirror]] = 0.0
@@ -140,7 +131,7 @@ def exchange_sides(
 
 
 def lowered(confidence: np.ndarray, exchange: Exchange, names: Sequence[str], params: FlipParams) -> np.ndarray:
-    """`confidence` (T, J) after the exchange, less sure where sides were exchanged or cannot be told."""
+    """`confidence` (T, J) after the exchange, lowered where sides were exchanged or cannot be distinguished."""
     out = exchanged(confidence, exchange, names)
     legs = leg_points(names)
     factor = np.where(legs[None], exchange.legs[:, None], exchange.rest[:, None])
@@ -149,7 +140,7 @@ def lowered(confidence: np.ndarray, exchange: Exchange, names: Sequence[str], pa
 
 
 def exchanged(values: np.ndarray, exchange: Exchange, names: Sequence[str]) -> np.ndarray:
-    """`values` (T, J, ...) with left and right exchanged where `exchange` says so."""
+    """`values` (T, J, ...) with left and right exchanged in the frames of `exchange`."""
     mirror = mirror_of(names)
     if mirror is None:
         return values
@@ -162,7 +153,7 @@ def exchanged(values: np.ndarray, exchange: Exchange, names: Sequence[str]) -> n
 
 
 def _in_metres(xy_px: np.ndarray, xyz_cam_m: np.ndarray, depth_weight: float) -> np.ndarray:
-    """Points (T, J, 3): place in the picture, in metres at the person's distance, and weighted depth."""
+    """Points (T, J, 3): position in the picture, in metres at the person's distance, and weighted depth."""
     spread_px, spread_m = _spread(xy_px), _spread(xyz_cam_m[..., :2])
     if spread_m is None:  # no 3D
         spread_m, depth = _BODY_SPREAD_M, np.zeros_like(xy_px[..., :1])
@@ -172,8 +163,8 @@ def _in_metres(xy_px: np.ndarray, xyz_cam_m: np.ndarray, depth_weight: float) ->
 
 
 def _spread(points: np.ndarray) -> float | None:
-    """Standard deviation of the points of a frame about their mean, the median over the frames; None where no frame
-    has two points."""
+    """Standard deviation of the points of a frame about their mean, the median over the frames; None if no frame has
+    two points."""
     seen = np.isfinite(points).all(axis=2, keepdims=True)
     n = np.maximum(seen.sum(axis=1), 1)
     values = np.where(seen, points, 0.0)
@@ -193,7 +184,7 @@ def _every(rows: np.ndarray, time_s: np.ndarray, step_s: float) -> np.ndarray:
 
 
 class _Shown:
-    """The points of a frame under each of the four states, and how far they are from where they are expected."""
+    """Points of a frame under each of the four states, and their distances from a prediction."""
 
     def __init__(
         self,
@@ -215,7 +206,7 @@ class _Shown:
         return self._points[row][self._order]
 
     def weight(self, *rows: int) -> np.ndarray:
-        """(J,) weights of the points that have a side, the least of these frames; 0 where one is not seen."""
+        """(J,) weights of the points that have a side, the least of these frames; 0 if one is not seen."""
         return np.where(self._paired, np.min(self._weight[list(rows)], axis=0), 0.0)
 
     def distance(self, at: np.ndarray, expected: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -224,7 +215,7 @@ class _Shown:
         return apart @ weight / max(float(weight.sum()), 1e-9)
 
     def between(self, row: int, near: Sequence[int], states: np.ndarray, time_s: np.ndarray) -> int:
-        """The state of a frame whose neighbours `near` (one or two) are known."""
+        """Find the state of a frame whose neighbours `near` (one or two) are known."""
         ends = [self.at(k)[s] for k, s in zip(near, states, strict=True)]
         if len(ends) == 2:
             fraction = (time_s[row] - time_s[near[0]]) / (time_s[near[1]] - time_s[near[0]])

@@ -1,4 +1,4 @@
-"""When the whole person is in view, and which frames of a recording count (the paper, section Keypoint Detection)."""
+"""Frames of a recording with the whole person in view, and those that count (the paper, section Keypoint Detection)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pbl_pipeline.tracking import step_s
 
 from .types import Keypoints
 
-#: Fraction of the markers that must have been detected for a frame to say anything about the pose.
+#: Fraction of the markers that must have been detected for a frame to count.
 SEEN_SHARE = 0.5
 #: Fraction of the markers that must lie inside the picture.
 INSIDE_SHARE = 0.95
-#: Mean confidence over the markers of a frame; a gap of partial view that is bridged is shorter than this; longer runs
-#: without sight of the person are left unknown (`fit.ViewParams` has the same, frozen in its paramsets).
+#: Least mean confidence over the markers of a frame; longest gap of partial view that is bridged; longest run without
+#: sight of the person that is (`fit.ViewParams` has the same, frozen in its paramsets).
 MIN_CONFIDENCE, MAX_GAP_S, MAX_BLIND_S = 0.5, 1.0, 0.15
 
 #: Names of points on feet and head, in any marker set.
@@ -29,8 +29,8 @@ _HEAD = re.compile(r"nose|head|eye|cheek", re.IGNORECASE)
 
 @dataclasses.dataclass(frozen=True)
 class Gap:
-    """Frames between two with the whole person in view, from the last before to the first after it (s); `bridged`:
-    short enough to count all the same."""
+    """Frames between two with the whole person in view, from the last before to the first after them (s); `bridged` if
+    short enough to count nevertheless."""
 
     start_s: float
     stop_s: float
@@ -44,7 +44,7 @@ class Visibility:
     time_s: np.ndarray  # (T,)
     seen: np.ndarray  # (T,) bool most points of the person were found
     whole: np.ndarray  # (T,) bool the whole person is in view (`whole_person_in_view`)
-    counts: np.ndarray  # (T,) bool the frames that a fit uses: whole, or in a bridged gap
+    counts: np.ndarray  # (T,) bool used by a fit: whole, or in a bridged gap
     gaps: tuple[Gap, ...]  # between the first and the last frame with the whole person
 
     @property
@@ -54,21 +54,21 @@ class Visibility:
 
     @property
     def first_s(self) -> float:
-        """Time of the first frame with the whole person, NaN where there is none."""
+        """Time of the first frame with the whole person, NaN if there is none."""
         return float(self.time_s[self.whole][0]) if self.whole.any() else math.nan
 
     @property
     def last_s(self) -> float:
-        """Time of the last frame with the whole person, NaN where there is none."""
+        """Time of the last frame with the whole person, NaN if there is none."""
         return float(self.time_s[self.whole][-1]) if self.whole.any() else math.nan
 
     @property
     def counts_s(self) -> float:
-        """Seconds of frames that count."""
+        """Time of the frames that count."""
         return float(np.sum(self.counts)) * step_s(self.time_s)
 
     def text(self) -> str:
-        """One sentence for people."""
+        """Summary in one sentence."""
         if not self.whole.any():
             return "the whole person is never in view"
         words = f"the whole person is in view in {self.whole_share:.0%} of the frames, from {self.first_s:.1f} to "
@@ -89,7 +89,7 @@ def visibility(
     max_gap_s: float = MAX_GAP_S,
     max_blind_s: float = MAX_BLIND_S,
 ) -> Visibility:
-    """Which frames of a trial of one camera show the whole person, and which count."""
+    """Find the frames of a trial of one camera that show the whole person, and those that count."""
     time = np.asarray(keypoints.time_s, float)
     whole = whole_person_in_view(keypoints, min_confidence)
     seen = np.mean(keypoints.confidence > 0, axis=1) >= SEEN_SHARE
@@ -101,10 +101,9 @@ def visibility(
 def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:
     """(T,) bool: nearly all markers are detected inside the picture, with a mean confidence of `min_confidence`.
 
-    The mean and not each marker: in a view from the side the far arm is hidden in every frame, and the person is in
-    view all the same. Markers that the detector never gives in this trial say nothing of a single frame and do not
-    count, unless they are most of them, or of a foot or the head where the person reaches to that border: there they
-    may have been beyond it all the time.
+    The mean, not each marker: in a view from the side the far arm is hidden in every frame, but the person is in view.
+    Markers that are never detected in this trial do not count, unless they are most of them, or of a foot or the head
+    of a person who reaches to that border: they may have been beyond it all the time.
     """
     given = np.any(keypoints.confidence > 0, axis=0)
     if given.mean() < SEEN_SHARE:
@@ -121,8 +120,8 @@ def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndar
 
 
 def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Of the feet and the lower border, then of the head and the upper one: which points (J,) bool they are, and in
-    which frames (T,) bool the person reaches to that border."""
+    """For the feet and the lower border, then for the head and the upper one: their points (J,) bool, and the frames
+    (T,) bool in which the person reaches to that border."""
     box, height = np.asarray(keypoints.box_px, float), keypoints.image_size_px[1]
     feet, head = _feet_and_head(tuple(keypoints.names))
     return (feet, box[:, 3] >= height - 1), (head, box[:, 1] <= 0)
@@ -130,7 +129,7 @@ def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
 
 @functools.cache
 def _feet_and_head(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Which markers (J,) bool are of the feet, and which of the head."""
+    """Markers (J,) bool of the feet, and of the head."""
     feet, head = (np.array([bool(p.search(n)) for n in names]) for p in (_FEET, _HEAD))
     return feet, head
 
@@ -154,8 +153,8 @@ def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np
 def blind_runs(seen: np.ndarray, time_s: np.ndarray, max_blind_s: float) -> np.ndarray:
     """(T,) bool: frames in unbroken runs without sight of the person, longer than `max_blind_s`.
 
-    Partial view may be bridged; where nothing was seen there is nothing to fit, and a trajectory that swings freely
-    through such a hole invents movement (on a synthetic walker up to 50 deg at the knee within 0.9 s).
+    Partial view may be bridged; without any points a fitted trajectory is free and invents movement (on a synthetic
+    walker up to 50 deg at the knee within 0.9 s).
     """
     blind = np.zeros(len(seen), bool)
     for a, b in _around_gaps(seen):

@@ -1,11 +1,12 @@
 """Anatomical markers from 15 points of a video: OpenCap's marker augmenter, an LSTM of OpenCap's version 0.3.
 
-Two hip points cannot tell how far a pelvis is tipped; people's movement can. The network was trained on motion capture
-of 1176 people to predict where 35 skin markers are, iliac spines among them (Falisse et al. 2025, "Marker Data
-Enhancement for Markerless Motion Capture", IEEE Trans Biomed Eng 72:2013, doi:10.1101/2024.07.13.603382). It sees the
-points y up, relative to the middle of the hips, over the person's height, then height and mass, all standardised by the
-mean and standard deviation that lie beside it; its markers are relative to the same point and over the same height.
-The walking direction should not matter but does, so the predictions for several headings are averaged.
+Two hip points do not determine the tilt of the pelvis, but the whole movement does. The network was trained on motion
+capture of 1176 people to predict the positions of 35 skin markers, including the iliac spines (Falisse et al. 2025,
+"Marker Data Enhancement for Markerless Motion Capture", IEEE Trans Biomed Eng 72:2013, doi:10.1101/2024.07.13.603382).
+Its input is the points, y up, relative to the middle of the hips and divided by the person's height, then height and
+mass, all standardised by the mean and standard deviation that are stored next to it; its markers are relative to the
+same point and divided by the same height. The walking direction should not matter but does, so the predictions for
+several headings are averaged.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.runs import runs
 
-#: What the network sees, in its order: names of the marker set `halpe_26`, whose hips, knees and ankles are joints.
+#: Input of the network, in its order: names of the marker set `halpe_26`, whose hips, knees and ankles are joints.
 POINTS: tuple[str, ...] = (
     "neck",
     *(
@@ -29,8 +30,7 @@ POINTS: tuple[str, ...] = (
         for side in ("right", "left")
     ),
 )
-#: What it predicts, in its order: the marker set `opencap_35`. OpenCap's names, with `l_` for its `L` and without
-#: "_study".
+#: Output, in its order: the marker set `opencap_35`. OpenCap's names, with `l_` for its `L` and without "_study".
 MARKERS: tuple[str, ...] = (
     *("r_ASIS", "l_ASIS", "r_PSIS", "l_PSIS"),
     *("r_knee", "r_mknee", "r_ankle", "r_mankle", "r_toe", "r_5meta", "r_calc"),
@@ -44,50 +44,43 @@ _KNEES = [POINTS.index("right_knee"), POINTS.index("left_knee")]
 _ANKLES = [POINTS.index("right_ankle"), POINTS.index("left_ankle")]
 #: From z up to y up: (x, y, z) to (x, z, -y).
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-#: Hip to knee and knee to ankle as a fraction of the height: 0.824 of 1.783 m on the body of this project (figures of
-#: Hamner, Seth and Delp 2010, J Biomech 43:2709), whose points go in. OpenCap's points of a man of 1.79 m have 0.45 to
-#: 0.46; the 0.491 of Drillis and Contini 1966 count from the trochanter to the ankle joint.
+#: Hip to knee and knee to ankle as a fraction of the height: 0.824 of 1.783 m on our body (figures of Hamner, Seth and
+#: Delp 2010, J Biomech 43:2709), whose points are the input. OpenCap's points of a man of 1.79 m have 0.45 to 0.46; the
+#: 0.491 of Drillis and Contini 1966 are from the trochanter to the ankle joint.
 _LEG_OF_HEIGHT = 0.462
-#: Heights (m) of the people that the network is meant for; outside, positions are taken to be in another unit.
+#: Heights (m) of the people that the network is meant for; and of any person, beyond which the unit must be wrong.
 _ADULT_M, _PERSON_M = (1.35, 2.15), (0.5, 2.6)
-#: Legs that imply another height than the stated one by more than this fraction are told.
+#: Relative difference between the height that the legs imply and the stated one above which it is reported.
 _MISMATCH = 0.08
 _unsuitable = functools.partial(PblError, "AUGMENTER_INPUT")
 
 
 @dataclasses.dataclass(frozen=True)
 class AugmenterParams:
-    """Parameters of `MarkerAugmenter`.
-
-    model_sha256: of the network. headings: answers that are averaged, evenly spread over a turn. rate_hz: the points
-    are brought to it, that of OpenCap's videos; the network's memory counts in frames. min_time_s: shortest stretch
-    without a gap that it is asked about.
-    """
+    """Parameters of `MarkerAugmenter`."""
 
     model_sha256: str = assets.ASSETS["augmenter_network"].sha256
-    headings: int = 8
-    rate_hz: float = 60.0
-    min_time_s: float = 0.25
+    headings: int = 8  # predictions that are averaged, evenly spread over a turn
+    rate_hz: float = 60.0  # rate of the points, that of OpenCap's videos; the network's memory counts in frames
+    min_time_s: float = 0.25  # shortest stretch without a gap for which it predicts
 
 
 @dataclasses.dataclass(frozen=True)
 class AnatomicalMarkers:
-    """`names` (35,); `xyz_world_m` (T, 35, 3) z up, NaN where a point was unknown; `height_m`, `mass_kg` as they were
-    used; `assumed`: a sentence for each of them that was not stated, or that the network was not made for; `origin`:
-    network, licence and hash."""
+    """Predicted markers, and the assumptions behind them."""
 
-    names: tuple[str, ...]
-    xyz_world_m: np.ndarray
-    height_m: float
+    names: tuple[str, ...]  # (35,)
+    xyz_world_m: np.ndarray  # (T, 35, 3) z up, NaN where a point was unknown
+    height_m: float  # these two: as used
     mass_kg: float
-    assumed: tuple[str, ...]
-    origin: str
+    assumed: tuple[str, ...]  # a sentence for each of them that was not stated, or is outside the network's range
+    origin: str  # network, licence and hash
 
 
 class MarkerAugmenter:
-    """The loaded network; `points`, `markers`: names of what it sees and predicts. Not to be shared by threads.
+    """The loaded network, with the names of its inputs (`points`) and outputs (`markers`). Not to be shared by threads.
 
-    Raises those of `assets.fetch`, and `PblError` SOLVER_UNKNOWN where `params` name another network.
+    Raises those of `assets.fetch`, and `PblError` SOLVER_UNKNOWN if `params` name another network.
     """
 
     points = POINTS
@@ -108,7 +101,7 @@ class MarkerAugmenter:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3
         path = assets.fetch(asset.name)
-        # Small, and a loop over time: a GPU brings nothing.
+        # Small, and a loop over time: a GPU is not faster.
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self._mean, self._std = (np.load(assets.fetch(f"augmenter_{which}")) for which in ("mean", "std"))
         self.origin = f"{asset.what}, SHA-256 {asset.sha256}, licence: {asset.licence}; {asset.source}"
@@ -120,22 +113,22 @@ class MarkerAugmenter:
         height_m: float | None = None,
         mass_kg: float | None = None,
     ) -> AnatomicalMarkers:
-        """The markers of one person.
+        """Predict the markers of one person.
 
         Raises `PblError` AUGMENTER_INPUT: other shapes, a point that is never known (a foot out of view), too short a
-        stretch, a height that no person has (another unit), or a body upside down (another axis up).
+        stretch, an impossible height (another unit), or a body upside down (another axis up).
 
         Parameters
         ----------
         time_s : (T,)
             Strictly increasing seconds.
         points_world_m : (T, 15, 3)
-            `POINTS` in a world with z up, metres; NaN where unknown. A frame counts where all 15 are known.
+            `POINTS` in a world with z up, metres; NaN where unknown. A frame counts if all 15 are known.
         height_m, mass_kg
-            Of the person. None: the height that the legs imply, and the mass of that height by
-            the mean body mass index of the network's people; `assumed` says so. Give the height only with positions
-            of the person's own size: one camera hardly knows it, and each centimetre by which height and positions
-            disagree tips the pelvis by 0.2 to 0.5 deg (docs/models.md).
+            Of the person. None: the height that the legs imply, and the mass of that height by the mean body mass index
+            of the network's people, as stated in `assumed`. Pass the height only with positions of true size: one
+            camera hardly determines it, and each centimetre by which height and positions disagree tilts the pelvis by
+            0.2 to 0.5 deg (docs/models.md).
         """
         points = np.asarray(points_world_m, float)
         time_s = np.asarray(time_s, float)
@@ -158,7 +151,7 @@ class MarkerAugmenter:
         return AnatomicalMarkers(MARKERS, out, height, mass, assumed, self.origin)
 
     def _predict(self, points: np.ndarray, height_m: float, mass_kg: float) -> np.ndarray:
-        """(N, 35, 3) of points (N, 15, 3) at `rate_hz`: the mean over the headings, all asked in one call."""
+        """(N, 35, 3) of points (N, 15, 3) at `rate_hz`: the mean over the headings, all in one call."""
         n, k = len(points), self.params.headings
         turns = _Y_UP @ Rotation.from_rotvec(np.outer(2 * np.pi * np.arange(k) / k, [0.0, 0.0, 1.0])).as_matrix()
         root = points[:, _HIPS].mean(axis=1, keepdims=True)
@@ -218,6 +211,6 @@ def _check(time_s: np.ndarray, points: np.ndarray) -> None:
 
 
 def _resampled(to_s: np.ndarray, from_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N, P, 3) at the times `to_s`, linear between `from_s`; its ends hold beyond."""
+    """(N, P, 3) at the times `to_s`, linear between `from_s` and constant beyond."""
     flat = values.reshape(len(values), -1)
     return np.stack([np.interp(to_s, from_s, v) for v in flat.T], axis=1).reshape(len(to_s), *values.shape[1:])

@@ -11,7 +11,7 @@ from .protocol import KeypointParams
 
 
 class RegisteredModels:
-    """`Provider` of the keypoint methods: each registered keypoint model is one, under its own name."""
+    """`Provider` of the keypoint methods: each registered keypoint model is a method with its name."""
 
     def names(self) -> list[str]:
         return [m.name for m in models.registered()]
@@ -23,7 +23,7 @@ class RegisteredModels:
 #: A family is a detector: a function from its parameters to a `KeypointDetector`.
 METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
 METHODS.register("blazepose-33", 3, KeypointParams(crop_step_px=0.25), blazepose)
-#: It shares inferences at 24 frames/s and more: each is slow, and its answers for two frames lie close together.
+#: Shares inferences at 24 frames/s and more: each is slow, and those of two neighbouring frames differ little.
 METHODS.register(
     "blazepose-heavy",
     4,

@@ -1,9 +1,9 @@
 """Inference of a picture and of its mirror image, combined into one result.
 
-Its errors in the two are partly independent, and where it prefers one side of the body the mirrored answer prefers the
+The errors of the two are partly independent, and if one prefers one side of the body the mirrored one prefers the
 other: their mean is better than either (docs/benchmarks.md). Half their difference changes slowly, so frames that
-follow each other closely can share the two inferences: one is seen as it is, the next mirrored, and the half is taken
-from the frames around. That costs one inference a frame instead of two.
+follow each other closely can share the two inferences: one is seen as it is, the next mirrored, and half the difference
+is taken from the frames around. That takes one inference per frame instead of two.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from scipy.special import expit
 from .flips import leg_points, mirror_of
 from .types import PersonKeypoints
 
-#: The two answers are taken to have other sides where they lie apart by more than this fraction of the region's side,
-#: in the mean, and by less than half of that with the sides exchanged.
+#: The sides of the two results are taken as exchanged if their mean distance is more than the first (a fraction of the
+#: region's side), and with sides exchanged less than the second as a fraction of that.
 LEAST_APART, MOST_CROSSED = 0.05, 0.5
-#: Factor of the confidence there.
+#: Factor of the confidence then.
 UNDECIDED = 0.5
-#: Over a longer gap nothing is shared.
+#: Longest gap over which inferences are shared.
 _MAX_GAP_S = 0.25
-#: Standard deviation of the Gaussian over time that half the difference is smoothed by where inferences are shared.
+#: Standard deviation of the Gaussian over time that smooths half the difference of shared inferences.
 _SMOOTH_S = 0.15
-#: Weight there of a point whose two answers contradict each other.
+#: Weight in it of a point whose two results contradict each other.
 _LEAST_WEIGHT = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class MirroredInference:
-    """Puts the two answers for points `names` together.
+    """Combines the two results for points `names`.
 
     confidence = the mean of both, times 1 / (1 + exp((sigma - agree_mm) / agree_width_mm)); sigma is half the 3D
-    distance in mm between the answers. The confidence that a network states stays near 1 where it takes one leg
-    for the other; this factor is small there.
+    distance in mm between them. If a network takes one leg for the other its confidence stays near 1, but this factor
+    is small.
 
-    Where the two are one body with left and right exchanged, of the legs or of the rest, the mirrored answer is renamed
-    after the other (their mean would be a body without width) and the confidence of these points is halved: which of
-    the two is right, the movement says (`exchange_sides`).
+    If the two are one body with left and right exchanged, of the legs or of the rest, the mirrored points are renamed
+    (the mean would be a body without width) and their confidence is halved: the movement decides later which of the two
+    is right (`exchange_sides`).
     """
 
     names: tuple[str, ...]
@@ -50,7 +50,7 @@ class MirroredInference:
     agree_width_mm: float
 
     def averaged(self, own: PersonKeypoints, mirrored: PersonKeypoints) -> PersonKeypoints:
-        """Of one frame that was looked at twice; both in terms of the frame itself."""
+        """Combine the results of one frame and of its mirror image, both in coordinates of the frame."""
         same = self.same_sides(own.xy_px, mirrored.xy_px, float(own.roi_px[2]))
         other = _renamed(mirrored, same)
         stated, decided = (own.confidence + other.confidence) / 2, same == np.arange(len(same))
@@ -71,8 +71,8 @@ class MirroredInference:
         time_s: np.ndarray,
         min_presence: float,
     ) -> list[PersonKeypoints | None]:
-        """Of frames that were looked at once each, those of `mirrored` (T,) bool in the mirror image. Frames in which
-        nobody was seen take no part; a stretch with fewer than two inferences of either kind stays as it is."""
+        """Combine the results of frames with one inference each, those of `mirrored` (T,) bool of the mirror image.
+        Frames without the person are ignored; a stretch with fewer than two inferences of either kind is unchanged."""
         out = list(found)
         seen = np.array([i for i, p in enumerate(found) if p is not None and p.presence >= min_presence], int)
         breaks = np.flatnonzero(np.diff(time_s[seen]) > _MAX_GAP_S) + 1
@@ -87,9 +87,8 @@ class MirroredInference:
         return out
 
     def same_sides(self, xy_px: np.ndarray, other_px: np.ndarray, side_px: float) -> np.ndarray:
-        """(J,) which point of `other_px` (J, 2) to compare with each of `xy_px` (J, 2): itself, or that of the other
-        side where the legs, or the rest of the body, lie clearly closer with left and right exchanged. `side_px`: the
-        region's."""
+        """(J,) index into `other_px` (J, 2) for each point of `xy_px` (J, 2): the same, or that of the other side if
+        the legs, or the rest of the body, are clearly closer with left and right exchanged. `side_px`: the region's."""
         order = np.arange(len(self.names))
         mirror = mirror_of(self.names)
         if mirror is None:
@@ -111,8 +110,8 @@ class MirroredInference:
     ) -> list[PersonKeypoints]:
         """Return the combined results of a stretch.
 
-        Half the difference in a frame is that of its result to the other kind's, interpolated there. Before and after
-        the frames of `both` one kind is not known: the nearest of them is used.
+        Half the difference in a frame is that of its result to the interpolated one of the other kind. Before and after
+        the frames of `both` one kind is not known, and that of the nearest of them is used.
         """
         plain = _between(people, ~mirrored, time_s)
         crossed = np.zeros((len(people), len(self.names)), bool)
@@ -120,7 +119,7 @@ class MirroredInference:
             same = self.same_sides(plain[i].xy_px, people[i].xy_px, float(people[i].roi_px[2]))
             people[i], crossed[i] = _renamed(people[i], same), same != np.arange(len(same))
         other = _between(people, mirrored, time_s)
-        # A frame without the mirrored look is as undecided as those beside it.
+        # A frame without the mirror image is as undecided as its neighbours.
         crossed[1:-1] |= ~mirrored[1:-1, None] & (crossed[:-2] | crossed[2:])
         pairs = list(zip(plain, other, strict=True))
         nearest = np.clip(np.arange(len(people)), np.flatnonzero(both)[0], np.flatnonzero(both)[-1])
@@ -155,7 +154,7 @@ def _renamed(person: PersonKeypoints, order: np.ndarray) -> PersonKeypoints:
 
 
 def _spanned(known: np.ndarray) -> np.ndarray:
-    """The frames between the first and the last of `known`; none where there are fewer than two."""
+    """Frames between the first and the last of `known`; none if there are fewer than two."""
     rows = np.flatnonzero(known)
     out = np.zeros(len(known), bool)
     if len(rows) > 1:
@@ -164,7 +163,7 @@ def _spanned(known: np.ndarray) -> np.ndarray:
 
 
 def _between(people: Sequence[PersonKeypoints], known: np.ndarray, time_s: np.ndarray) -> list[PersonKeypoints]:
-    """Each frame's points as the frames of `known` have them: cubic (Akima) between these, beyond them the nearest."""
+    """Points of each frame, interpolated from the frames of `known`: cubic (Akima) in between, the nearest beyond."""
     at = np.clip(time_s, time_s[known][0], time_s[known][-1])
 
     def values(name: str) -> np.ndarray:

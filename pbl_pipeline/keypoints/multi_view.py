@@ -1,4 +1,4 @@
-"""One trial seen by several calibrated cameras, and the check that they see one person."""
+"""Trials seen by several calibrated cameras, and the check that they see the same person."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses, undis
 
 from .types import Keypoints
 
-#: Cameras started by one trigger differ by less; a frame of 60 Hz is 17 ms.
+#: Largest difference between cameras started by one trigger; a frame of 60 Hz is 17 ms.
 SAME_TIME_S = 1e-3
 _view_error = functools.partial(
     PblError,
@@ -35,8 +35,8 @@ class MultiView:
 
     #: Keypoints of each camera: equal time stamps (within 1 ms), names and marker set. `xyz_cam_m` may be all NaN.
     views: tuple[Keypoints, ...]
-    poses: tuple[CameraPose, ...]  # where each camera stands, in the same order; one world for all
-    cameras: tuple[str, ...] = ()  # what each is called, for messages; empty where they have no names
+    poses: tuple[CameraPose, ...]  # pose of each camera, in the same order and one world
+    cameras: tuple[str, ...] = ()  # their names, for messages; may be empty
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -64,7 +64,7 @@ class MultiView:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The J markers of each view."""
+        """Names of the J markers of each view."""
         return self.views[0].names
 
     @property
@@ -107,13 +107,13 @@ def check_same_times(times_s: Sequence[np.ndarray], key: object = None) -> None:
 
 
 def cameras_of_files(stems: Sequence[str], calibration: str | Path) -> tuple[str, list[str]]:
-    """A name for the trial and the camera of each file.
+    """Find the trial's name and the camera of each file.
 
     A file belongs to the camera that its stem names, alone or after the trial's name and a dot ("cam_01",
-    "walk.cam_01"; case, `_` and `-` do not count). Where no stem names one, the files are in the order of the cameras.
-    The trial is called "trial" where the stems have no common name for it.
+    "walk.cam_01"; case, `_` and `-` are ignored). If no stem names one, the files are in the order of the cameras. The
+    trial is called "trial" if the stems have no common name for it.
 
-    Raises `PblError` CAMERA_INVALID where some files are of a camera and some are not, or the counts differ.
+    Raises `PblError` CAMERA_INVALID if only some stems name a camera, or the numbers differ.
     """
     cameras = list(load_camera_poses(calibration))
     plain = {_plain(name): name for name in cameras}
@@ -143,20 +143,19 @@ def _calibration_error(path: str | Path, cameras: list[str], views: list[str], n
     )
 
 
-#: Most by which rays to the points of one person miss the points that are nearest to all of them (m), mean over points.
-#: docs/accuracy.md has what it was chosen from.
+#: Largest mean distance (m) of rays to the points of one person from the triangulated points (docs/accuracy.md).
 MOST_MISS_M = 0.1
-#: Points that a frame needs in two cameras, as a share of all, to be compared.
+#: Least fraction of the points that two cameras must see in a frame for it to be compared.
 _COMPARED_SHARE = 0.5
 
 
 def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
-    """How far each camera's rays to the person's points pass the triangulated points (m): the mean over the points of
-    a frame, the median over the frames. NaN for a camera that shares no frame with another.
+    """Distance of each camera's rays to the person's points from the triangulated points (m): the mean over the points
+    of a frame, the median over the frames. NaN for a camera that shares no frame with another.
 
-    A point is triangulated where two cameras see it, as the place with the least sum of squared distances to their
-    rays, each weighted with its confidence (Hartley & Zisserman 2004, chapter 12, names it the midpoint method for two
-    views). Two cameras of one height see a person at another place by the height of the points alone.
+    A point is triangulated if two cameras see it, at the position with the least sum of squared distances to their
+    rays, each weighted with its confidence (Hartley & Zisserman 2004, chapter 12; the midpoint method for two views).
+    If two cameras of one height see two different people, only the heights of the points differ.
     """
     origin = np.stack([p.p_nc for p in trial.poses])
     seen = np.stack([v.confidence > 0 for v in trial.views], axis=2)  # (T, J, V)
@@ -181,7 +180,7 @@ def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
 
 
 def check_views_agree(trial: MultiView, name: str) -> float:
-    """The largest of `ray_miss_m` (m), NaN where no two cameras see the person in one frame.
+    """Return the largest of `ray_miss_m` (m), NaN if no two cameras see the person in one frame.
 
     Raises `PblError` VIEWS_DISAGREE: more than `MOST_MISS_M`.
     """

@@ -1,4 +1,4 @@
-"""Keypoints from a registered ONNX model: crops by virtual cameras, augmentations, the way back into the picture."""
+"""Keypoints from a registered ONNX model: crops by virtual cameras, augmentations, and mapping back to the picture."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from .protocol import KeypointParams
 from .types import PersonKeypoints
 from .virtual_camera import aligned, augmentations, crops, look_at, sd_confidence, spread_mm
 
-#: Fewest points that fix a place.
+#: Fewest points that determine a position.
 MIN_POINTS = 4
-#: Distance at which a point counts half, as a length at the person's distance (m), which is the same in a picture of
-#: any size: 5 px of one of 1080 x 1920 from 4.5 m. And rounds of reweighting: first with Huber's weights, which find
-#: their way from anywhere, then with Cauchy's, which let go of points that are far off.
+#: Distance at which the weight of a point is halved, as a length at the person's distance (m), the same in a picture of
+#: any size: 5 px of one of 1080 x 1920 from 4.5 m. And rounds of reweighting: first with Huber's weights, which
+#: converge from anywhere, then with Cauchy's, which ignore outliers.
 HALF_M, _OLD_HALF_PX = 0.015, 5.0
 _ROUNDS = (8, 8)
-#: Nearest that a point may be to the camera (m).
+#: Least depth of a point (m).
 _NEAREST_M = 0.1
 
 
 def absolute_root(
     xyz_m: np.ndarray, xy_px: np.ndarray, confidence: np.ndarray, camera: Camera, half_m: float = HALF_M
 ) -> np.ndarray:
-    """(T, 3) shift in m that puts points (T, J, 3), right but for one shift, where their pixels (T, J, 2) see them.
+    """(T, 3) shift in m that projects points (T, J, 3), known up to one shift, onto their pixels (T, J, 2).
 
     Least squares on ``(x + tx) - u (z + tz)`` and the same for y, u and v being the ray of the pixel without
-    distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as seen in
-    the picture, and that fall with a point's distance in the picture from where the last shift puts it (Cauchy's, half
-    at `half_m`; 0: at 5 px of the file, as before 0.2). `confidence` (T, J) weighs the points. NaN where fewer than
-    four have one, or where the person would stand behind the camera.
+    distortion, linear in the shift. Repeated with weights that divide by the depth, so that distances count as in the
+    picture, and that fall with a point's distance in the picture from its last projection (Cauchy's, half at `half_m`;
+    0: at 5 px of the file, as before 0.2). `confidence` (T, J) weights the points. NaN if fewer than four have one, or
+    if the person would be behind the camera.
     """
     xyz, weight0 = np.asarray(xyz_m, np.float64), np.asarray(confidence, np.float64)
     known = np.isfinite(xyz).all(axis=2) & np.isfinite(xy_px).all(axis=2) & (weight0 > 0)
@@ -78,8 +78,8 @@ _FLAT = 1e-12
 
 def from_simcc(x: np.ndarray, y: np.ndarray, split: float) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, J, 2) in px of the crop and scores (N, J) from SimCC's two profiles (N, J, width * split) and
-    (N, J, height * split): the place of the largest value on each axis, between the bins by the parabola through it
-    and its neighbours. The score is the smaller of the two values, in 0..1 (Li et al. 2022, "SimCC", ECCV)."""
+    (N, J, height * split): the position of the largest value on each axis, refined by the parabola through it and its
+    neighbours. The score is the smaller of the two values, 0 to 1 (Li et al. 2022, "SimCC", ECCV)."""
     at_x, top_x = _peak(x)
     at_y, top_y = _peak(y)
     return np.stack([at_x, at_y], axis=-1) / split, np.clip(np.minimum(top_x, top_y), 0.0, 1.0)
@@ -87,7 +87,7 @@ def from_simcc(x: np.ndarray, y: np.ndarray, split: float) -> tuple[np.ndarray, 
 
 def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, J, 2) in px of the crop of `size_px` (width, height) and scores (N, J) from heat maps (N, J, h, w):
-    the place of the largest value, between the cells by the parabola along each axis; its value in 0..1 is the score.
+    the position of the largest value, refined by the parabola along each axis; its value, 0 to 1, is the score.
 
     Cell i is at i * width / w: cells and pixels count from the centre of the first, or both from its edge less half a
     cell (`edge_shift`)."""
@@ -102,12 +102,12 @@ def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndar
 
 
 def edge_shift(shape: tuple[int, ...], size_px: tuple[int, int]) -> np.ndarray:
-    """Half a cell (2,) of a heat map of `shape` (..., h, w) in px: what its centre is from its edge."""
+    """Half a cell (2,) of a heat map of `shape` (..., h, w) in px: from its edge to its centre."""
     return np.array([size_px[0] / shape[-1], size_px[1] / shape[-2]]) / 2
 
 
 def _peak(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place (N, J), between the bins, and value (N, J) of the largest of (N, J, K)."""
+    """Position (N, J), refined between the bins, and value (N, J) of the largest of (N, J, K)."""
     index = profile.argmax(axis=2)
     inner = np.clip(index, 1, profile.shape[2] - 2)
     a, b = np.ogrid[: profile.shape[0], : profile.shape[1]]
@@ -120,36 +120,30 @@ def _peak(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 #: Frames in one call of the network, by device.
 BATCH = {"cpu": 2, "cuda": 16}
-#: The person's box is this much larger than the hull of its points.
+#: Size of the person's box over that of the hull of its points.
 _HULL_MARGIN = 1.1
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelParams:
-    """What a method freezes of a registered model.
+    """Properties of a registered model that a method stores."""
 
-    name: under which it is registered. sha256, spec_sha256: of its graph, and of all in its `model.json` that changes a
-    number. licence: as its `model.json` states it. n_augmentations: see `augmentations`; a model with 3D needs two or
-    more, because their spread is its confidence. half_mm, width_mm: see `sd_confidence`.
-    half_root_m: see `absolute_root`; 0: half at 5 px of the file, as of methods that were stored before 0.2.
-    """
-
-    name: str
-    sha256: str
-    spec_sha256: str
-    licence: str
-    n_augmentations: int
-    half_mm: float = 30.0
+    name: str  # of the registered model
+    sha256: str  # of its graph
+    spec_sha256: str  # of all fields of its `model.json` that change a number
+    licence: str  # in its `model.json`
+    n_augmentations: int  # two or more for a model with 3D, because their spread is its confidence (`augmentations`)
+    half_mm: float = 30.0  # these two: see `sd_confidence`
     width_mm: float = 10.0
-    half_root_m: float = later(0.0)
+    half_root_m: float = later(0.0)  # see `absolute_root`; 0 in methods stored before 0.2: half at 5 px of the file
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelKeypointParams(KeypointParams):
     """Parameters of `detect_keypoints` with a registered model.
 
-    min_presence is 0: no network here says whether a person is there; without one, confidences are low. `agree_mm`,
-    `confidence_curve` and `sides` were made and measured with BlazePose: the first does nothing here, the others are
+    min_presence is 0: these networks do not return the presence of a person; without one, confidences are low.
+    `agree_mm`, `confidence_curve` and `sides` were measured with BlazePose: the first is not used here, the others are
     off.
     """
 
@@ -161,14 +155,14 @@ class ModelKeypointParams(KeypointParams):
     model: ModelParams = dataclasses.field(kw_only=True)
 
     def points(self) -> tuple[str, bool]:
-        """As the registered model has them. Raises `PblError` MODEL_MISSING, MODEL_INVALID."""
+        """Those of the registered model. Raises `PblError` MODEL_MISSING, MODEL_INVALID."""
         spec = load_spec(find(self.model.name))
         return spec.marker_set, root_relative(spec)
 
 
 def model_params(name: str) -> ModelParams:
-    """The parameters of a registered model as it is now: 10 augmentations where it gives 3D, the picture and its mirror
-    image where it gives 2D only. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN, USAGE."""
+    """Return the parameters of a registered model as it is now: 10 augmentations if it returns 3D, the picture and its
+    mirror image if only 2D. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN, USAGE."""
     spec = load_spec(find(name))
     if not spec.joint_names:
         raise PblError(
@@ -185,13 +179,13 @@ def model_params(name: str) -> ModelParams:
 class OnnxKeypoints:
     """`KeypointDetector` of any registered model.
 
-    A model with 3D: 2D points are the mean over the augmentations; 3D points the mean of the answers, aligned by a
-    shift, and put where the 2D points see them (`absolute_root`), so in the camera frame from the camera on;
-    confidence from their spread (`sd_confidence`), their mean is `presence`. A model without: 3D is NaN, confidence is
-    the mean of the model's own scores.
+    With a model of 3D points, 2D points are the mean over the augmentations; 3D points are the mean of the results,
+    aligned by a shift and placed by the 2D points (`absolute_root`), so in the camera frame with its origin at the
+    camera; confidence is from their spread (`sd_confidence`), and its mean is `presence`. With other models, 3D is NaN,
+    and confidence is the mean of the model's scores.
 
-    Raises `PblError` MODEL_CHECKSUM where the registered model is not the one that the parameters name; what
-    `OnnxModel` raises.
+    Raises `PblError` MODEL_CHECKSUM if the registered model is not that of the parameters, USAGE (too few
+    augmentations), and as `OnnxModel`.
     """
 
     name = "onnx"
@@ -200,7 +194,14 @@ class OnnxKeypoints:
         self._model = OnnxModel(folder or find(params.name), device)
         spec = self._model.spec
         check_frozen(spec, params.sha256, params.spec_sha256)
-        _check_augmentations(spec, params)
+        if params.n_augmentations < (2 if spec.kind == "crop3d" else 1):
+            raise PblError(
+                "USAGE",
+                found=f"{params.n_augmentations} augmentations for a {spec.kind} model",
+                expected="two or more with 3D, whose spread is the confidence; one or more without",
+                next_step="use 10, as the paper does",
+                key=params.name,
+            )
         self._spec, self._params = spec, params
         self.model_sha256 = spec.sha256
         self.names = spec.joint_names
@@ -213,14 +214,14 @@ class OnnxKeypoints:
 
     @property
     def origin(self) -> str:
-        """Where these keypoints come from, for the result."""
+        """Origin of these keypoints, for the result."""
         spec = self._spec
         looks = f"{len(self._augmentations)} augmentations, ONNX on {self.device}"
         looks += f" ({self.note})" if self.note else ""
         return f"{spec.kind} model {spec.name}, SHA-256 {spec.sha256}, licence: {spec.licence}; {looks}"
 
     def detect(self, image: np.ndarray, roi_px: np.ndarray, camera: Camera, *, quick: bool = False) -> PersonKeypoints:
-        """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR; what lies beyond it is black to the network."""
+        """See `KeypointDetector`. `image` (H, W, 3) uint8 BGR, black beyond it."""
         return self.detect_many([image], [roi_px], camera, quick=quick)[0]
 
     def detect_many(
@@ -258,7 +259,7 @@ class OnnxKeypoints:
         confidence = sd_confidence(spread_mm(together), self._params.half_mm, self._params.width_mm)
         root = absolute_root(mean_xyz, mean_xy, confidence, camera, self._params.half_root_m)
         placed = np.asarray(np.isfinite(root).all(axis=1))
-        # A shape that fits nowhere in front of the camera is not a person.
+        # Points that fit nowhere in front of the camera are not a person.
         confidence = np.where(placed[:, None], confidence, 0.0)
         mean_xyz = mean_xyz + root[:, None]
         people = zip(mean_xy, mean_xyz, confidence, rois_px, strict=True)
@@ -285,44 +286,33 @@ class OnnxKeypoints:
 
 
 def root_relative(spec: ModelSpec) -> bool:
-    """Whether 3D points are relative to the root of the body; those of a crop model are put into the camera's frame."""
+    """True if 3D points are relative to the root of the body; those of a crop model are in the camera's frame."""
     return spec.kind != "crop3d"
 
 
 def model_keypoint_params(name: str) -> ModelKeypointParams:
-    """The parameters of the keypoint method of a registered model. Raises as `model_params`."""
+    """Return the parameters of the keypoint method of a registered model. Raises as `model_params`."""
     model = model_params(name)
     return ModelKeypointParams(model_sha256=model.sha256, model=model)
 
 
 def onnx(params: ModelKeypointParams) -> OnnxKeypoints:
-    """The detector of the method. Raises what `OnnxKeypoints` raises."""
+    """Return the detector of the method. Raises as `OnnxKeypoints`."""
     return OnnxKeypoints(params.model)
 
 
 def _person(
     xy: np.ndarray, xyz: np.ndarray, confidence: np.ndarray, roi_px: np.ndarray, crop_px: float, *, known: bool = True
 ) -> PersonKeypoints:
-    """`known`: whether the confidence says anything; a single look of a model with 3D has none."""
+    """Keypoints of one frame. `known`: False if there is no confidence, as for one inference of a model with 3D."""
     presence = float(confidence.mean()) if known else float("nan")
     return PersonKeypoints(xy, xyz, confidence, presence, _region(xy, roi_px), crop_px)
 
 
 def _region(xy: np.ndarray, roi_px: np.ndarray) -> np.ndarray:
-    """(4,) centre, side and rotation of the box around the points, turned as the region they were found in."""
+    """(4,) centre, side and rotation of the box around the points, turned as their region."""
     cosine, sine = np.cos(roi_px[3]), np.sin(roi_px[3])
     turn = np.array([[cosine, sine], [-sine, cosine]])
     along = xy @ turn.T
     low, high = along.min(axis=0), along.max(axis=0)
     return np.array([*((low + high) / 2 @ turn), _HULL_MARGIN * np.max(high - low), roi_px[3]])
-
-
-def _check_augmentations(spec: ModelSpec, params: ModelParams) -> None:
-    if params.n_augmentations < (2 if spec.kind == "crop3d" else 1):
-        raise PblError(
-            "USAGE",
-            found=f"{params.n_augmentations} augmentations for a {spec.kind} model",
-            expected="two or more with 3D, whose spread is the confidence; one or more without",
-            next_step="use 10, as the paper does",
-            key=params.name,
-        )

@@ -1,8 +1,8 @@
-"""Two passes over the frames in one reading of the video, shared out to the cores.
+"""Two passes over the frames in one reading of the video, distributed over the cores.
 
 The second pass over a frame needs what the first found up to `reach_s` later, so the frames of that time wait in memory
-(not converted, 3 MB each at 1080p) and the video is decoded once. Decoding, converting and the network all leave
-Python's lock, so they run side by side: one detector per core, each with one thread, is faster than one detector with
+(not converted, 3 MB each at 1080p) and the video is decoded once. Decoding, converting and the network all release
+Python's lock, so they run in parallel: one detector per core, each with one thread, is faster than one detector with
 several.
 """
 
@@ -29,7 +29,7 @@ _Item = tuple[Frame, np.ndarray, bool, "Future[PersonKeypoints]"]
 
 @runtime_checkable
 class BatchDetector(Protocol):
-    """A `KeypointDetector` that is best given up to `batch` frames at once."""
+    """A `KeypointDetector` that is fastest with up to `batch` frames at once."""
 
     batch: int
 
@@ -39,7 +39,7 @@ class BatchDetector(Protocol):
 
 
 class BatchedInference:
-    """As `ParallelInference`, with one detector in one thread. As a context: leaving it drops what has not begun."""
+    """One detector in one thread, with batches of frames. A context manager: leaving it cancels waiting frames."""
 
     def __init__(self, detector: BatchDetector, camera: Camera) -> None:
         self._detector, self._camera = detector, camera
@@ -47,7 +47,7 @@ class BatchedInference:
         self._closed = False
         self._thread = Thread(target=self._work, name="keypoints", daemon=True)
         self._thread.start()
-        #: As many frames are kept under way as if there were so many detectors, so that batches fill.
+        #: Frames are submitted as if to so many detectors, so that batches fill.
         self.n_detectors = detector.batch
 
     def __enter__(self) -> BatchedInference:
@@ -90,7 +90,7 @@ class BatchedInference:
         try:
             images, rois = [i[0].image for i in batch], [i[1] for i in batch]
             found = self._detector.detect_many(images, rois, self._camera, quick=batch[0][2])
-        except BaseException as error:  # noqa: BLE001 - handed to whoever asks for the result
+        except BaseException as error:  # noqa: BLE001 - raised again by `Future.result`
             for item in batch:
                 item[3].set_exception(error)
             return
@@ -98,17 +98,17 @@ class BatchedInference:
             item[3].set_result(person)
 
 
-#: More detectors than this bring little and cost memory.
+#: More detectors than this are hardly faster and take memory.
 _MAX_WORKERS = 8
 
 
 def n_workers() -> int:
-    """Detectors to run side by side: the cores this process may use, at most 8."""
+    """Number of detectors to run in parallel: the cores this process may use, at most 8."""
     return min(cores(), _MAX_WORKERS)
 
 
 class Inference(Protocol):
-    """Runs detectors: `ParallelInference`, or `BatchedInference` for a detector that wants many frames at once."""
+    """Runs detectors: `ParallelInference`, or `BatchedInference` for a detector of many frames at once."""
 
     n_detectors: int
 
@@ -116,14 +116,14 @@ class Inference(Protocol):
 
 
 class ParallelInference:
-    """Detectors at work in threads, one in each. Use as a context: leaving it drops what has not begun."""
+    """Detectors in threads, one in each. A context manager: leaving it cancels frames that are waiting."""
 
     def __init__(self, detectors: Sequence[KeypointDetector], camera: Camera) -> None:
         self._idle: queue.SimpleQueue[Any] = queue.SimpleQueue()
         for detector in detectors:
             self._idle.put(detector)
         self._camera = camera
-        # Asked once: to look through a protocol's members takes as long as cutting a crop.
+        # Once, as checking a protocol's members takes as long as cutting a crop.
         self._by_crop, self._mirrors = (isinstance(detectors[0], kind) for kind in (CropDetector, MirrorDetector))
         self._pool = ThreadPoolExecutor(len(detectors), "keypoints")
         self.n_detectors = len(detectors)
@@ -160,9 +160,9 @@ def two_passes(
 ) -> Iterator[tuple[int, PersonKeypoints]]:
     """Yield the index of each frame, in order, with the keypoints that the second pass found.
 
-    `frames` are those in which the person is, of the video with stamps `time_s` (T,). The first pass is over those of
-    `regions.first`; a frame's region of the second is asked for once all first results up to `regions.reach_s` after
-    it are known. `inspection`: how the second pass inspects a frame.
+    `frames` are those with the person, of the video with stamps `time_s` (T,). The first pass is over those of
+    `regions.first`; the second inspects a frame once all results of the first up to `regions.reach_s` later are known.
+    `inspection`: that of a frame in the second pass.
     """
     last_needed = np.searchsorted(time_s, time_s + regions.reach_s, side="right") - 1
     waiting: collections.deque[Frame] = collections.deque()
@@ -181,7 +181,7 @@ def two_passes(
             early.append((frame.index, inference.submit(frame, regions.track_px[frame.index], Inspection.QUICK)))
         while waiting and last_needed[waiting[0].index] <= frame.index:
             second(waiting.popleft())
-        # So many frames may be under way that no detector waits, and no more: each is held in memory.
+        # Just enough frames that no detector waits, as each is held in memory.
         while len(late) > 2 * inference.n_detectors:
             index, future = late.popleft()
             yield index, future.result()

@@ -1,8 +1,8 @@
-"""How good the picture of the person is: light, contrast and blur, measured in a few frames while they pass by.
+"""Quality of the picture of the person: light, contrast and blur, measured in a few frames while they pass by.
 
-A detector answers in the dark and out of focus as well, only worse, and its confidence falls late. What is measured
-here is measured where the person is, and at the person's own scale: the middle strip of the crop, made `SIDE` pixels
-high. The figures behind the thresholds of the checks are in docs/confidence.md.
+A detector returns points also in the dark and out of focus, but worse ones, and its confidence falls late. The picture
+is measured at the person's position and scale: the middle strip of the crop, scaled to `SIDE` pixels high.
+docs/confidence.md explains the thresholds of the checks.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers
 from pbl_pipeline.video import Frame
 
-#: Height (px) of the crop in which the picture is measured: about what the landmark networks see.
+#: Height (px) of the crop in which the picture is measured: about that of the landmark networks.
 SIDE = 256
-#: Fraction of the crop's width that is looked at: the body and not what is beside it.
+#: Fraction of the crop's width that is measured: the body without its surroundings.
 STRIP = 0.4
-#: Of the Gaussian (px of the crop) that takes out the sensor's noise before the blur is measured.
+#: Standard deviation of the Gaussian (px of the crop) that removes the sensor's noise before the blur is measured.
 _CALM_SD = 1.0
+#: Interval of the measured frames (s).
+_EVERY_S = 0.5
 _LEAST_PX = 8
 
 
@@ -38,7 +40,7 @@ class Picture:
     detail: np.ndarray
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The fields of `keypoints.npz`."""
+        """Fields of `keypoints.npz`."""
         return {
             "picture_time_s": np.asarray(self.time_s, np.float64),
             "picture_luma": np.asarray(self.luma, np.float32),
@@ -47,7 +49,7 @@ class Picture:
 
     @classmethod
     def from_arrays(cls, path: str | Path, data: Mapping[str, np.ndarray]) -> Picture | None:
-        """From the fields of a file; None where it has none. Raises `PblError` FILE_FORMAT."""
+        """Read the fields of a file; None if it has none. Raises `PblError` FILE_FORMAT."""
         if "picture_time_s" not in data:
             return None
         n = data["picture_time_s"].size
@@ -77,21 +79,15 @@ class Picture:
 
 
 class PictureMeter:
-    """Measures one frame in each `every_s` seconds.
+    """Measures one frame in each `_EVERY_S` seconds, of those that pass through `watch`."""
 
-    `watch` stands between the video and whoever looks at its frames: it hands every frame on and converts only those
-    that it measures.
-    """
-
-    def __init__(self, every_s: float = 0.5) -> None:
-        self._every_s = every_s
+    def __init__(self) -> None:
         self._next_s = -math.inf
         self._rows: list[tuple[float, np.ndarray, float]] = []
 
     def watch(self, frames: Iterable[Frame], roi_px: np.ndarray) -> Iterator[Frame]:
-        """The frames as they come; `roi_px` (T, 4) is the region of interest of each frame of the video, or NaN."""
+        """Yield all frames, and measure some; `roi_px` (T, 4) is the region of interest of each frame, or NaN."""
         for frame in frames:
-            # A clock that was set back (`time_s` from another video) only measures more.
             if frame.time_s >= self._next_s and np.isfinite(roi_px[frame.index]).all():
                 self.add(frame.time_s, frame.image, roi_px[frame.index])
             yield frame
@@ -101,11 +97,11 @@ class PictureMeter:
         strip = _strip(image, roi_px)
         if strip is None:
             return
-        self._next_s = time_s + self._every_s
+        self._next_s = time_s + _EVERY_S
         self._rows.append((time_s, np.percentile(strip, (5, 50, 95)), detail_of(strip)))
 
     def result(self) -> Picture:
-        """What was measured so far."""
+        """Return the measures so far."""
         if not self._rows:
             return Picture(np.zeros(0), np.zeros((0, 3)), np.zeros(0))
         time, luma, detail = zip(*self._rows, strict=True)
@@ -115,9 +111,8 @@ class PictureMeter:
 def detail_of(strip: np.ndarray) -> float:
     """Length of the finest detail of a grey picture (H, W) whose height is the person's size, as a fraction of it.
 
-    sqrt(variance / variance of the step between neighbouring pixels), along the axis where it is longer: a picture
-    that is blurred along one axis, as by movement, is a blurred one. Brightness and contrast do not count. NaN for a
-    flat picture.
+    sqrt(variance / variance of the step between neighbouring pixels), along the axis with the longer detail, because
+    movement blurs along one axis. Independent of brightness and contrast. NaN for a flat picture.
     """
     calm = cv2.GaussianBlur(strip.astype(np.float32), (0, 0), _CALM_SD)
     steps = min(float(np.var(np.diff(calm, axis=0))), float(np.var(np.diff(calm, axis=1))))
@@ -126,7 +121,7 @@ def detail_of(strip: np.ndarray) -> float:
 
 
 def _strip(image: np.ndarray, roi_px: np.ndarray) -> np.ndarray | None:
-    """The grey strip (<= SIDE, W) uint8 of the person; None where hardly anything of it is in the picture."""
+    """Grey strip (<= SIDE, W) uint8 of the person; None if hardly anything of it is in the picture."""
     x, y, side, _ = (float(v) for v in roi_px)
     height, width = image.shape[:2]
     x0, x1 = max(0, round(x - STRIP * side / 2)), min(width, round(x + STRIP * side / 2))

@@ -1,22 +1,18 @@
-"""Checks of the keypoints of one trial, and the confidence that a method states of them.
+"""Checks of the keypoints of one trial, and calibration of their confidence.
 
-A body from the front and the same from behind, with the sides exchanged, give nearly one outline. Where the face tells
-nothing (pixelated for privacy, against the light) a network may answer with either, and change its mind within a trial.
-Which of the two is right cannot be told from the movement alone: the sequence that moves least may be the wrong one
-throughout. So such a trial is reported, not repaired.
+A body seen from the front and one seen from behind, with the sides exchanged, have nearly the same outline. If the face
+is not visible (pixelated for privacy, against the light) a network may return either, and change within a trial. The
+movement alone does not show which is right: the sequence that moves least may be wrong throughout. So such a trial is
+reported, not repaired.
 
-The thresholds of the picture were set where the detector begins to fall behind what it saw in the clean picture, on
-recordings that were darkened, blurred and shrunk (docs/confidence.md).
+The thresholds of the picture are where the detector begins to get worse than in the original picture, on recordings
+that were darkened, blurred and reduced (docs/confidence.md).
 
-Calibration of a detector's confidence: curves from the stated value to the probability that a point is right.
-
-A stated confidence is a number between 0 and 1 in a scale of the detector's own. A curve turns it into the probability
-that the point lies within a stated bound of the true one in the picture. Curves are data with a name and a version
-(`data/confidence_curves.json`, made by `python -m research.confidence`) and never change: another
-fit is another version, and its name stands in the parameters of the keypoint method.
-
-The stated confidence stays what the fit weighs with (docs/confidence.md says why); the probability is what people are
-shown.
+A stated confidence is a number between 0 and 1 in the detector's scale. A curve maps it to the probability that the
+point lies within a bound of the true one in the picture. Curves are data with a name and a version
+(`data/confidence_curves.json`, made by `python -m research.confidence`) and never change: another fit is another
+version, and its name is a parameter of the keypoint method. Fits are weighted with the stated confidence
+(docs/confidence.md explains why); reports show the probability.
 """
 
 from __future__ import annotations
@@ -51,10 +47,9 @@ class ConfidenceCurve:
     #: (K,) knots; linear between them, constant outside.
     stated: np.ndarray
     probability: np.ndarray
-    n: int  # points that it was fitted to
+    n: int  # number of points that it was fitted to
     source: str  # the data that it was fitted to, in words
-    #: The parameters of the detection that gave these confidences (`KeypointParams` less `confidence_curve`).
-    params: dict
+    params: dict  # of the detection with these confidences (`KeypointParams` without `confidence_curve`)
 
     def __call__(self, confidence: np.ndarray) -> np.ndarray:
         """Return probabilities for stated confidences of any shape; 0 for 0, which means that no point was found."""
@@ -77,7 +72,7 @@ def confidence_curves() -> dict[str, ConfidenceCurve]:
 
 
 def confidence_curve(name: str) -> ConfidenceCurve:
-    """The curve of that name. Raises `PblError` SOLVER_UNKNOWN."""
+    """Return the curve of that name. Raises `PblError` SOLVER_UNKNOWN."""
     curves = confidence_curves()
     if name not in curves:
         raise PblError(
@@ -97,14 +92,14 @@ def probability_within(keypoints: Keypoints) -> np.ndarray | None:
 
 
 def confidence_text(keypoints: Keypoints) -> str:
-    """One sentence for people: how sure the points are, and what that is worth."""
+    """Describe the confidence of the points, and their probability, in one sentence."""
     found = keypoints.confidence > 0
     if not found.any():
         return "no point was found"
     stated = f"median {np.median(keypoints.confidence[found]):.2f} as the detector states it"
     probability = probability_within(keypoints)
     if probability is None:
-        return f"{stated}; what that is worth was not measured"
+        return f"{stated}; its reliability was not measured"
     bound = confidence_curve(keypoints.confidence_curve).bound_trunk
     right = float(np.mean(probability[found]))
     return (
@@ -112,7 +107,7 @@ def confidence_text(keypoints: Keypoints) -> str:
     )
 
 
-#: Seconds in view: about three strides; what a fit needs at least.
+#: Seconds in view: about three strides; least for a fit.
 SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0
 #: Fraction of the frames between the first and the last sight of the person in which she is not found.
 ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
@@ -120,34 +115,31 @@ ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
 CUT_WARN, CUT_FAIL = 0.1, 0.5
 #: Head to feet in the picture.
 HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
-#: Brightness (0..255) of the brightest twentieth of the person. In about half of it people are not found any more.
+#: Brightness (0..255) of the brightest twentieth of the person. At about half of it people are no longer found.
 BRIGHT_WARN, BRIGHT_FAIL = 60.0, 15.0
 #: Finest detail as a fraction of the person's size.
 DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
 #: Frames a second.
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
-#: Mean confidence of the legs' points as stated; fraction of them that is right by the bound of the detector's curve.
+#: Mean stated confidence of the legs' points; fraction of them within the bound of the detector's curve.
 LEGS_CONFIDENCE_WARN, LEGS_RIGHT_WARN = 0.6, 0.9
-#: Fraction of the frames in which left and right were exchanged back; where many are, the rest may be the wrong ones.
+#: Fraction of the frames in which left and right were exchanged back; if large, the others may be the wrong ones.
 EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
-#: Nobody turns by this much between neighbouring frames (deg); single frames of noise stay below.
+#: Turn between neighbouring frames (deg) that no person makes; single frames of noise stay below.
 _TURN_DEG = 90.0
 _LONGEST_STEP_S = 0.2
 _LEGS = ("hip", "knee", "ankle", "heel", "foot_index")
 
 
 def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
-    """The checks of one trial, in the order of the chain. Where no frame shows the person: EMPTY, and why if the
-    picture tells.
+    """Check the keypoints of one trial. If no frame shows the person: EMPTY, and the failed checks of the picture.
 
     `frames_seen_s`, `whole_person_s`, `frames_without_person_share`, `feet_cut_share`, `head_cut_share`,
     `body_height_px`, `picture_brightness`, `picture_detail_share`, `frame_rate_hz`, `leg_confidence`,
-    `leg_points_right_share`, `side_changes`, `sides_exchanged_share`. Those that a trial's points or file cannot tell
-    are left out.
+    `leg_points_right_share`, `side_changes`, `sides_exchanged_share`, without those that are not known of a trial.
     """
     seen = keypoints.confidence.max(axis=1) > 0
     if not seen.any():
-        # Where the picture says why, it is said.
         why = [c for c in _picture(keypoints) if c is not None and c.outcome != PASS]
         return (Check("frames_seen_s", EMPTY, 0.0, 1.0, "no frame shows the person"), *why)
     checks = [*_time(keypoints, seen), *_cut(keypoints), *_picture(keypoints), _rate(keypoints.time_s)]
@@ -155,27 +147,27 @@ def check_keypoints(keypoints: Keypoints) -> tuple[Check, ...]:
 
 
 def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
-    """How long the person, and the whole of her, is in view."""
+    """Checks of the time in which the person, and the whole person, is in view."""
     seconds = float(seen.sum()) * step_s(keypoints.time_s)
     shown = visibility(keypoints)
     first, last = np.flatnonzero(seen)[[0, -1]]
     absent = 1.0 - float(np.mean(seen[first : last + 1]))
     return [
-        _low(
+        _limit_check(
             "frames_seen_s",
             seconds,
             SECONDS_WARN,
             0.0,
             "fewer than about three strides are in view: film a longer walk",
         ),
-        _low(
+        _limit_check(
             "whole_person_s",
             shown.counts_s,
             SECONDS_WARN,
             SECONDS_FAIL,
             f"{shown.text()}: keep head and feet in the picture, step back or film a longer walk",
         ),
-        _high(
+        _limit_check(
             "frames_without_person_share",
             absent,
             ABSENT_WARN,
@@ -187,7 +179,7 @@ def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
 
 
 def _cut(keypoints: Keypoints) -> list[Check | None]:
-    """Feet and head beyond the border, and how large the person is."""
+    """Checks of feet and head beyond the border, and of the person's size."""
     width, height = keypoints.image_size_px
     xy = np.nan_to_num(np.asarray(keypoints.xy_px, float), nan=-1.0)
     found = (keypoints.confidence > 0) & np.all((xy >= 0) & (xy <= (width, height)), axis=2)
@@ -201,13 +193,13 @@ def _cut(keypoints: Keypoints) -> list[Check | None]:
     ):
         if points.any() and seen.any():
             cut = at_border & ~found[:, points].all(axis=1)
-            checks.append(_high(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
+            checks.append(_limit_check(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
     whole = found[:, feet].any(axis=1) & found[:, head].any(axis=1)
     if whole.any():
         points = np.where(found[whole][..., None], xy[whole], np.nan)
         extent = np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
         checks.append(
-            _low(
+            _limit_check(
                 "body_height_px",
                 float(np.median(extent.max(axis=1))),
                 HEIGHT_WARN_PX,
@@ -223,23 +215,21 @@ def _picture(keypoints: Keypoints) -> list[Check | None]:
     picture = keypoints.picture
     if picture is None or not len(picture.time_s):
         return []
-    blurred = (
-        "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
-    )
     return [
-        _low(
+        _limit_check(
             "picture_brightness",
             picture.bright,
             BRIGHT_WARN,
             BRIGHT_FAIL,
             "the person is too dark: switch lights on, and do not film against a window",
         ),
-        _high(
+        _limit_check(
             "picture_detail_share",
             picture.detail_share,
             DETAIL_WARN,
             DETAIL_FAIL,
-            blurred + "the lens, and let it focus on the person",
+            "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
+            "the lens, and let it focus on the person",
         ),
     ]
 
@@ -250,21 +240,21 @@ def _rate(time_s: np.ndarray) -> Check | None:
         return None
     rate = 1.0 / interval_s
     advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
-    return _low("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
+    return _limit_check("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
 
 
 def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
-    """How sure the points of the legs are, as stated and, where it is known, what that is worth."""
+    """Checks of the stated confidence of the legs' points and, if known, of their probability."""
     legs = [i for i, n in enumerate(keypoints.names) if n.startswith(("left_", "right_")) and n.endswith(_LEGS)]
     if not legs:
         return []
     advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
     mean = float(keypoints.confidence[seen][:, legs].mean())
-    found = [_low("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
+    found = [_limit_check("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
     probability = probability_within(keypoints)
     if probability is not None:
         fraction = float(probability[seen][:, legs].mean())
-        found.append(_low("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
+        found.append(_limit_check("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
     return found
 
 
@@ -273,20 +263,20 @@ def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
         return []
     changes = float(len(side_changes(keypoints)))
     advice = "left and right change places between frames: look at the overlay; film from the side"
-    found = [_high("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    found = [_limit_check("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
     if keypoints.sides_changed is not None:
         fraction = float(keypoints.sides_changed[seen].any(axis=1).mean())
         advice = (
             "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
             "the movement now: look at the overlay, film in better light or more from the side"
         )
-        found.append(_high("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+        found.append(_limit_check("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
     return found
 
 
 def side_changes(keypoints: Keypoints) -> np.ndarray:
     """Frames (K,) at which the axis from left to right hip has turned by more than 90 degrees since the last one seen
-    (at most 0.2 s ago): there the sides were exchanged."""
+    (at most 0.2 s before), so that the sides were exchanged."""
     axis = (
         keypoints.xyz_cam_m[:, keypoints.names.index("right_hip")]
         - keypoints.xyz_cam_m[:, keypoints.names.index("left_hip")]
@@ -297,17 +287,10 @@ def side_changes(keypoints: Keypoints) -> np.ndarray:
     return rows[1:][turned & (np.diff(keypoints.time_s[rows]) <= _LONGEST_STEP_S)]
 
 
-def _low(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
-    """A value that should be high; None where it is not known."""
+def _limit_check(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
+    """Check of a value that should be high (`warn` above `fail`) or low (`warn` below it); None if it is not known."""
     if not np.isfinite(value):
         return None
-    outcome = FAIL if value < fail else WARN if value < warn else PASS
-    return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)
-
-
-def _high(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
-    """A value that should be low; None where it is not known."""
-    if not np.isfinite(value):
-        return None
-    outcome = FAIL if value > fail else WARN if value > warn else PASS
+    sign = 1.0 if warn > fail else -1.0
+    outcome = FAIL if sign * value < sign * fail else WARN if sign * value < sign * warn else PASS
     return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)

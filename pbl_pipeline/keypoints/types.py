@@ -1,4 +1,4 @@
-"""Keypoints of one person in one trial: the data of `keypoints.npz`, validated at the door."""
+"""Keypoints of one person in one trial: the data of `keypoints.npz`, validated."""
 
 from __future__ import annotations
 
@@ -33,21 +33,16 @@ _format_error = functools.partial(PblError, "FILE_FORMAT", next_step="see docs/f
 
 @dataclasses.dataclass(frozen=True)
 class PersonKeypoints:
-    """One person in one frame.
+    """One person in one frame."""
 
-    xy_px (J, 2) in the upright, distorted picture; xyz_cam_m (J, 3) camera frame (x right, y down, z forward);
-    confidence (J,) in 0..1; presence: how sure the detector is that the crop shows a person at all, 0..1;
-    roi_px (4,) centre x, centre y, side, rotation of the region as these keypoints show it (NaN: not known),
-    a better crop for the same frame than the one they were found in; crop_px: longer side of the crop that
-    the network saw, in pixels of the picture (NaN: not stated).
-    """
-
-    xy_px: np.ndarray
-    xyz_cam_m: np.ndarray
-    confidence: np.ndarray
-    presence: float
+    xy_px: np.ndarray  # (J, 2) in the upright, distorted picture
+    xyz_cam_m: np.ndarray  # (J, 3) camera frame (x right, y down, z forward)
+    confidence: np.ndarray  # (J,) 0 to 1
+    presence: float  # confidence that the crop shows a person at all, 0 to 1
+    # (4,) centre x, centre y, side, rotation of the region by these keypoints, which is better than the one they were
+    # found in; NaN if not known.
     roi_px: np.ndarray
-    crop_px: float = float("nan")
+    crop_px: float = float("nan")  # longer side of the crop, in pixels of the picture; NaN if not stated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,25 +62,20 @@ class Keypoints:
     image_size_px: tuple[int, int]  # (width, height)
     camera: Camera
     box_px: np.ndarray  # (T, 4) x0, y0, x1, y1 of the person
-    #: (P,), (P, 4) or None: phone orientation, camera to world, at its own stamps: both or neither. Brought to unit
-    #: length, without jumps of sign, when made (`check_attitude`); how much of the recording it covers is for the fit
-    #: to judge.
+    #: (P,), (P, 4) phone orientation, camera to world, at its own stamps; both or neither is None. Validated, of unit
+    #: length and without jumps of sign (`check_attitude`); the fit judges whether it covers the recording.
     phone_time_s: np.ndarray | None = None
     phone_quat_wxyz: np.ndarray | None = None
     phone_clock_sd_s: float = math.nan  # as in `Attitude`
-    #: Name of the curve (`confidence_curve`) that says what this is worth; empty where none is known.
-    confidence_curve: str = ""
-    picture: Picture | None = None  # how light and sharp the picture of the person is, or None where no video was seen
-    #: Which detector and model made them, under which licence and on what; empty where it is not stated.
-    origin: str = ""
-    #: (T, 3) bool or None: frames in which left and right of the legs, and of the rest of the body, are not as the
-    #: detector said but were exchanged, and those in which its body has no width, so that the sides cannot be told;
-    #: None: not checked.
+    confidence_curve: str = ""  # name of the `ConfidenceCurve` of this confidence, "" if there is none
+    picture: Picture | None = None  # light and sharpness of the picture of the person, None without a video
+    origin: str = ""  # detector, model, licence and device; "" if not stated
+    #: (T, 3) bool: frames in which left and right of the legs, and of the rest of the body, were exchanged, and those
+    #: in which the detected body has no width, so that the sides cannot be distinguished; None: not checked.
     sides_changed: np.ndarray | None = None
-    #: (T,) or None: longer side of the crop that the detector saw, in pixels of the picture. NaN where nothing was
-    #: seen; None where it was not stated.
+    #: (T,) longer side of the crop, in pixels of the picture, NaN where nothing was seen; None if not stated.
     crop_px: np.ndarray | None = None
-    assumed: tuple[str, ...] = ()  # fields that the file did not have, for which a default stands (`load`)
+    assumed: tuple[str, ...] = ()  # fields that the file did not have, and that have a default (`load`)
 
     def __post_init__(self) -> None:
         n, j = len(self.time_s), len(self.names)
@@ -110,7 +100,7 @@ class Keypoints:
         if np.any(~np.isfinite(self.confidence)) or np.any(self.confidence < 0) or np.any(self.confidence > 1):
             raise _format_error("confidence outside 0..1 or not finite", "0 for a missing point, at most 1")
         if self.crop_px is not None and np.any(np.asarray(self.crop_px) <= 0):
-            raise _format_error("a crop of no size", "crop_px above 0, or NaN where it is not stated")
+            raise _format_error("a crop of size 0 or below", "crop_px above 0, or NaN where it is not stated")
         check_lens(self.camera.matrix, self.camera.distortion, self.image_size_px)
         self._check_phone()
 
@@ -131,7 +121,7 @@ class Keypoints:
         object.__setattr__(self, "phone_quat_wxyz", quat_wxyz)
 
     def with_attitude(self, attitude: Attitude) -> Keypoints:
-        """The same keypoints with the phone's orientation."""
+        """Return the same keypoints with the phone's orientation."""
         return dataclasses.replace(
             self,
             phone_time_s=attitude.time_s,
@@ -141,23 +131,17 @@ class Keypoints:
 
     def save(self, path: str | Path) -> None:
         """Write `keypoints.npz` (the fields of docs/files.md)."""
-        optional: dict[str, Any] = {}
-        if self.phone_time_s is not None and self.phone_quat_wxyz is not None:
-            optional = {"phone_time_s": self.phone_time_s, "phone_quat_wxyz": self.phone_quat_wxyz}
-        if np.isfinite(self.phone_clock_sd_s):
-            optional["phone_clock_sd_s"] = np.asarray(self.phone_clock_sd_s, np.float64)
-        if np.isfinite(self.camera.focal_rel_sd):
-            optional["focal_rel_sd"] = np.asarray(self.camera.focal_rel_sd, np.float64)
-        if self.confidence_curve:
-            optional["confidence_curve"] = np.asarray(self.confidence_curve)
-        if self.origin:
-            optional["origin"] = np.asarray(self.origin)
-        if self.sides_changed is not None:
-            optional["sides_changed"] = np.asarray(self.sides_changed, bool)
-        if self.crop_px is not None:
-            optional["crop_px"] = np.asarray(self.crop_px, np.float32)
-        if self.picture is not None:
-            optional |= self.picture.arrays()
+        optional: dict[str, Any] = {
+            "phone_time_s": self.phone_time_s,
+            "phone_quat_wxyz": self.phone_quat_wxyz,
+            "phone_clock_sd_s": self.phone_clock_sd_s if np.isfinite(self.phone_clock_sd_s) else None,
+            "focal_rel_sd": self.camera.focal_rel_sd if np.isfinite(self.camera.focal_rel_sd) else None,
+            "confidence_curve": self.confidence_curve or None,
+            "origin": self.origin or None,
+            "sides_changed": None if self.sides_changed is None else np.asarray(self.sides_changed, bool),
+            "crop_px": None if self.crop_px is None else np.asarray(self.crop_px, np.float32),
+            **(self.picture.arrays() if self.picture is not None else {}),
+        }
         np.savez(  # not packed, see `TrialFit.save`
             path,
             time_s=np.asarray(self.time_s, np.float64),
@@ -172,15 +156,15 @@ class Keypoints:
             distortion=np.asarray(self.camera.distortion, np.float64),
             camera_source=np.asarray(self.camera.source),
             box_px=np.asarray(self.box_px, np.float32),
-            **optional,
+            **{name: value for name, value in optional.items() if value is not None},
         )
 
     @classmethod
     def load(cls, path: str | Path) -> Keypoints:
         """Read `keypoints.npz`; never unpickles.
 
-        Files of other programs may lack the fields of `_ASSUMED`: no distortion, a camera whose source is not stated,
-        and the box around the points that were seen, stand for them, and `assumed` names them.
+        Files of other programs may lack the fields of `_ASSUMED`, whose defaults are no distortion, a camera of unknown
+        source, and the box around the points that were seen; `assumed` names them.
 
         Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID, PHONE_LOG.
         """
@@ -192,16 +176,9 @@ class Keypoints:
         n, j = data["time_s"].size, data["names"].size
         arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j)}
         arrays |= {"image_size_px": (2,), "camera_matrix": (3, 3), "root_relative": ()}
-        arrays |= {k: s for k, s in {"distortion": (5,), "box_px": (n, 4)}.items() if k in data}
-        if "focal_rel_sd" in data:
-            arrays["focal_rel_sd"] = ()
-        if "phone_clock_sd_s" in data:
-            arrays["phone_clock_sd_s"] = ()
-        if "sides_changed" in data:
-            arrays["sides_changed"] = (n, 3)
-        if "crop_px" in data:
-            arrays["crop_px"] = (n,)
-        check_numbers(path, data, arrays)
+        optional = {"distortion": (5,), "box_px": (n, 4), "focal_rel_sd": (), "phone_clock_sd_s": ()}
+        optional |= {"sides_changed": (n, 3), "crop_px": (n,)}
+        check_numbers(path, data, arrays | {k: shape for k, shape in optional.items() if k in data})
         rel_sd = float(data.get("focal_rel_sd", np.nan))
         distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
         if "camera_source" in data:
@@ -231,7 +208,7 @@ class Keypoints:
 
 
 def _box(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-    """(T, 4) x0, y0, x1, y1 around the points of each frame that were seen, NaN where none was."""
+    """(T, 4) x0, y0, x1, y1 around the points seen in each frame, NaN without any."""
     seen = (confidence > 0)[..., None] & np.isfinite(xy_px)
     low, high = (np.where(seen, xy_px, fill).astype(float) for fill in (np.inf, -np.inf))
     box = np.concatenate([low.min(axis=1, initial=np.inf), high.max(axis=1, initial=-np.inf)], axis=1)
@@ -243,8 +220,8 @@ def _there(value: object) -> str:
 
 
 def log_shift_s(log: PhoneLog, keypoints: Keypoints | None, path: str) -> float:
-    """Return what added to the log's times gives the video's (s): known where the keypoints hold the log, which was
-    brought to the video's clock when they were made, or where the log uses that clock.
+    """Return the shift from the log's times to the video's (s): known if the keypoints hold the log, which was brought
+    to the video's clock when they were made, or if the log uses that clock.
 
     Raises `PblError` PHONE_LOG.
     """
@@ -258,8 +235,7 @@ def log_shift_s(log: PhoneLog, keypoints: Keypoints | None, path: str) -> float:
     raise PblError(
         "PHONE_LOG",
         found="a log whose clock against the video's is not known",
-        expected="the log that the keypoints beside the fit were made with (--attitude of `pbl detect`), or one on the "
-        "video's clock",
+        expected="the log that the keypoints were made with (--attitude of `pbl detect`), or one on the video's clock",
         next_step="pass that log, or leave --attitude out",
         key=path,
     )

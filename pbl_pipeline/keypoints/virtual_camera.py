@@ -1,21 +1,18 @@
-"""Perspective-correct crops: what a camera at the same place would see that looks straight at the person.
+"""Perspective-correct crops: the picture of a camera at the same position that looks straight at the person.
 
-A crop that is only cut out of the picture shows a person at the edge turned and stretched, and a lens bends her. The
-virtual camera stands where the real one does, is turned so that the middle of the crop lies on its optical axis, may be
-rolled and mirrored, and has no distortion. The way back is exact: a pixel of the crop is a ray, a ray is a pixel of the
-picture; 3D points are turned back.
+A crop that is only cut out of the picture shows a person at the edge turned and stretched, and distorted by the lens.
+The virtual camera is at the position of the real one, turned so that the middle of the crop is on its optical axis, may
+be rolled and mirrored, and has no distortion. The mapping back is exact: a pixel of the crop is a ray, a ray is a pixel
+of the picture; 3D points are turned back.
 
-Test-time augmentations: the crop shown several times, a little other each time, and what is made of the answers.
+Test-time augmentations show the crop several times, slightly changed. Scale, rotation and gamma are those of MeTRAbs
+(Sarandi et al. 2023, WACV, and its published PyTorch code), so that the spread of its results is the one for which the
+paper states its confidence.
 
-Figures of scale, rotation and gamma as MeTRAbs uses them (Sarandi et al. 2023, WACV, and its published PyTorch code),
-so that the spread of its answers is the one for which the paper states its confidence.
-
-From the axes of a picture's crop to the camera frame.
-
-A network that sees a crop does not know where in the picture it was cut. Except for a slight stretch, the crop is
-the picture of a camera that looks straight at the crop's centre and is rolled with the crop. Its 3D points stand in
-that virtual camera's frame. A person at the edge of a wide picture is seen at up to 30 degrees from the optical axis,
-and without this rotation would seem to turn while she walks straight on.
+A network does not know the position of a crop in the picture. Except for a slight stretch, the crop is the picture of a
+camera that looks straight at its centre and is rolled with it, and the 3D points are in that camera's frame. A person
+at the edge of a wide picture is seen at up to 30 degrees from the optical axis, and without this rotation would seem to
+turn while she walks straight on.
 """
 
 from __future__ import annotations
@@ -53,11 +50,11 @@ def view_rotation(roi_px: np.ndarray, camera: Camera) -> np.ndarray:
     z = ray / np.linalg.norm(ray)
     y = (below - ray) - z * (z @ (below - ray))
     y /= np.linalg.norm(y)
-    x = y[[1, 2, 0]] * z[[2, 0, 1]] - y[[2, 0, 1]] * z[[1, 2, 0]]  # np.cross takes longer than all else here
+    x = y[[1, 2, 0]] * z[[2, 0, 1]] - y[[2, 0, 1]] * z[[1, 2, 0]]  # np.cross takes longer than the rest of the function
     return np.array([x, y, z]).T
 
 
-#: Rotations up to this to either side (deg); scales and exponents of gamma from and to.
+#: Largest rotation to either side (deg); scales; least and largest exponent of gamma.
 _ROTATION_DEG = 25.0
 _SCALES = (0.8, 1.0, 1.1)
 _GAMMAS = (0.6, 1.0)
@@ -65,7 +62,7 @@ _GAMMAS = (0.6, 1.0)
 
 @dataclasses.dataclass(frozen=True)
 class Augmentation:
-    """`scale` of what is seen, `roll_rad` clockwise, left and right exchanged, exponent `gamma` of values in 0..1."""
+    """Scale of the content, clockwise roll, exchange of left and right, and exponent of values from 0 to 1."""
 
     scale: float = 1.0
     roll_rad: float = 0.0
@@ -74,7 +71,7 @@ class Augmentation:
 
 
 def augmentations(n: int) -> tuple[Augmentation, ...]:
-    """The `n` augmentations, always the same ones; `n` = 1 is the crop as it is, 2 it and its mirror image.
+    """Return `n` fixed augmentations; `n` = 1 is the crop as it is, 2 also its mirror image.
 
     From 3 on: rotations evenly from -25 to 25 deg, scales from 0.8 to 1.1, gamma from 0.6 to 1, every other mirrored.
     """
@@ -101,10 +98,10 @@ def sd_confidence(sigma_mm: np.ndarray, half_mm: float = 30.0, width_mm: float =
 
 
 def aligned(xyz: np.ndarray) -> np.ndarray:
-    """Answers (..., A, J, 3), each moved by the shift that brings it onto the others; axes stay as they are.
+    """Shift each of the results (..., A, J, 3) onto the others, without rotation.
 
-    The network gives a shape, not a place. First the means of all points coincide, then the median deviation from the
-    mean answer goes from each axis, so that a few points that differ do not move the others.
+    The network returns a shape, not a position. First the means of all points are made equal, then the median deviation
+    from the mean result is subtracted on each axis, so that a few outliers do not move the others.
     """
     centred = xyz - xyz.mean(axis=-2, keepdims=True)
     off = centred - centred.mean(axis=-3, keepdims=True)
@@ -112,32 +109,25 @@ def aligned(xyz: np.ndarray) -> np.ndarray:
 
 
 def spread_mm(xyz_m: np.ndarray) -> np.ndarray:
-    """(..., J) standard deviation in mm of aligned answers (..., A, J, 3) in m: the root mean square distance from
-    their mean over the A answers. One answer has none: 0."""
+    """(..., J) standard deviation in mm of aligned results (..., A, J, 3) in m: the root mean square distance from
+    their mean over the A results; 0 for one result."""
     off = xyz_m - xyz_m.mean(axis=-3, keepdims=True)
     return 1000.0 * np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=-2))
 
 
-#: From this many picture pixels per crop pixel on, the picture is averaged before it is sampled.
+#: Picture pixels per crop pixel from which the picture is averaged before it is sampled.
 _SHRINK_FROM = 1.5
-#: Shortest way in the picture (px) over which its scale is measured.
+#: Shortest distance in the picture (px) over which its scale is measured.
 _SHORTEST_PX = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
 class VirtualCamera:
-    """A crop's camera. Coordinates of the crop count from the centre of its first pixel.
+    """A crop's camera. Coordinates of the crop count from the centre of its first pixel."""
 
-    matrix : (3, 3)
-        Intrinsics, principal point in the middle of the crop.
-    turn : (3, 3)
-        x_crop = turn @ x_cam: a rotation, or with `mirrored` one followed by a reflection in x.
-    size_px : (width, height)
-    """
-
-    matrix: np.ndarray
-    turn: np.ndarray
-    size_px: tuple[int, int]
+    matrix: np.ndarray  # (3, 3) intrinsics, principal point in the middle of the crop
+    turn: np.ndarray  # (3, 3) x_crop = turn @ x_cam: a rotation, if `mirrored` followed by a reflection in x
+    size_px: tuple[int, int]  # (width, height)
     mirrored: bool
 
     def rays(self, xy: np.ndarray) -> np.ndarray:
@@ -166,10 +156,10 @@ def look_at(
     roll_rad: float = 0.0,
     mirrored: bool = False,
 ) -> VirtualCamera:
-    """The virtual camera of a region of the picture.
+    """Virtual camera of a region of the picture.
 
     `roi_px` (4,) centre x, centre y, side, rotation (rad, clockwise) as in `tracking.Detection`. The region, `margin`
-    times as large, fills the longer side of the crop of `size_px` (width, height); `scale` enlarges what is seen, and
+    times as large, fills the longer side of the crop of `size_px` (width, height); `scale` enlarges the content, and
     `roll_rad` turns it clockwise in the crop.
     """
     width, height = size_px
@@ -184,10 +174,10 @@ def look_at(
 
 
 def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> np.ndarray:
-    """(N, height, width, 3) uint8: the picture (H, W, 3) as each of the virtual cameras, all of one size, sees it.
+    """(N, height, width, 3) uint8: the picture (H, W, 3) seen by the virtual cameras, which have one size.
 
-    Black beyond the picture, and where the lens model has no answer. A picture that is shown smaller than it is, is
-    averaged first, so that fine patterns do not flicker.
+    Black beyond the picture and beyond the validity of the lens model. A picture that is reduced is averaged first, so
+    that fine patterns do not flicker.
     """
     width, height = views[0].size_px
     matrix, distortion = _lens(camera)
@@ -210,15 +200,12 @@ def crops(image: np.ndarray, views: Sequence[VirtualCamera], camera: Camera) -> 
 
 
 def _lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and distortion as OpenCV wants them."""
+    """Matrix and distortion in OpenCV's type."""
     return np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
 
 
 def _per_pixel(roi_px: np.ndarray, camera: Camera) -> float:
-    """How much a step of one pixel along the region's down axis is at its middle, on the virtual camera's plane z = 1.
-
-    Measured over what of the region lies in the picture's angle: far outside a lens model means nothing.
-    """
+    """Length on the virtual camera's plane z = 1 of one pixel along the region's down axis, at its middle."""
     centre, down = roi_px[:2], np.array([-np.sin(roi_px[3]), np.cos(roi_px[3])])
     half = max(float(roi_px[2]) / 8, _SHORTEST_PX)
     ends = np.stack([centre - half * down, centre + half * down])
@@ -247,14 +234,14 @@ def _step(view: VirtualCamera, camera: Camera) -> float:
 
 
 def _factor(step: float) -> int:
-    """Whole pixels of the picture that become one before the crop is sampled."""
+    """Number of pixels of the picture that are averaged into one before the crop is sampled."""
     return round(step) if step >= _SHRINK_FROM else 1
 
 
 def _shrunk(
     image: np.ndarray, maps: Sequence[tuple[np.ndarray, np.ndarray]], factor: int
 ) -> tuple[np.ndarray, tuple[float, float]]:
-    """The part of the picture that the maps need, `factor` times smaller, and its corner (x, y) in the picture."""
+    """Part of the picture that the maps need, `factor` times smaller, and its corner (x, y) in the picture."""
     if factor == 1:
         return image, (0.0, 0.0)
     height, width = image.shape[:2]
@@ -263,7 +250,7 @@ def _shrunk(
         min(int(max(np.max(m[k], initial=0, where=m[k] > -1e5) for m in maps)) + 2 * factor, n)
         for k, n in ((0, width), (1, height))
     )
-    # Whole blocks from the corner on; a rim narrower than one is left out.
+    # Whole blocks from the corner on, without a narrower rim.
     w, h = max((x1 - x0) // factor, 1), max((y1 - y0) // factor, 1)
     part = image[y0 : y0 + h * factor, x0 : x0 + w * factor]
     if part.size == 0:

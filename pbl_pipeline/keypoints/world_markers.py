@@ -1,9 +1,8 @@
-"""Markers of a laboratory: points in the world, without a camera.
+"""Markers of a laboratory: points in the world, without a camera, and their TRC files of tab-separated text.
 
-TRC: markers as tab-separated text.
-
-Line 1 names the format, lines 2 and 3 are a table of one row (DataRate, NumFrames, NumMarkers, Units, ...). Line 4
-holds `Frame#`, `Time` and each marker's name over its three columns, line 5 the axes. Then a row for each frame.
+Line 1 of a TRC file names the format, lines 2 and 3 are a table of one row (DataRate, NumFrames, NumMarkers, Units,
+...). Line 4 holds `Frame#`, `Time` and each marker's name over its three columns, line 5 the axes. Then a row for each
+frame.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pbl_pipeline.names import is_plain
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _HEADER_LINES = 5
-#: Spread of the markers of a frame that no room has and no body: the unit is another one than the file says.
+#: Spread of the markers of a frame beyond that of a room, or below that of a body: the stated unit is wrong.
 _WIDEST_M, _NARROWEST_M = 50.0, 0.01
 _format_error = functools.partial(
     PblError, "FILE_FORMAT", next_step="see docs/files.md, section markers of a laboratory"
@@ -30,30 +29,29 @@ _format_error = functools.partial(
 _damaged = functools.partial(
     PblError,
     "FILE_FORMAT",
-    next_step="export it again, tab-separated; docs/files.md, section markers of a laboratory, says what is read",
+    next_step="export it again, tab-separated; docs/files.md, section markers of a laboratory, describes the format",
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Trc:
-    """`time_s` (T,); `names`, J; `xyz_m` (T, J, 3) in the file's own axes, NaN where a cell is empty or a marker's
-    three numbers are 0."""
+    """Content of a TRC file."""
 
-    time_s: np.ndarray
-    names: tuple[str, ...]
-    xyz_m: np.ndarray
+    time_s: np.ndarray  # (T,)
+    names: tuple[str, ...]  # J
+    xyz_m: np.ndarray  # (T, J, 3) in the file's axes, NaN where a cell is empty or a marker's three numbers are 0
 
 
 def read_trc(path: str | Path) -> Trc:
     """Read a TRC file.
 
-    Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: no TRC, other counts of frames or markers than its header
-    says, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
-    other than mm, cm, m, or one that makes the markers lie further apart than 50 m or closer than 1 cm.
+    Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: not a TRC, other numbers of frames or markers than in its
+    header, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
+    other than mm, cm, m, or one by which the markers lie further apart than 50 m or closer than 1 cm.
     """
     with os_errors_as("FILE_MISSING", "a TRC file", "check the path, and that you may read the file", path):
         try:
-            # Only names matter: a path in the first line may be in any encoding.
+            # A path in the first line may be in any encoding.
             lines = read_bytes(path, MAX_TEXT).decode("utf-8-sig", errors="replace").splitlines()
             count_rows(len(lines))
         except ValueError as error:
@@ -202,7 +200,7 @@ class WorldMarkers:
         x stays (OpenSim's forward) and the frame stays right-handed. "z": taken as it is. Empty cells, NaN and three
         zeros, which some programs write into gaps, are missing: NaN with confidence 0; all else has confidence 1.
 
-        Raises `PblError` FILE_MISSING, FILE_FORMAT (also for units that cannot be), USAGE for another `up`.
+        Raises `PblError` FILE_MISSING, FILE_FORMAT (also for impossible units), USAGE for another `up`.
         """
         if up not in ("y", "z"):
             raise PblError(
@@ -222,9 +220,9 @@ class WorldMarkers:
         )
 
     def select(self, names: Sequence[str], marker_set: str | None = None) -> WorldMarkers:
-        """The markers of `names` in that order, as a marker set wants them; one that the trial lacks was never seen.
+        """Return the markers of `names` in that order; those that the trial lacks were never seen.
 
-        `marker_set` renames the set. Raises `PblError` MARKER_SET_UNKNOWN where the trial has none of them.
+        `marker_set` renames the set. Raises `PblError` MARKER_SET_UNKNOWN if the trial has none of them.
         """
         column = {name: i for i, name in enumerate(self.names)}
         there = [i for i, name in enumerate(names) if name in column]
@@ -244,7 +242,7 @@ class WorldMarkers:
 
 
 def _about(path: str | Path, *values) -> WorldMarkers:
-    """Markers from a file; an error names the file."""
+    """Markers from a file, with its path in errors."""
     try:
         return WorldMarkers(*values)
     except PblError as error:

@@ -1,6 +1,6 @@
 """Ground reactions, joint moments and powers from the fitted motion, with their error (docs/kinetics.md)."""
 
-from .compute import REASONS, TOO_UNCERTAIN, trial_kinetics, visit_kinetics
+from .compute import REASONS, TOO_UNCERTAIN, visit_kinetics
 from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
 from .ground import GroundReaction, contact_of, ground_reaction
 from .inertia import Inertia, segment_inertia

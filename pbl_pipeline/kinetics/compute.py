@@ -34,9 +34,9 @@ from .types import (
 )
 from .vertical import VerticalModel, dimensionless_speed, load_vertical_model, vertical_force
 
-#: What the method itself gets wrong of a measure of one leg (root mean square), from force plates: the tuning children
-#: of `python -m research.benchmarks.kinetics`, each with courses that were fitted to the other children. Their motion
-#: is known from markers, so what such a fit gets wrong in all frames is in it.
+#: Error of the method in a measure of one leg (root mean square), from force plates: the tuning children of
+#: `python -m research.benchmarks.kinetics`, each with courses that were fitted to the other children. Their motion is
+#: known from markers, so it includes errors of such a fit that are constant over all frames.
 METHOD_SD: Mapping[str, float] = {
     "vertical_peak_loading_bw": 0.053,
     "vertical_peak_push_off_bw": 0.032,
@@ -51,7 +51,7 @@ METHOD_SD: Mapping[str, float] = {
     "ankle_work_j_per_kg": 0.098,
     "centre_of_mass_excursion_m": 0.002,
 }
-#: By marker set, what the fit of one camera gets wrong of a measure on both sides alike, beyond the varying error that
+#: By marker set, error of the fit of one camera in a measure that is equal on both sides, beyond the varying error that
 #: is drawn (root mean square over recorded walks of the tuning persons, each from three sides:
 #: `python -m research.benchmarks.kinetics_phone`). Of another marker set the larger one of 33 points.
 ONE_CAMERA_SD: Mapping[str, Mapping[str, float]] = {
@@ -103,7 +103,7 @@ HEALTHY_SD: Mapping[str, float] = {
 }
 #: Half of the range of healthy people in which 95 % of them lie, in their standard deviations.
 HEALTHY_RANGE = 1.96
-#: Why a measure is absent whose 90 % interval is wider than that range: it cannot tell a patient from a healthy person.
+#: Reason for a missing measure whose 90 % interval is wider than that range and cannot show that a person is a patient.
 TOO_UNCERTAIN = "its 90 % interval is wider than the range of healthy people"
 #: Reasons for missing forces, by code.
 REASONS = {
@@ -132,10 +132,10 @@ def visit_kinetics(
     mass_kg: float | None = None,
     aid: str = "",
 ) -> Kinetics:
-    """Return the kinetics of a visit's trials, `gait` being what was measured of each of `fits`.
+    """Return the kinetics of a visit's trials; `gait`: the measures of each of `fits`.
 
-    `mass_kg`: the person's mass, kept with the result. `aid`: the walking aid as it was stated; with one that may carry
-    weight there are no forces.
+    `mass_kg`: the person's mass, stored with the result. `aid`: the stated walking aid; with one that may carry weight
+    forces are not computed.
     """
     trials = tuple(trial_kinetics(f, g, method.params, aid=aid) for f, g in zip(fits, gait, strict=True))
     pooled = [t for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None]
@@ -214,7 +214,7 @@ def trial_series(
     params: KineticsParams,
     rng: np.random.Generator | None = None,
 ) -> Series | None:
-    """Return forces and moments over time of a trial's motion `qpos` (T, Q); None where no stretch is long enough. With
+    """Return forces and moments over time of a trial's motion `qpos` (T, Q); None if no stretch is long enough. With
     `rng` the vertical force is drawn from its posterior, else it is the mean."""
     parts = []
     for motion in smooth_motion(fit.time_s, qpos, params.cutoff_hz):

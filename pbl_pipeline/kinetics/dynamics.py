@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import mujoco
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body
+from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body, scaled_model
 from pbl_pipeline.gait.events.signal import uniform_segments
 
 from .inertia import Inertia
@@ -38,26 +37,20 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """Forces that a motion needs, per kilogram of the person, at N times; world frame, z up.
+    """Forces of a motion, per kilogram of the person, at N times; world frame, z up."""
 
-    force_n, moment_nm (N, 3): of everything outside the body, gravity excepted; the moment is about the world's origin
-    (N/kg, Nm/kg). centre_m (N, 3): of mass. generalised (N, Q): what each joint value would need if
-    that force acted on the pelvis (Nm/kg, N/kg). axis, anchor_m (N, Q, 3): of each joint. xpos (N, B, 3), xmat (N, B,
-    3, 3).
-    """
-
-    force_n: np.ndarray
-    moment_nm: np.ndarray
-    centre_m: np.ndarray
-    generalised: np.ndarray
-    axis: np.ndarray
-    anchor_m: np.ndarray
-    xpos: np.ndarray
-    xmat: np.ndarray
+    force_n: np.ndarray  # (N, 3) external force without gravity, N/kg
+    moment_nm: np.ndarray  # (N, 3) its moment about the world's origin, Nm/kg
+    centre_m: np.ndarray  # (N, 3) centre of mass
+    generalised: np.ndarray  # (N, Q) generalised forces if that force acted on the pelvis, Nm/kg and N/kg
+    axis: np.ndarray  # (N, Q, 3) of each joint
+    anchor_m: np.ndarray  # (N, Q, 3) of each joint
+    xpos: np.ndarray  # (N, B, 3)
+    xmat: np.ndarray  # (N, B, 3, 3)
 
 
 def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz: float) -> list[Motion]:
-    """Return the motion with its derivatives, one for each stretch without long gaps; none where all are too short.
+    """Return the motion with its derivatives, one for each stretch without long gaps; none if all are too short.
 
     Joint values are put on a grid of `GRID_HZ` and low-passed there and back (`uniform_segments`, order 4, -3 dB at
     `cutoff_hz`); the derivatives are those of the quintic spline through the result. `time_s` (T,); rows of `qpos` that
@@ -82,7 +75,7 @@ def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz:
 
 def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inertia, motion: Motion) -> Dynamics:
     """Return the force that a motion needs (`mj_inverse` in each frame, without contacts and joint limits)."""
-    model = _dynamic_model(body, np.asarray(scale, np.float64), inertia)
+    model = _dynamic_model(body, scale, inertia)
     data = mujoco.MjData(model)
     n, q, b = len(motion.time_s), model.nv, model.nbody - 1
     generalised, axis, anchor = np.empty((n, q)), np.empty((n, q, 3)), np.empty((n, q, 3))
@@ -96,7 +89,7 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
         xpos[i], xmat[i] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
     slides = [body.joint_names.index(name) for name in SLIDES]
     turns = [body.joint_names.index(name) for name in PELVIS_TURNS]
-    # Along each slide acts the force's share, about each turn that of the moment about the pelvis.
+    # The generalised forces are projections: of the force on each slide, of the moment about the pelvis on each turn.
     force = np.linalg.solve(axis[:, slides], generalised[:, slides, None])[..., 0]
     about = np.linalg.solve(axis[:, turns], generalised[:, turns, None])[..., 0]
     moment = about + np.cross(xpos[:, 0], force)
@@ -105,9 +98,7 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
 
 def _dynamic_model(body: Body, scale: np.ndarray, inertia: Inertia) -> mujoco.MjModel:
     """Return the scaled body with its inertia, free of contacts and joint limits."""
-    own = scale[body.scale_index]
-    model = copy.copy(body.mj_model)
-    model.body_pos[2:] *= own[body.parent_index[1:], None]
+    model = scaled_model(body, scale)
     model.body_mass[1:], model.body_ipos[1:], model.body_inertia[1:] = (
         inertia.mass,
         inertia.centre_m,

@@ -1,19 +1,19 @@
-"""Each foot's share of the ground reaction, and where it acts.
+"""Ground reaction of each foot, and its point of application.
 
-The motion tells the vertical force of both feet together well. Its second derivatives tell the horizontal force
-less well and the moment badly, so that the centre of pressure of one foot would be off by 5 cm. Three things that are
-known of walking tell more, each measured on force plates (`python -m research.benchmarks.kinetics`):
+The motion determines the vertical force of both feet together well. Its second derivatives determine the horizontal
+force less well and the moment poorly, so that the centre of pressure of one foot would be off by 5 cm. Three properties
+of walking, each measured on force plates (`python -m research.benchmarks.kinetics`), add information:
 
-- the centre of pressure goes from heel to toes in a usual way over the time that the foot stands (`PROGRESS`), and lies
-  under the forefoot where the heel is off the floor;
-- each force points from there nearly at the centre of mass: past it by what turns the body. The centre of mass is moved
-  by a constant of the recording, so that the horizontal forces have the mean that the change of velocity asks for;
-- while both feet stand, the vertical force of the one behind falls as `trailing_share` (from the motion alone it cannot
-  be told: two feet and the body are a closed loop), and a foot that has just landed does not yet push backwards
+- the centre of pressure moves from heel to toes in a typical way over the stance of a foot (`PROGRESS`), and lies under
+  the forefoot while the heel is off the floor;
+- each force points from there nearly at the centre of mass; the offset turns the body. The centre of mass is moved by a
+  constant of the recording, so that the mean of the horizontal forces agrees with the change of velocity;
+- in double support, the vertical force of the foot behind falls as `trailing_share` (the motion alone does not
+  determine it: two feet and the body are a closed loop), and a foot that has just landed does not yet push backwards
   (`LEANS`).
 
-The horizontal force is `BELIEVED` times that of the accelerations and the rest of this. The force that feet on a
-floor then do not carry stays as the residual.
+The horizontal force is the mean of this one and of that of the accelerations, whose weight is `BELIEVED`. Forces that
+feet on a floor cannot carry are the residual.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from jaxtyping import Float
 
 from pbl_pipeline.body import Body
 from pbl_pipeline.gait.events import FOOT_DOWN, SIDES, GaitEvent
+from pbl_pipeline.runs import runs
 
 from .dynamics import GRAVITY, Dynamics
 
@@ -72,18 +73,13 @@ FRICTION = 0.8
 
 @dataclasses.dataclass(frozen=True)
 class GroundReaction:
-    """Of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known.
+    """Ground reaction of [left, right] at N times, per kilogram, world frame (z up); NaN where contact is not known."""
 
-    contact (N, 2): 1 on the floor, 0 in the air. force_n (N, 2, 3), 0 in the air; centre_m (N, 2, 3): of pressure, NaN
-    in the air. residual_n, residual_nm (N, 3): of what the motion needs, the force and the moment about the centre of
-    mass that no foot carries.
-    """
-
-    contact: np.ndarray
-    force_n: np.ndarray
-    centre_m: np.ndarray
-    residual_n: np.ndarray
-    residual_nm: np.ndarray
+    contact: np.ndarray  # (N, 2) 1 on the floor, 0 in the air
+    force_n: np.ndarray  # (N, 2, 3) 0 in the air
+    centre_m: np.ndarray  # (N, 2, 3) of pressure, NaN in the air
+    residual_n: np.ndarray  # (N, 3) force that no foot carries
+    residual_nm: np.ndarray  # (N, 3) moment about the centre of mass that no foot carries
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,44 +175,44 @@ def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:
     if feet.any():
         size = float(np.subtract(*np.percentile(vertical[feet > 0], [95, 5])))
         for n, values in zip((2, 1), TRANSIENT, strict=True):
-            for first, last in _runs(feet == n):
-                if first > 0 and last + 1 < len(vertical):
-                    out[first : last + 1] = size * _course(_phase(first, last), values)
+            for run in runs(feet == n):
+                if run.start > 0 and run.stop < len(vertical):
+                    out[run] = size * _course(_phase(run), values)
     return out
 
 
-def _phase(first: int, last: int) -> np.ndarray:
-    return (np.arange(last + 1 - first) + 0.5) / (last + 1 - first)
+def _phase(run: slice) -> np.ndarray:
+    return (np.arange(run.stop - run.start) + 0.5) / (run.stop - run.start)
 
 
-def _double_support(stands: np.ndarray) -> Iterator[tuple[int, int, int | None]]:
-    """Yield first and last index of each double support and the foot behind: the one that stood alone before; where
-    that was not seen, the one that does not stand alone after; None where neither was."""
-    for first, last in _runs(np.all(stands, axis=1)):
-        if first > 0 and stands[first - 1].any():
-            yield first, last, int(stands[first - 1, 1])
-        elif last + 1 < len(stands) and stands[last + 1].any():
-            yield first, last, int(stands[last + 1, 0])
+def _double_support(stands: np.ndarray) -> Iterator[tuple[slice, int | None]]:
+    """Yield the rows of each double support and the foot behind: the one that stood alone before; if that was not seen,
+    the one that does not stand alone after; None if neither was."""
+    for run in runs(np.all(stands, axis=1)):
+        if run.start > 0 and stands[run.start - 1].any():
+            yield run, int(stands[run.start - 1, 1])
+        elif run.stop < len(stands) and stands[run.stop].any():
+            yield run, int(stands[run.stop, 0])
         else:
-            yield first, last, None
+            yield run, None
 
 
 def _shares(stands: np.ndarray) -> np.ndarray:
-    """Return the share (N, 2) of the vertical force of each foot; 0 where none stands."""
+    """Return the fraction (N, 2) of the vertical force of each foot; 0 where none stands."""
     share = stands.astype(float)
-    for first, last, behind in _double_support(stands):
-        falls = 0.5 if behind is None else trailing_share(_phase(first, last))
-        share[first : last + 1, behind or 0], share[first : last + 1, 1 - (behind or 0)] = falls, 1.0 - falls
+    for run, behind in _double_support(stands):
+        falls = 0.5 if behind is None else trailing_share(_phase(run))
+        share[run, behind or 0], share[run, 1 - (behind or 0)] = falls, 1.0 - falls
     return share
 
 
 def _leans(stands: np.ndarray) -> np.ndarray:
     """Return `LEANS` (N, 2) of each foot over each double support, 1 elsewhere."""
     lean = np.ones(stands.shape)
-    for first, last, behind in _double_support(stands):
+    for run, behind in _double_support(stands):
         if behind is not None:
             for foot, values in zip((behind, 1 - behind), LEANS, strict=True):
-                lean[first : last + 1, foot] = _course(_phase(first, last), values)
+                lean[run, foot] = _course(_phase(run), values)
     return lean
 
 
@@ -240,23 +236,19 @@ def _mean_shift(body: Body, d: Dynamics, level: np.ndarray, vertical: np.ndarray
 
 
 def _pressure(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, k: int) -> np.ndarray:
-    """Return the centre of pressure (N, 3) of foot `k` [left, right] as `PROGRESS` has it; NaN where it does not
-    stand."""
+    """Return the centre of pressure (N, 3) of foot `k` [left, right] by `PROGRESS`; NaN where it does not stand."""
     sole = _sole(body, scale, d, contact, "lr"[k])
-    runs = _runs(contact == 1)
-    whole = [
-        b - a + 1 for a, b in runs if a > 0 and b + 1 < len(contact) and np.isfinite(contact[[a - 1, b + 1]]).all()
-    ]
+    # Each stance with its length, and whether its beginning and its end are seen.
+    known = np.concatenate([[False], np.isfinite(contact), [False]])
+    stances = [(r, r.stop - r.start, bool(known[r.start]), bool(known[r.stop + 1])) for r in runs(contact == 1)]
+    whole = [n for _, n, began, ended in stances if began and ended]
     place = np.full((len(contact), 2), np.nan)
-    for first, last in runs:
-        n = last + 1 - first
-        began = first > 0 and np.isfinite(contact[first - 1])
-        ended = last + 1 < len(contact) and np.isfinite(contact[last + 1])
-        # Of a stance that is seen in part, the other part is as long as in the others.
+    for run, n, began, ended in stances:
+        # A stance that is seen in part is as long as the others.
         full = n if (began and ended) or not whole else max(n, int(np.median(whole)))
         phase = (np.arange(n) + 0.5 + (0 if began else full - n)) / full
         for i in (0, 1):
-            place[first : last + 1, i] = np.interp(phase, PROGRESS[:, 0], PROGRESS[:, i + 1])
+            place[run, i] = np.interp(phase, PROGRESS[:, 0], PROGRESS[:, i + 1])
     forefoot = _FOREFOOT * np.clip(np.interp(sole.lifted / sole.length, _HEEL_OFF, (0.0, 1.0)), 0.0, 1.0)
     return sole.point(np.maximum(place[:, 0], forefoot), place[:, 1] * (1 if k == 0 else -1))
 
@@ -270,14 +262,8 @@ def _sole(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, side:
     length = own * float(np.linalg.norm(np.array(_TIP_M) + body.mj_model.body_pos[toes + 1] - _HEEL_M))
     lowest = np.minimum(np.minimum(heel[:, 2], ball[:, 2]), tip[:, 2])
     floor = np.full(len(heel), np.nan)
-    for first, last in _runs(contact == 1):
-        floor[first : last + 1] = np.median(lowest[first : last + 1])
+    for run in runs(contact == 1):
+        floor[run] = np.median(lowest[run])
     along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
-    # A foot on its toes is as long as ever: its tip stays where it is.
+    # A foot on its toes keeps its length: its tip stays in place.
     return _Sole(tip[:, :2] - length * along, heel[:, 2] - floor, along, length, floor)
-
-
-def _runs(on: np.ndarray) -> list[tuple[int, int]]:
-    """Return first and last index of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,4 +1,4 @@
-"""Moments and powers of the legs' joints: what the motion needs less what the ground gives, from the ground up.
+"""Moments and powers of the legs' joints: those of the motion minus those of the ground reaction, from the ground up.
 
 The moment of a joint value is the generalised force of OpenSim's inverse dynamics: internal (of muscles and ligaments),
 in the direction in which the value grows, in Nm per kilogram; its power is moment times velocity (W/kg). The knee has
@@ -17,7 +17,7 @@ from .ground import GroundReaction
 
 #: Joint values of a leg that have a moment.
 JOINTS = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle", "ankle_angle", "subtalar_angle")
-#: Their angles as people read them, in the same order.
+#: Their angles, in the same order.
 MOMENTS = tuple(angle_of(joint)[0] for joint in JOINTS)
 
 

@@ -1,4 +1,4 @@
-"""The methods of the stage: a row of `KineticsMethod` in the tables."""
+"""Methods of the stage: a row of `KineticsMethod` in the tables."""
 
 from __future__ import annotations
 

@@ -43,24 +43,18 @@ WIDTH_SD = 1.645
 
 @dataclasses.dataclass(frozen=True)
 class KineticsParams:
-    """Parameters of the stage.
+    """Parameters of the stage."""
 
-    cutoff_hz: of the low-pass of the joint values; samples: how many motions are drawn from the fit's uncertainty for
-    the intervals; varying_turns, varying_slides: the fraction of its variance that varies over a walk, of joint angles
-    and of the pelvis' place; memory_s: how long an error stays alike; vertical_model: against which the vertical force
-    of one camera is weighed (`vertical.load_vertical_model`).
-    """
-
-    cutoff_hz: float = 6.0
-    samples: int = 20
-    varying_turns: float = 0.05
-    varying_slides: float = 0.002
-    memory_s: float = 0.2
-    vertical_model: str = "vertical-force-1"
+    cutoff_hz: float = 6.0  # of the low-pass of the joint values
+    samples: int = 20  # number of motions that are drawn from the fit's uncertainty for the intervals
+    varying_turns: float = 0.05  # fraction of the variance that varies over a walk, of joint angles
+    varying_slides: float = 0.002  # the same of the position of the pelvis
+    memory_s: float = 0.2  # correlation time of the error
+    vertical_model: str = "vertical-force-1"  # model of the vertical force of one camera (`load_vertical_model`)
 
 
 class Walk(Protocol):
-    """Gait of a trial as far as the stage reads it; a `TrialMetrics` is one."""
+    """The parts of a trial's gait that the stage reads, such as of a `TrialMetrics`."""
 
     @property
     def events(self) -> GaitEvents: ...
@@ -106,46 +100,37 @@ class KineticMeasure:
 
 @dataclasses.dataclass(frozen=True)
 class CycleKinetics:
-    """Of one gait cycle (`number` and `side` are those of its `GaitCycle`).
+    """Kinetics of one gait cycle."""
 
-    curves and curves_sd map names of `CURVES` to (51,) at 0, 2, ..., 100 % of the cycle; measures maps names of
-    `MEASURES` to numbers, of those that are known. Where there are none `missing` says why.
-    """
-
-    number: int
+    number: int  # this and `side` as in its `GaitCycle`
     side: str
     used: bool
+    #: Names of `CURVES` -> (51,) at 0, 2, ..., 100 % of the cycle.
     curves: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     curves_sd: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
-    measures: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    missing: str = ""
+    measures: Mapping[str, float] = dataclasses.field(default_factory=dict)  # the known ones of `MEASURES`
+    missing: str = ""  # reason of missing results
 
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Over N times of a trial, per kilogram; world frame (z up). NaN where contact is not known.
+    """Kinetics over N times of a trial, per kilogram; world frame (z up). NaN where contact is not known."""
 
-    time_s (N,); force_bw (N, 2, 3) in body weights and centre_m (N, 2, 3) of [left, right]; moment_nm_per_kg,
-    power_w_per_kg (N, 2, 6) of `joints.MOMENTS`; residual_bw (N, 3), residual_nm_per_kg (N, 3): what no foot carries;
-    centre_of_mass_m (N, 3); ahead (N, 2): where the pelvis
-    faces; knee_adduction_nm_per_kg (N, 2): `joints.knee_adduction`.
-    """
-
-    time_s: np.ndarray
-    force_bw: np.ndarray
-    centre_m: np.ndarray
-    moment_nm_per_kg: np.ndarray
-    power_w_per_kg: np.ndarray
-    residual_bw: np.ndarray
-    residual_nm_per_kg: np.ndarray
-    centre_of_mass_m: np.ndarray
-    ahead: np.ndarray
-    knee_adduction_nm_per_kg: np.ndarray
+    time_s: np.ndarray  # (N,)
+    force_bw: np.ndarray  # (N, 2, 3) of [left, right], in body weights
+    centre_m: np.ndarray  # (N, 2, 3) centres of pressure
+    moment_nm_per_kg: np.ndarray  # (N, 2, 6) of `joints.MOMENTS`
+    power_w_per_kg: np.ndarray  # (N, 2, 6)
+    residual_bw: np.ndarray  # (N, 3) force that no foot carries
+    residual_nm_per_kg: np.ndarray  # (N, 3) moment that no foot carries
+    centre_of_mass_m: np.ndarray  # (N, 3)
+    ahead: np.ndarray  # (N, 2) direction that the pelvis faces
+    knee_adduction_nm_per_kg: np.ndarray  # (N, 2) of `joints.knee_adduction`
 
 
 @dataclasses.dataclass(frozen=True)
 class TrialKinetics:
-    """Of one trial. `code` and `reason` say why there is nothing, both empty where there is something."""
+    """Kinetics of one trial. `code` and `reason` explain missing results, otherwise both are empty."""
 
     name: str
     status: str
@@ -158,20 +143,15 @@ class TrialKinetics:
 
 @dataclasses.dataclass(frozen=True)
 class Kinetics:
-    """Of a visit: measures over all used cycles of its trials, and the trials.
-
-    `reasons` says of each measure that is absent from `measures` why. `mass_kg`: the person's stated mass, None where
-    it was not stated; all numbers are per body weight or per kilogram, so none of them needs it. `residual_bw`: root
-    mean square of the force that no foot carries, over the used cycles.
-    """
+    """Kinetics of a visit: measures over all used cycles of its trials, and the trials."""
 
     status: str
     code: str
     reason: str
     measures: Mapping[str, KineticMeasure]
-    reasons: Mapping[str, str]
-    mass_kg: float | None
-    residual_bw: float | None
+    reasons: Mapping[str, str]  # of each missing measure
+    mass_kg: float | None  # the stated mass; all numbers are per body weight or per kilogram and do not need it
+    residual_bw: float | None  # root mean square of the force that no foot carries, over the used cycles
     method: str
     params_hash: str
     trials: tuple[TrialKinetics, ...]

@@ -1,5 +1,4 @@
-"""The vertical force of both feet together: what the motion of one camera needs, weighed against how people's force
-varies.
+"""Vertical force of both feet together, from the motion of one camera and a model of people's forces.
 
 Second derivatives of such a motion are noisy, and the force on the floor differs little between people who walk at one
 speed. So the force F (body weights) is a Gaussian process over the phase of double and single support,
@@ -27,7 +26,7 @@ from pbl_pipeline.shipped import shipped_model
 
 from .dynamics import GRAVITY, GRID_HZ
 
-#: Of the observed frames every third counts: 33 a second show all that a low-passed motion has.
+#: Every third of the observed frames is used: 33 a second suffice for a low-passed motion.
 _EVERY = 3
 #: Longer recordings are estimated in parts (frames).
 _PART = 1500
@@ -44,7 +43,7 @@ class Noise(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)  # a model is itself alone, so that results of one can be kept
 class VerticalModel:
-    """How the vertical force varies; forces in body weights.
+    """Model of the variation of the vertical force; forces in body weights.
 
     Attributes
     ----------
@@ -59,11 +58,11 @@ class VerticalModel:
     speed_range
         Least and greatest dimensionless speed (speed over the root of gravity times stature) of the walks.
     step_sd, step_memory_s
-        Standard deviation and memory of a step's own part.
+        Standard deviation and correlation time of the part of a step.
     noise_memory_s
-        How long the noise stays alike.
+        Correlation time of the noise.
     noise
-        By marker set of one camera; the force of other sets stays as the motion needs it.
+        By marker set of one camera; the force of other sets is that of the motion.
     """
 
     name: str
@@ -112,7 +111,7 @@ class _Part:
     factor: Any
 
     def update(self, observed: np.ndarray) -> np.ndarray:
-        """Return what observations (of departures from their expectation) add to the force."""
+        """Return the update of the force by observations (of departures from their expectation)."""
         return self.noise.gain * self.prior[:, ::_EVERY] @ cho_solve(self.factor, observed)
 
     def departure(self, rng: np.random.Generator) -> np.ndarray:
@@ -127,7 +126,7 @@ class _Part:
 
 @functools.cache
 def load_vertical_model(name: str) -> VerticalModel:
-    """Return a model that ships."""
+    """Return an included model."""
     data = shipped_model(f"kinetics/vertical_models/{name}.json", ("phase", "mean", "slope", "person"))
     noise = {k: Noise(*v) for k, v in data.pop("noise").items()}
     return VerticalModel(**data, noise=noise)

@@ -1,6 +1,6 @@
-"""Networks: BlazePose (tflite) and any as ONNX: folder with graph and spec, the registry, sessions on CPU or CUDA."""
+"""Networks: BlazePose (TensorFlow Lite), and ONNX models with a graph and a spec, in a registry, on CPU or CUDA."""
 
-from .devices import DEVICES, asked_device, available_devices, providers_for
+from .devices import asked_device, available_devices, providers_for
 from .gpu_address import gpu_visible
 from .network import Network
 from .onnx_model import OnnxModel, check_frozen

@@ -1,4 +1,4 @@
-"""Where ONNX models run: CPU or CUDA. What was asked for and is not there is an error or is said, never silent."""
+"""Device of ONNX models: CPU or CUDA. A requested device that is not available is an error, or is reported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from pbl_pipeline.errors import PblError
 
-#: What may be asked for. "auto": CUDA where it works, else the CPU, and the model says which.
+#: Devices that may be requested. "auto": CUDA if it works, else the CPU; the model states which.
 DEVICES = ("auto", "cpu", "cuda")
 _PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 unavailable = functools.partial(
@@ -22,7 +22,7 @@ unavailable = functools.partial(
 
 
 def asked_device(device: str | None = None) -> str:
-    """`device`, or PBL_ONNX_DEVICE, or "auto". Raises `PblError` USAGE for another word."""
+    """Return `device`, or PBL_ONNX_DEVICE, or "auto". Raises `PblError` USAGE for another word."""
     asked = (device or os.environ.get("PBL_ONNX_DEVICE") or "auto").lower()
     if asked not in DEVICES:
         raise PblError(
@@ -35,7 +35,7 @@ def asked_device(device: str | None = None) -> str:
 
 
 def available_devices() -> tuple[str, ...]:
-    """Devices of the installed onnxruntime, the fastest first. That a driver answers is only known by loading."""
+    """Devices of the installed onnxruntime, the fastest first. Loading a model may still fail for lack of a driver."""
     import onnxruntime
 
     there = set(onnxruntime.get_available_providers())
@@ -43,7 +43,7 @@ def available_devices() -> tuple[str, ...]:
 
 
 def providers_for(device: str | None = None) -> list[str]:
-    """Execution providers to ask a session for.
+    """Return the execution providers for a session.
 
     Raises `PblError` DEVICE_UNAVAILABLE: CUDA was asked for and the installed onnxruntime has none. USAGE: an unknown
     device.
@@ -57,5 +57,5 @@ def providers_for(device: str | None = None) -> list[str]:
 
 
 def device_of(providers: Sequence[str]) -> str:
-    """The device that a session with these providers computes on."""
+    """Return the device that a session with these providers computes on."""
     return next((d for d, p in _PROVIDERS.items() if providers and providers[0] == p), "cpu")

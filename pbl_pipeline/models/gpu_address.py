@@ -1,7 +1,6 @@
-"""Where the process that owns the GPU for detection listens, and how it is started: by whoever first needs it.
+"""Address and start of the process that owns the GPU for detection; the first process that needs it starts it.
 
-It ends by itself when no one has been connected for a while. Many processes that decode share one GPU, so it is
-separate from them.
+It is separate because many processes that decode share one GPU, and ends by itself after a while without connections.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from pathlib import Path
 
 from pbl_pipeline.temporary import private_folder
 
-#: A GPU process that does not listen after so long has failed (s): loading JAX and the driver takes some seconds.
+#: Time after which a GPU process that does not listen has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def gpu_visible() -> bool:
-    """Whether JAX would find an NVIDIA GPU, without loading it: a driver, a GPU that is not hidden, a plugin."""
+    """True if JAX would find an NVIDIA GPU, without loading it: a driver, a GPU that is not hidden, a plugin."""
     listed = os.environ.get("CUDA_VISIBLE_DEVICES")
     hidden = listed is not None and listed.split(",")[0].strip() in ("", "-1", "NoDevFiles")
     other = os.environ.get("JAX_PLATFORMS", "")
@@ -34,12 +33,12 @@ def gpu_visible() -> bool:
 
 
 def running_server() -> str:
-    """Return the address of the GPU process, after starting it where none listens.
+    """Return the address of the GPU process, which is started if none listens.
 
     Raises
     ------
     RuntimeError
-        It does not start; the text has the last line that it printed.
+        It does not start; the message is the last line that it printed.
     OSError
         The folder of its socket cannot be made.
     """
@@ -55,7 +54,7 @@ def running_server() -> str:
 
 
 def _name() -> str:
-    """A name for this code and the GPUs that this process may see."""
+    """Name of the process for this code and the GPUs that this process may use."""
     here = Path(__file__).parent
     code = b"".join((here / name).read_bytes() for name in ("gpu_server.py", "network.py", "tflite_jax.py"))
     seen = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
@@ -77,7 +76,7 @@ def _start(address: str, log: Path) -> None:
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
     with log.open("wb") as out:
-        # -P: not from the current folder, which may hold another checkout.
+        # -P: do not import from the current folder, which may hold another checkout.
         command = [sys.executable, "-P", "-m", "pbl_pipeline.models.gpu_server", address]
         process = subprocess.Popen(
             command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True

@@ -2,8 +2,8 @@
 
 Each connection is of one network: a line of JSON with its `NetworkSpec`, answered by one; then the bytes of pictures,
 each answered with the network's outputs as float32 in the order of the pictures. The pictures that wait on all
-connections of a network go through the GPU together. Each network has one batch size, so that one program is compiled
-for it; a batch that is not full is padded, and a picture's result does not depend on its neighbours.
+connections of a network are one batch. Each network has one batch size, so that one program is compiled for it; a batch
+that is not full is padded, and a picture's result does not depend on the others.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from pbl_pipeline.errors import PblError
 from .network import NetworkSpec, receive, receive_line, send_line
 from .tflite import LiteModel, read_network
 
-#: Pictures of one call of a network, and the smallest that is tried where the GPU's memory does not suffice.
+#: Pictures in one call of a network, and the least if the GPU's memory does not suffice.
 BATCH, LEAST_BATCH = 16, 4
-#: The process ends when no one has been connected for so long (s).
+#: Time without connections (s) after which the process ends.
 IDLE_S = 60.0
-#: Largest difference to LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
+#: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
-#: Networks that use the device at a time.
+#: Number of networks that use the device at a time.
 _AT_ONCE = 2
 
 
@@ -62,8 +62,8 @@ class Program:
         scale, offset = np.float32(spec.scale), np.float32(spec.offset)
 
         def outputs(weights: Any, images: Any) -> Any:
-            # Factors rounded to ten bits (TensorFloat-32) are a third faster here, and points then differ by 4 px of
-            # 256 where a picture tells little; so results would depend on where they were computed.
+            # Factors rounded to ten bits (TensorFloat-32) are a third faster here, but points then differ by 4 px of
+            # 256 in poor pictures, so that results would depend on the device.
             with jax.default_matmul_precision("highest"):
                 return jax.numpy.concatenate(model(weights, images.astype(np.float32) * scale + offset), axis=1)
 
@@ -71,7 +71,7 @@ class Program:
         self._check(spec)
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
-        """Return the outputs (N, sum of sizes) of pictures (N, H, W, 3) uint8, N at most that of any call before."""
+        """Return the outputs (N, sum of sizes) of pictures (N, H, W, 3) uint8."""
         while True:
             try:
                 parts = [self._run(self._weights, part) for part in self._parts(images)]
@@ -99,17 +99,17 @@ class Program:
 
 
 class _Served:
-    """A network and the connections that show it pictures.
+    """A network and its connections.
 
-    `device`: networks compute in turn, so that pictures gather for one while others compute; two at a time, so that the
-    pictures and results of one are copied while another computes.
+    `device`: networks compute in turn, so that pictures accumulate for one while others compute; two at a time, so that
+    the pictures and results of one are copied while another computes.
     """
 
     def __init__(self, program: Program, device: threading.Semaphore) -> None:
         self._program, self._device = program, device
         self._selector = selectors.DefaultSelector()
         self._changed = threading.Condition()
-        # One batch is filled while the other is computed; new memory for each would cost more than receiving it.
+        # One batch is filled while the other is computed; allocating memory for each would take longer than receiving.
         self._images, self._spare = (np.zeros((program.batch, *program.image_shape), np.uint8) for _ in range(2))
         self._owners = list[socket.socket]()
         self.n_connections = 0
@@ -136,7 +136,7 @@ class _Served:
                     self._drop(key.data)
                     continue
                 with self._changed:
-                    if self._images is not images:  # the batch was taken meanwhile
+                    if self._images is not images:  # the batch was exchanged meanwhile
                         self._images[0] = images[at]
                     self._owners.append(key.data)
                     self._changed.notify()
@@ -146,7 +146,7 @@ class _Served:
             self._selector.unregister(connection)
             connection.close()
             self.n_connections -= 1
-        except (KeyError, OSError, ValueError):  # it was closed before
+        except (KeyError, OSError, ValueError):  # already closed
             return
 
     def _compute(self) -> None:
@@ -154,13 +154,13 @@ class _Served:
             with self._changed:
                 self._changed.wait_for(lambda: self._owners)
             with self._device:
-                with self._changed:  # what came while others computed, too
+                with self._changed:  # includes pictures that came while others computed
                     images, owners = self._images, self._owners
                     self._images, self._owners = self._spare, []
                     self._changed.notify()
                 try:
                     found = self._program(images)
-                except RuntimeError as error:  # the GPU went away: who is connected lets LiteRT compute
+                except RuntimeError as error:  # the GPU failed: the clients fall back to LiteRT
                     sys.stderr.write(f"the GPU does not compute: {error}\n")
                     sys.stderr.flush()
                     os._exit(1)
@@ -173,7 +173,7 @@ class _Served:
 
 
 class Server:
-    """Serves networks at an address until it is closed or no one has been connected for `idle_s`."""
+    """Serves networks at an address until it is closed or has had no connection for `idle_s`."""
 
     def __init__(self, address: str, any_device: bool = False, idle_s: float = IDLE_S, batch: int = BATCH) -> None:
         self._listener = socket.socket(socket.AF_UNIX)
@@ -184,7 +184,7 @@ class Server:
         self._locks: dict[NetworkSpec, threading.Lock] = {}
         self._device = threading.Semaphore(_AT_ONCE)
         self._opening = 0
-        # Programs of several networks compile side by side.
+        # Programs of several networks compile in parallel.
         self._openers = ThreadPoolExecutor(16)
 
     def run(self) -> None:
@@ -213,7 +213,7 @@ class Server:
                 with self._locks.setdefault(spec, threading.Lock()):
                     if spec not in self._served:
                         self._served[spec] = _Served(Program(spec, self._any_device, self._batch), self._device)
-            except Exception as error:  # noqa: BLE001 - whoever asked lets LiteRT compute and says why
+            except Exception as error:  # noqa: BLE001 - the client falls back to LiteRT and reports the reason
                 lines = [error.short()] if isinstance(error, PblError) else str(error).strip().splitlines()
                 send_line(connection, {"error": lines[0] if lines else type(error).__name__})
                 connection.close()
@@ -228,7 +228,7 @@ class Server:
             self._opening -= 1
 
     def _watch(self) -> None:
-        """End the process when it is not used any more."""
+        """End the process when it is no longer used."""
         last = time.monotonic()
         while time.monotonic() - last < self._idle_s:
             time.sleep(min(1.0, self._idle_s / 4))
@@ -239,7 +239,7 @@ class Server:
 
 
 def main() -> None:
-    """Entry of the process. Ends at once where JAX finds no GPU."""
+    """Run the process. Ends at once if JAX finds no GPU."""
     address = Path(sys.argv[1])
     address.unlink(missing_ok=True)
     from pbl_pipeline.jax_setup import configure

@@ -1,9 +1,9 @@
-"""A network of a TensorFlow Lite file that is shown pictures: on the GPU where one is visible, else by LiteRT.
+"""A network of a TensorFlow Lite file with pictures as input: on the GPU if one is visible, else by LiteRT.
 
 On the GPU one process for each machine and GPU owns the networks (`gpu_server`); every process that detects sends its
-pictures there, so that pictures of many videos make up a batch. The choice of `PBL_ONNX_DEVICE` holds here as
-for ONNX models: "cpu" never uses the GPU, "auto" uses it where it works; "cuda" fails where one is visible to JAX
-and does not compute. Where none is, LiteRT computes whatever was asked for: "cuda" may be meant for an ONNX model.
+pictures there, so that pictures of many videos make up a batch. `PBL_ONNX_DEVICE` is used as for ONNX models: "cpu"
+never uses the GPU, "auto" uses it if it works, "cuda" fails if a GPU is visible to JAX and does not compute. If none is
+visible, LiteRT computes also with "cuda", which may be meant for an ONNX model.
 """
 
 from __future__ import annotations
@@ -26,17 +26,16 @@ from .tflite import NUM_THREADS, LiteModel
 
 @dataclasses.dataclass(frozen=True)
 class NetworkSpec:
-    """A network: its file with SHA-256, the sizes of the outputs that are wanted (None: all), and how the values 0 to
-    255 of a picture enter it: times `scale` plus `offset`."""
+    """A network and its input."""
 
     path: str
     sha256: str
-    outputs: tuple[int, ...] | None
-    scale: float
-    offset: float = 0.0
+    outputs: tuple[int, ...] | None  # sizes of the wanted outputs, None: all
+    scale: float  # the values 0 to 255 of a picture are multiplied by it
+    offset: float = 0.0  # and added to it
 
     def entered(self, image: np.ndarray) -> np.ndarray:
-        """Return a picture (H, W, 3) uint8 as the network takes it, float32."""
+        """Return a picture (H, W, 3) uint8 as input of the network, float32."""
         values = np.multiply(image, np.float32(self.scale), dtype=np.float32)
         return values + np.float32(self.offset) if self.offset else values
 
@@ -44,9 +43,9 @@ class NetworkSpec:
 class Network:
     """A loaded network, called with a picture (H, W, 3) uint8 RGB; outputs are keyed by their number of elements.
 
-    On the GPU several threads may call it at once, and `side_by_side` of them fill it; by LiteRT one at a time.
+    On the GPU several threads may call it at once (`side_by_side` of them use it fully), with LiteRT one at a time.
 
-    Raises `PblError` ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was asked for, a GPU is
+    Raises `PblError` ASSET_CHECKSUM: the file is not the pinned one. DEVICE_UNAVAILABLE: CUDA was requested, a GPU is
     visible, and it does not compute this network. USAGE: an unknown device.
 
     Attributes
@@ -54,9 +53,9 @@ class Network:
     sha256
         Of the file.
     device
-        Name of the GPU that computes, or "" for LiteRT on the CPU.
+        Name of the GPU, or "" for LiteRT on the CPU.
     note
-        Why LiteRT computes although a GPU is visible; "" where there is nothing to say.
+        Reason why LiteRT computes although a GPU is visible, or "".
     """
 
     def __init__(
@@ -85,12 +84,12 @@ class Network:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether the GPU computes."""
+        """True if the GPU computes."""
         return self._remote is not None
 
     @property
     def side_by_side(self) -> int:
-        """Calls at once that keep the device busy while pictures are cut for others."""
+        """Number of parallel calls that keep the device busy while pictures are cropped for others."""
         return 16 if self.on_gpu else 1
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
@@ -110,7 +109,7 @@ class Network:
         return LiteModel(self._spec.path, self.sha256, self._spec.outputs, self._threads)
 
     def _fall_back(self, error: BaseException) -> None:
-        """Let LiteRT compute from now on. Raises DEVICE_UNAVAILABLE where the GPU was asked for."""
+        """Let LiteRT compute from now on. Raises `PblError` DEVICE_UNAVAILABLE if the GPU was requested."""
         found = str(error) or type(error).__name__
         if asked_device() == "cuda":
             raise unavailable(found) from error
@@ -149,7 +148,7 @@ class _Remote:
         try:
             while receive(self._connection, reply := np.empty(sum(self._sizes), np.float32)):
                 self._waiting.popleft().set_result(reply)
-        except IndexError:  # an answer to nothing
+        except IndexError:  # an answer without a request
             pass
         with self._sending:
             self._broken = EOFError("the process that owns the GPU ended")
@@ -163,7 +162,7 @@ def send_line(connection: socket.socket, value: object) -> None:
 
 
 def receive_line(connection: socket.socket) -> bytes:
-    """Return the next line, without what follows it. Raises EOFError where the other side has ended."""
+    """Return the next line. Raises EOFError if the other side has ended."""
     line = b""
     while not line.endswith(b"\n"):
         byte = connection.recv(1)
@@ -174,7 +173,7 @@ def receive_line(connection: socket.socket) -> bytes:
 
 
 def receive(connection: socket.socket, into: np.ndarray) -> bool:
-    """Fill an array with the bytes that come; False where the other side ended before."""
+    """Fill an array with received bytes; False if the other side ended before."""
     try:
         return connection.recv_into(into.data, into.nbytes, socket.MSG_WAITALL) == into.nbytes
     except OSError:

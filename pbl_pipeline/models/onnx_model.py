@@ -1,4 +1,4 @@
-"""One loaded ONNX model that is what its `model.json` says: checked by its hash, its graph and a black picture."""
+"""Loaded ONNX models, checked against their `model.json` by the hash, the graph and one run on a black picture."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 class OnnxModel:
     """A model's folder, loaded. Not to be shared by threads.
 
-    Raises `PblError` MODEL_MISSING, MODEL_INVALID (also an opset or operator that the runtime does not know, another
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID (also an opset or operator that the runtime does not support, another
     name or shape of an input or output, another number of points), MODEL_CHECKSUM, MARKER_SET_UNKNOWN,
     DEVICE_UNAVAILABLE, USAGE.
 
     Attributes
     ----------
     spec
-        What `model.json` says.
+        Content of `model.json`.
     device
-        "cpu" or "cuda": where it computes.
+        "cpu" or "cuda".
     note
-        Why it is not the device one would expect; "" where there is nothing to say.
+        Reason why it is not the expected device, or "".
     """
 
     def __init__(self, folder: str | Path, device: str | None = None) -> None:
@@ -40,12 +40,12 @@ class OnnxModel:
         self._path = self.folder / GRAPH_FILE
         data = check_graph_file(self.folder, self.spec)
         providers = providers_for(device)
-        # Here and not above: whoever only fits or reads results does not wait for the runtime.
+        # Not at the top: commands that only fit or read results do not wait for the runtime.
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = cores()
-        options.log_severity_level = 4  # what it would print is raised below
+        options.log_severity_level = 4  # its messages are raised below
         try:
             self._session = onnxruntime.InferenceSession(data, options, providers=providers)
         except Exception as error:
@@ -74,7 +74,7 @@ class OnnxModel:
     def __call__(self, crops: np.ndarray, gamma: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Outputs by role, float32, for `crops` (N, H, W, 3) uint8 BGR; `gamma` (N,) is applied to each on 0..1.
 
-        A graph whose batch is fixed is called as often as it takes.
+        A graph with a fixed batch is called several times if necessary.
         """
         inputs = self._inputs(crops, gamma)
         size = self.fixed_batch or len(inputs)
@@ -89,7 +89,7 @@ class OnnxModel:
         return dict(zip(self.spec.outputs, joined, strict=True))
 
     def _inputs(self, crops: np.ndarray, gamma: np.ndarray | None) -> np.ndarray:
-        """The crops as the graph wants them, by a table of the 256 values for each crop and channel."""
+        """The crops as input of the graph, by a table of the 256 values for each crop and channel."""
         entry = self.spec.input
         levels = np.arange(256) / 255.0
         gammas = np.ones(len(crops)) if gamma is None else np.asarray(gamma, float)
@@ -103,7 +103,7 @@ class OnnxModel:
         return out if entry.layout == "NCHW" else np.ascontiguousarray(out.transpose(0, 2, 3, 1))
 
     def _check_names(self) -> tuple[Any, int | None]:
-        """Type of the input and the batch that it is fixed to (None: any)."""
+        """Type of the input and its fixed batch (None: any)."""
         entry = self.spec.input
         inputs = {i.name: i for i in self._session.get_inputs()}
         outputs = [o.name for o in self._session.get_outputs()]
@@ -125,7 +125,7 @@ class OnnxModel:
     def _check_shapes(self, got: dict[str, np.ndarray]) -> None:
         n, entry = len(self.spec.joint_names), self.spec.input
         if self.spec.kind in WITHOUT_POINTS:
-            return  # the detector that reads it checks its rows
+            return  # the detector checks the rows
         along = {"simcc_x": entry.width, "simcc_y": entry.height}
         for role, array in got.items():
             if role in ("coords2d", "coords3d"):
@@ -163,7 +163,7 @@ def check_frozen(spec: ModelSpec, sha256: str, spec_sha256: str) -> None:
 
 
 def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
-    """The bytes of `model.onnx`. Raises `PblError` MODEL_MISSING, MODEL_CHECKSUM."""
+    """Read `model.onnx`. Raises `PblError` MODEL_MISSING, MODEL_CHECKSUM."""
     path = Path(folder) / GRAPH_FILE
     with os_errors_as("MODEL_MISSING", f"{GRAPH_FILE} beside model.json", "copy the whole folder again", path):
         data = path.read_bytes()

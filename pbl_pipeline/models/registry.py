@@ -1,7 +1,7 @@
-"""The registered models of this machine: one folder for each, under its name, in `settings.models_dir()`.
+"""Registered models of this machine: a folder with the name of each, in `settings.models_dir()`.
 
-A method of the tables names a model by its name and the SHA-256 of its graph and of its spec, so a folder that changed
-is refused wherever it is used.
+A method of the tables stores the name of a model and the SHA-256 of its graph and of its spec, so a folder that changed
+is refused.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .spec import GRAPH_FILE, SPEC_FILE, ModelSpec, load_spec, model_invalid
 
 _TIMEOUT_S = 60.0
 _CHUNK = 1 << 20
-#: Only these leave an archive; the graph is at most what one ONNX file may be.
+#: Files of a model that are kept; the graph has at most the size of one ONNX file.
 _MEMBERS = (GRAPH_FILE, SPEC_FILE, "LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
 _LARGEST = 2 << 30
 _missing = functools.partial(
@@ -41,7 +41,7 @@ _missing = functools.partial(
 
 @contextlib.contextmanager
 def unpacked(source: str | Path, sha256: str | None) -> Iterator[Path]:
-    """The folder of a model; a temporary one where `source` is an archive or an address. Raises as `add`."""
+    """Folder of a model; a temporary one if `source` is an archive or an address. Raises as `add`."""
     text = str(source)
     address = text.lower().startswith(("http://", "https://"))
     if not address and Path(source).is_dir():
@@ -111,7 +111,7 @@ def _check(archive: Path, sha256: str | None, source: str) -> None:
 
 
 def _extract(archive: Path, folder: Path, source: str) -> None:
-    """Take the model's files out, whatever folder they lie in; one folder only."""
+    """Extract the model's files, which are all in one folder of the archive."""
     found: dict[str, tuple[str, int]] = {}
     try:
         with contextlib.ExitStack() as stack:
@@ -140,17 +140,13 @@ def _extract(archive: Path, folder: Path, source: str) -> None:
     except (*DAMAGED, tarfile.TarError, ValueError, OSError) as error:
         what = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise model_invalid(
-            f"no readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive", key=source
+            f"not a readable archive ({what})", f"a folder with {SPEC_FILE}, or its archive", key=source
         ) from error
-
-
-#: Files that are kept beside graph and spec, where they are there.
-_TEXTS = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "NOTICE", "README.md")
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelStatus:
-    """A registered model: `spec` and no `error`, or what is wrong with it."""
+    """A registered model, with its `spec` or the `error` of a damaged one."""
 
     name: str
     folder: Path
@@ -159,7 +155,7 @@ class ModelStatus:
 
 
 def registered() -> list[ModelStatus]:
-    """Every registered model by name, with what is wrong with it; checks the bytes of the graphs."""
+    """List the registered models by name, with their errors; checks the bytes of the graphs."""
     folder = settings.models_dir()
     if not folder.is_dir():
         return []
@@ -168,7 +164,7 @@ def registered() -> list[ModelStatus]:
 
 
 def is_registered(name: str) -> bool:
-    """Whether a model of that name is registered here, sound or not."""
+    """True if a model of that name is registered here, damaged or not."""
     return "/" not in name and not name.startswith(".") and (settings.models_dir() / name / SPEC_FILE).is_file()
 
 
@@ -190,11 +186,11 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
     """Register a model from its folder, or from an archive (.zip, .tar, .tar.gz) in a file or at an http(s) address.
 
     `sha256` is that of the archive, and must be given for an address. The model is loaded and run once on the CPU
-    before anything is kept. Registering the same bytes again changes nothing.
+    before anything is stored. Registering the same bytes again changes nothing.
 
-    Raises `PblError` MODEL_MISSING (also where nothing can be fetched), MODEL_INVALID, MODEL_CHECKSUM,
-    MARKER_SET_UNKNOWN; USAGE where another model has the name and `replace` is not set, or an address comes without
-    `sha256`; FILE_UNWRITABLE.
+    Raises `PblError` MODEL_MISSING (also if it cannot be fetched), MODEL_INVALID, MODEL_CHECKSUM, MARKER_SET_UNKNOWN;
+    USAGE if another model has the name and `replace` is not set, or an address is given without `sha256`;
+    FILE_UNWRITABLE.
     """
     with unpacked(source, sha256) as folder:
         model = OnnxModel(folder, "cpu")
@@ -204,31 +200,31 @@ def add(source: str | Path, sha256: str | None = None, *, replace: bool = False)
             raise PblError(
                 "USAGE",
                 found=f"another model is registered as {spec.name}",
-                expected="a name of its own for each model",
-                next_step="give the new one another name in its model.json, or pass --replace: results made with the "
-                "old one stay, and a method that names it then fails until it is added again",
+                expected="a different name for each model",
+                next_step="change the name in the new one's model.json, or pass --replace: results made with the old "
+                "one stay, but methods that use it fail until it is added again",
                 key=str(source),
             )
         with os_errors_as(
             "FILE_UNWRITABLE",
             f"a folder of models that you may write to ({there.parent})",
-            "set PBL_MODELS to a folder of your own",
+            "set PBL_MODELS to one of your folders",
             there,
         ):
             there.parent.mkdir(parents=True, exist_ok=True)
             with _scratch(there.parent) as new:
-                for name in (GRAPH_FILE, SPEC_FILE, *_TEXTS):
+                for name in _MEMBERS:
                     if (folder / name).is_file():
                         shutil.copyfile(folder / name, new / name)
                 with _scratch(there.parent) as old:
-                    if there.exists():  # put aside in one step: nobody meets half of it
+                    if there.exists():  # moved in one step, so that no process reads half of it
                         os.replace(there, old / "model")
                     os.replace(new, there)
     return load_spec(there), model
 
 
 def remove(name: str) -> Path:
-    """Delete a registered model's folder and return where it was. Raises `PblError` MODEL_MISSING, FILE_UNWRITABLE."""
+    """Delete a registered model's folder and return its path. Raises `PblError` MODEL_MISSING, FILE_UNWRITABLE."""
     folder = find(name)
     with os_errors_as(
         "FILE_UNWRITABLE", "a folder of models that you may change", "ask the owner of the folder", folder
@@ -238,7 +234,7 @@ def remove(name: str) -> Path:
 
 
 def verify(name: str, device: str | None = None) -> OnnxModel:
-    """Load a registered model and run it once: checksum, graph, shapes. Raises what `OnnxModel` does."""
+    """Load a registered model and run it once: checksum, graph, shapes. Raises as `OnnxModel`."""
     return OnnxModel(find(name), device)
 
 

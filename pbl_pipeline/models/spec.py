@@ -1,4 +1,4 @@
-"""`model.json`: what a keypoint model takes and gives, validated at the door (docs/models.md)."""
+"""`model.json`: input and output of a model, validated (docs/models.md)."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.paramset import canonical_json
 
 SPEC_FILE, GRAPH_FILE = "model.json", "model.onnx"
-#: Kind -> the outputs that it must have.
+#: Kind -> its required outputs.
 KINDS: dict[str, tuple[str, ...]] = {
     "crop3d": ("coords2d", "coords3d"),
     "simcc": ("simcc_x", "simcc_y"),
     "heatmap": ("heatmap",),
     "person_detector": ("boxes",),
 }
-#: Kinds that find people, not points: they have no marker set.
+#: Kinds that detect people, not points: they have no marker set.
 WITHOUT_POINTS = ("person_detector",)
 _NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,39}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-#: What the text of a licence or a source may take.
+#: Most characters of the text of a licence or a source.
 _LONGEST = 500
 _REQUIRED = ("name", "kind", "sha256", "licence", "source", "input", "outputs")
 _POINTS = ("marker_set", "joint_names")
 _OPTIONAL_POINTS = ("mirror_pairs", "pixel_origin", "box_margin", "simcc_split")
 _OPTIONAL = ("comment",)
 _INPUT = ("name", "width", "height", "layout", "colour", "mean", "std")
-#: Fields that change no number of the result; the others are hashed into the method's parameters.
+#: Fields that do not affect results; the others are hashed into the method's parameters.
 _WORDS = ("name", "licence", "source", "comment")
-#: Ways in which names tell the sides apart: (left, right) at the beginning or the end of a name.
+#: Marks of the sides (left, right) at the beginning or the end of a name.
 _SIDES = (("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("l", "r"), ("L", "R"))
 #: MODEL_INVALID about a file of a model.
 model_invalid = functools.partial(
@@ -45,15 +45,14 @@ model_invalid = functools.partial(
 
 @dataclasses.dataclass(frozen=True)
 class ModelInput:
-    """The picture that a model takes: `name` of the graph's input, `width` and `height` in px, `layout` NCHW or NHWC,
-    `colour` RGB or BGR; value = (v - mean) / std with v in 0..255, a mean and std for each channel in that order."""
+    """Input picture of a model; value = (v - mean) / std with v from 0 to 255."""
 
-    name: str
-    width: int
+    name: str  # of the graph's input
+    width: int  # px, as the height
     height: int
-    layout: str
-    colour: str
-    mean: tuple[float, float, float]
+    layout: str  # "NCHW" or "NHWC"
+    colour: str  # "RGB" or "BGR"
+    mean: tuple[float, float, float]  # of each channel in that order
     std: tuple[float, float, float]
 
 
@@ -74,15 +73,15 @@ class ModelSpec:
     outputs: Mapping[str, str]  # role (above) -> name in the graph
     marker_set: str
     joint_names: tuple[str, ...]
-    mirror: tuple[int, ...]  # (J,) ints for each point of a mirrored picture, whose it is
-    pixel_origin: str  # where coordinates of the crop count from: "centre" of the first pixel, or its "edge"
-    box_margin: float  # how much larger than the person's box (the region of interest) the crop is to be
+    mirror: tuple[int, ...]  # (J,) index of each point in a mirrored picture
+    pixel_origin: str  # of coordinates in the crop: "centre" of the first pixel, or its "edge"
+    box_margin: float  # size of the crop over that of the person's box (the region of interest)
     simcc_split: float
-    spec_sha256: str  # over all that changes a result, without names and licences
+    spec_sha256: str  # of all fields that affect a result, without names and licences
 
 
 def load_spec(folder: str | Path) -> ModelSpec:
-    """Read `model.json` of a model's folder. Whether `model.onnx` fits it, `OnnxModel` checks.
+    """Read `model.json` of a model's folder. `OnnxModel` checks that `model.onnx` agrees with it.
 
     Raises `PblError` MODEL_MISSING: no such folder or file. MODEL_INVALID: not JSON, a field missing, unknown or of a
     wrong kind. MARKER_SET_UNKNOWN: the joint names are not those of the marker set of the body that is named.
@@ -91,20 +90,20 @@ def load_spec(folder: str | Path) -> ModelSpec:
     with os_errors_as(
         "MODEL_MISSING",
         f"a folder with {GRAPH_FILE} and {SPEC_FILE}",
-        "see docs/models.md for what a model's folder holds",
+        "docs/models.md describes the folder of a model",
         path,
     ):
         try:
             content = read_json(path)
         except ValueError as error:
-            raise model_invalid(f"no JSON text ({error})", "a JSON object", key=path) from error
+            raise model_invalid(f"not JSON ({error})", "a JSON object", key=path) from error
     if not isinstance(content, dict):
         raise model_invalid("no named fields", "a JSON object", key=path)
     return parse_spec(content, path)
 
 
 def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
-    """The spec from the fields of `model.json`; `path` is named in errors. Raises as `load_spec`."""
+    """Parse the fields of `model.json`; `path` is named in errors. Raises as `load_spec`."""
     points = content.get("kind") not in WITHOUT_POINTS
     required = (*_REQUIRED, *(_POINTS if points else ()))
     _fields(path, "", content, required, (*(_OPTIONAL_POINTS if points else ()), *_OPTIONAL))
@@ -153,7 +152,7 @@ def parse_spec(content: Mapping[str, Any], path: str | Path) -> ModelSpec:
 
 
 def mirror_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Pairs (left, right) that the names tell: equal but for left/right or l/r, in either case, at one end."""
+    """Pairs (left, right) of names that are equal but for left/right or l/r, in either case, at one end."""
     known, pairs = set(names), []
     for name in names:
         for left, right in _SIDES:
@@ -195,7 +194,7 @@ def _mirror(path: str | Path, names: list[str], stated: Any) -> tuple[int, ...]:
 
 
 def _check_marker_set(markers: str, names: Sequence[str]) -> None:
-    """A set of the body must be given in its order; another set is the lab's own, and the fit asks for its table."""
+    """Check the order of a marker set of the body; another set is the lab's own, and the fit asks for its table."""
     from pbl_pipeline.body import MARKER_SETS, marker_set
 
     if markers in MARKER_SETS:

@@ -1,8 +1,8 @@
 """MediaPipe's single-shot detectors: a square input, boxes with keypoints relative to fixed anchors, suppression.
 
 Person and face detectors differ only in the size of the input, the layers of anchors and the number of keypoints.
-Layout: the graph configurations beside the models in the mediapipe 0.10.21 wheel; Bazarevsky et al. 2019, "BlazeFace",
-arXiv:1907.05047, for the suppression that averages.
+Layout: the graph configurations next to the models in the mediapipe 0.10.21 wheel; Bazarevsky et al. 2019, "BlazeFace",
+arXiv:1907.05047, for the averaging suppression.
 """
 
 from __future__ import annotations
@@ -17,15 +17,17 @@ from scipy.special import expit
 
 from .network import Network
 
+#: Overlap (intersection over union) above which boxes of one network are of one object.
+_MIN_IOU = 0.3
+
 
 @dataclasses.dataclass(frozen=True)
 class SsdLayout:
-    """Shape of a detector: side of its input (px), layers of anchors (stride in px of the input, anchors per cell), and
-    keypoints beside each box."""
+    """Shape of a detector."""
 
-    input_size: int
-    layers: tuple[tuple[int, int], ...]
-    n_keypoints: int
+    input_size: int  # side of the input, px
+    layers: tuple[tuple[int, int], ...]  # of anchors: stride in px of the input, anchors per cell
+    n_keypoints: int  # of each box
 
     @functools.cached_property
     def anchor_centres(self) -> np.ndarray:
@@ -40,11 +42,11 @@ class SsdLayout:
 
     @property
     def n_values(self) -> int:
-        """Values of a box: centre and size, then x and y of each keypoint."""
+        """Number of values of a box: centre and size, then x and y of each keypoint."""
         return 4 + 2 * self.n_keypoints
 
     def decode(self, raw_boxes: np.ndarray, raw_scores: np.ndarray, min_score: float) -> tuple[np.ndarray, np.ndarray]:
-        """Values (M, `n_values`) in 0..1 of the input (x0, y0, x1, y1, keypoints x y) and scores (M,), best first.
+        """Decode boxes (M, `n_values`), 0 to 1 of the input (x0, y0, x1, y1, keypoints x y) and scores (M,), sorted.
 
         raw_boxes (N, `n_values`): centre, size and keypoints in input pixels relative to the anchor; raw_scores (N,)
         logits.
@@ -65,17 +67,15 @@ class SsdLayout:
 class SsdModel:
     """A loaded detector of a layout. Not to be shared by threads. Raises the `PblError`s of `Network`."""
 
-    def __init__(
-        self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float, min_iou: float = 0.3
-    ) -> None:
-        # 0 is black: the letterbox bars must be what the network knows as black (-1), not grey.
+    def __init__(self, model_path: str | Path, sha256: str, layout: SsdLayout, min_score: float) -> None:
+        # The bars of the letterbox are 0, the network's black (-1), not grey.
         self._model = Network(model_path, sha256, scale=2 / 255, offset=-1.0)
         self.sha256 = self._model.sha256
-        self._layout, self._min_score, self._min_iou = layout, min_score, min_iou
+        self._layout, self._min_score = layout, min_score
 
     def find(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the boxes and keypoints (M, 2 + K, 2) in pixels of `image` (H, W, 3) uint8 BGR, which they may
-        leave, and scores (M,), best first."""
+        """Find boxes: their corners and keypoints (M, 2 + K, 2) in pixels of `image` (H, W, 3) uint8 BGR, possibly
+        beyond it, and scores (M,), best first."""
         size = self._layout.input_size
         height, width = image.shape[:2]
         scale = size / max(height, width)
@@ -88,7 +88,7 @@ class SsdModel:
         n = len(self._layout.anchor_centres)
         raw_boxes = output[n * self._layout.n_values].reshape(n, -1)
         values, scores = self._layout.decode(raw_boxes, output[n].reshape(n), self._min_score)
-        values, scores = suppress(values, scores, self._min_iou)
+        values, scores = suppress(values, scores, _MIN_IOU)
         points = values.reshape(-1, self._layout.n_values // 2, 2) * size
         # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
         return (points - [left, top]) * [width / w, height / h] - 0.5, scores
@@ -113,8 +113,8 @@ def suppress(values: np.ndarray, scores: np.ndarray, min_iou: float) -> tuple[np
 
 
 def box_iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Intersection over union of one box (4,), or as many (N, 4), with boxes (N, 4), corners x0 y0 x1 y1. Empty boxes
-    give 0."""
+    """Intersection over union of one box (4,), or as many (N, 4), with boxes (N, 4), corners x0 y0 x1 y1; 0 for empty
+    boxes."""
     size = np.minimum(box[..., 2:4], boxes[:, 2:4]) - np.maximum(box[..., 0:2], boxes[:, 0:2])
     intersection = np.prod(np.maximum(size, 0.0), axis=1)
     area = np.prod(np.maximum(box[..., 2:4] - box[..., 0:2], 0.0), axis=-1)

@@ -1,11 +1,9 @@
-"""One place that loads a TensorFlow Lite model: hash checked, thread count fixed.
+"""TensorFlow Lite models, loaded with a checked hash and only the outputs that are used.
 
-A TensorFlow Lite model without the branches that no one asks for.
-
-BlazePose's landmark network also draws a silhouette of 256 x 256 and a heatmap for every point. Those two branches are
-a seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every
-output that the file names, so the file is rewritten with fewer; the rest is computed from the same weights in the
-same order, bit for bit.
+BlazePose's landmark network also returns a silhouette of 256 x 256 and a heatmap for every point. Those two branches
+are a seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every
+output of the file, so the file is rewritten with fewer; the rest is computed from the same weights in the same order,
+bit for bit.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ _FILE_IDENTIFIER = b"TFL3"
 
 
 def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
-    """The same model with only those outputs whose number of elements is one of `sizes`, and what they need.
+    """Reduce a model to the outputs whose number of elements is one of `sizes`, and the operations that they need.
 
     Raises
     ------
@@ -55,7 +53,7 @@ def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
             needed.add(number)
             open_tensors += [int(t) for t in graph.operators[number].inputs if t >= 0]
     graph.operators = [op for number, op in enumerate(graph.operators) if number in needed]
-    # Signatures name the outputs that are gone; nothing here calls a model by its signature.
+    # Signatures name removed outputs; no model is called by its signature here.
     content.signatureDefs = None
     builder = flatbuffers.Builder(len(model))
     builder.Finish(content.Pack(builder), _FILE_IDENTIFIER)
@@ -63,8 +61,8 @@ def keep_outputs(model: bytes, sizes: Collection[int]) -> bytes:
 
 
 def read_network(path: str | Path, sha256: str, outputs: Collection[int] | None = None) -> bytes:
-    """Return the bytes of a network's file with the wanted outputs, None: all of them; those of the last networks stay
-    in memory. Raises `PblError` ASSET_CHECKSUM: the file is not the one of that hash."""
+    """Return the bytes of a network's file with the wanted outputs (None: all); those of the last networks stay in
+    memory. Raises `PblError` ASSET_CHECKSUM: the file has another hash."""
     return _read_network(path, Path(path).stat().st_mtime_ns, sha256, None if outputs is None else tuple(outputs))
 
 
@@ -90,8 +88,8 @@ _done: set[bytes] = set()
 
 @contextmanager
 def without_notice(words: bytes) -> Iterator[None]:
-    """Keep lines with these words off the standard error, the first time in a process that the block is entered; what
-    else is written there is written after the block. For a library that says it once and has no setting for it."""
+    """Suppress lines with these words on the standard error, the first time in a process that the block is entered;
+    other lines are written after the block. For a library that prints a notice once and has no setting for it."""
     with _lock:
         first = words not in _done
         _done.add(words)
@@ -110,17 +108,17 @@ def without_notice(words: bytes) -> Iterator[None]:
             os.write(_STDERR, b"".join(line for line in kept if words not in line))
 
 
-#: Two threads are the sweet spot of these small models; more only waits. Not a method parameter.
+#: Two threads are fastest for these small models. Not a method parameter.
 NUM_THREADS = 2
 
 
 class LiteModel:
     """A loaded .tflite model with one float32 image input. Not to be shared by threads.
 
-    `outputs`: numbers of elements of the outputs that are wanted; the others are not computed (`keep_outputs`). None:
-    all of them. `num_threads`: of one call; where several models work side by side, one each is fastest.
+    `outputs`: numbers of elements of the wanted outputs (None: all); the others are not computed (`keep_outputs`).
+    `num_threads`: of one call; with several models in parallel, one each is fastest.
 
-    Raises `PblError` ASSET_CHECKSUM when the file is not the pinned one: results name the model by its hash.
+    Raises `PblError` ASSET_CHECKSUM if the file is not the pinned one: results name the model by its hash.
     """
 
     def __init__(
@@ -132,7 +130,7 @@ class LiteModel:
     ) -> None:
         content = read_network(path, sha256, outputs)
         self.sha256 = sha256
-        # Here and not above: whoever only fits or reads results does not wait for the runtime.
+        # Not at the top: commands that only fit or read results do not wait for the runtime.
         from ai_edge_litert.interpreter import Interpreter
 
         with without_notice(b"XNNPACK delegate"):

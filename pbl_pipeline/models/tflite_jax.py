@@ -1,6 +1,6 @@
 """A TensorFlow Lite model as a JAX function of a batch of pictures, for a GPU, which LiteRT does not use.
 
-Only the operations of the networks here are known; a model with another one is left to LiteRT. On a CPU LiteRT is some
+Only the operations of the networks here are supported; LiteRT computes models with others. On a CPU LiteRT is some
 thirty times faster than XLA's program of the same model.
 """
 
@@ -34,16 +34,11 @@ _DTYPES = {0: np.float32, 1: np.float16, 2: np.int32}  # of `TensorType`
 
 @dataclasses.dataclass(frozen=True)
 class JaxModel:
-    """A model with one float32 image input.
+    """A model with one float32 image input."""
 
-    `weights` (tensor number -> array) are an argument of `__call__`, so that they are no constants of its program.
-    `image_shape`: height, width, channels. `output_sizes`: numbers of elements of the outputs for one picture, in
-    the order in which `__call__` returns them.
-    """
-
-    weights: dict[int, np.ndarray]
-    image_shape: tuple[int, int, int]
-    output_sizes: tuple[int, ...]
+    weights: dict[int, np.ndarray]  # by number of the tensor; an argument of `__call__`, not constants of its program
+    image_shape: tuple[int, int, int]  # height, width, channels
+    output_sizes: tuple[int, ...]  # numbers of elements of the outputs for one picture, in the order of `__call__`
     _steps: tuple[tuple[Callable[..., Any], tuple[int, ...], int], ...]
     _input: int
     _outputs: tuple[int, ...]
@@ -63,7 +58,7 @@ def read_model(content: bytes) -> JaxModel:
     Raises
     ------
     PblError
-        MODEL_INVALID: the model has an operation, or a variant of one, that is not known here; the text names it.
+        MODEL_INVALID: the model has an operation, or a variant of one, that is not supported; the text names it.
     """
     from ai_edge_litert import schema_py_generated as schema
 
@@ -110,7 +105,7 @@ def _unknown(name: str) -> PblError:
 
 
 def _constant(tensor: Any, buffer: Any) -> np.ndarray | None:
-    """The values of a tensor that the file holds, dense; None for one that is computed."""
+    """Values of a tensor in the file, dense; None for one that is computed."""
     if buffer.data is None or len(buffer.data) == 0:
         return None
     if tensor.type not in _DTYPES:
@@ -162,10 +157,10 @@ def _activated(options: Any, compute: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _convolution(options: Any, depthwise: bool) -> Callable[..., Any]:
-    """Shifted pictures, side by side, times one matrix; depthwise the sum of shifted pictures times their weights.
+    """Concatenated shifted pictures times one matrix; depthwise the sum of shifted pictures times their weights.
 
-    NVIDIA's library has its own convolutions, but float32 ones that are fast are found by trial (half a minute a
-    network), and convert the order of axes before and after. These are a third faster, without a trial.
+    NVIDIA's library has its own convolutions, but finds fast ones for float32 by trial (half a minute a network), and
+    converts the order of axes before and after. These are a third faster, without a trial.
     """
     stride, dilation = (options.strideH, options.strideW), (options.dilationHFactor, options.dilationWFactor)
 
@@ -184,10 +179,6 @@ def _convolution(options: Any, depthwise: bool) -> Callable[..., Any]:
         return y + bias
 
     return _activated(options, compute)
-
-
-def _conv(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
-    return _convolution(options, depthwise=False)
 
 
 def _depthwise(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
@@ -225,23 +216,11 @@ def _depth_to_space(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int,
     return compute
 
 
-def _concatenation(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
-    return _activated(options, lambda *x: jnp.concatenate(x, axis=options.axis))
-
-
-def _add(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
-    return _activated(options, jnp.add)
-
-
-def _reshape(options: Any, fixed: Sequence[np.ndarray], shape: tuple[int, ...]) -> Callable[..., Any]:
-    return lambda x: x.reshape(x.shape[0], *shape[1:])
-
-
 _Operation = Callable[[Any, Sequence[np.ndarray], tuple[int, ...]], Callable[..., Any]]
 _OPERATIONS: dict[str, _Operation] = {
-    "ADD": _add,
-    "CONCATENATION": _concatenation,
-    "CONV_2D": _conv,
+    "ADD": lambda options, fixed, shape: _activated(options, jnp.add),
+    "CONCATENATION": lambda options, fixed, shape: _activated(options, lambda *x: jnp.concatenate(x, options.axis)),
+    "CONV_2D": lambda options, fixed, shape: _convolution(options, depthwise=False),
     "DENSIFY": lambda options, fixed, shape: lambda x: x,
     "DEPTHWISE_CONV_2D": _depthwise,
     "DEPTH_TO_SPACE": _depth_to_space,
@@ -250,6 +229,6 @@ _OPERATIONS: dict[str, _Operation] = {
     "MAX_POOL_2D": _max_pool,
     "PAD": _pad,
     "RELU": lambda options, fixed, shape: jax.nn.relu,
-    "RESHAPE": _reshape,
+    "RESHAPE": lambda options, fixed, shape: lambda x: x.reshape(x.shape[0], *shape[1:]),
     "RESIZE_BILINEAR": _resize,
 }

@@ -5,7 +5,6 @@ from ._check import (
     EMPTY,
     FAIL,
     NEEDS_CHOICE,
-    ORDER,
     OUTCOMES,
     PASS,
     WARN,

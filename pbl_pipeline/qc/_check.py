@@ -14,7 +14,7 @@ CADENCE = "cadence_plausible"
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A named check. `value` and `threshold` are in the unit that `check` names; None where none applies."""
+    """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 
     check: str
     outcome: str
@@ -31,31 +31,30 @@ class Check:
 
 
 def warn_if(bad: object, check: str, value: float | None, threshold: float | None, advice: str) -> Check:
-    """A check that asks with `advice` for attention where something is `bad`, else passes."""
+    """Return a check that warns with `advice` if `bad`, else passes."""
     return Check(check, WARN if bad else PASS, value, threshold, advice if bad else "")
 
 
 def worst(checks: Iterable[Check]) -> str:
-    """The worst outcome; PASS when there is no check."""
+    """The worst outcome; PASS without checks."""
     return max((c.outcome for c in checks), key=OUTCOMES.index, default=PASS)
 
 
 def in_session(outcome: str, measured: bool) -> str:
-    """What an outcome means for a session: where the session has measures, one recording without gait, or no index,
-    makes it one to be read with care (WARN), not an empty one."""
+    """Return a recording's outcome as it counts for its session: EMPTY (no gait, no index) is only a warning if the
+    session has measures."""
     return WARN if measured and outcome == EMPTY else outcome
 
 
 def failed(fit_checks: Iterable[Check]) -> tuple[str, ...]:
     """Names of the checks that FAIL: nothing is measured on a fit with one of them.
 
-    The one rule for files and tables: a body that does not lie on the person says nothing of how she walks, so the
-    gait cycles of such a fit are not used.
+    One rule for files and tables: if the body does not lie on the person, the gait cycles of the fit are not used.
     """
     return tuple(c.check for c in fit_checks if c.outcome == FAIL)
 
 
-#: Names of the checks of fit, events, cycles and index as the functions that make them return them.
+#: Names of the checks of fit, events, cycles and index, in the order in which they are made.
 ORDER = (
     "residual_2d_share_of_body_height",
     "residual_3d_cm",
@@ -93,5 +92,5 @@ _PLACE = {name: i for i, name in enumerate(ORDER)}
 
 
 def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
-    """Return the checks of one stage in the order in which it made them; others after them, as they come."""
+    """Return the checks of one stage in the order in which they were made; unknown ones last, in the given order."""
     return tuple(sorted(checks, key=lambda c: _PLACE.get(c.check, len(ORDER))))

@@ -1,4 +1,4 @@
-"""The fitted body drawn over the recording."""
+"""Drawing of the fitted body over the recording."""
 
 from pbl_pipeline.render.body_poses import BodyTrack, body_track, uncertain_sides
 from pbl_pipeline.render.drawing import (

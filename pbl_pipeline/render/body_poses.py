@@ -1,4 +1,4 @@
-"""The fitted body as poses, frame by frame, for a program that draws it itself."""
+"""Poses of the fitted body in each frame, for programs that draw it themselves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import CapsuleShapes, capsule_frames, capsule_shapes, capsules, load_body
+from pbl_pipeline.body import CapsuleShapes, body_frames, capsule_shapes, capsules, load_body
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.checks import SD_WARN_DEG
 from pbl_pipeline.keypoints import Keypoints
@@ -24,9 +24,8 @@ _LEG = ("hip", "knee", "ankle", "heel", "foot_index")
 class BodyTrack:
     """B bodies over T frames in the world of the fit (z up, origin at the camera)."""
 
-    #: Of the bodies; the side is "left", "right" or "middle".
-    names: tuple[str, ...]
-    sides: tuple[str, ...]
+    names: tuple[str, ...]  # of the bodies
+    sides: tuple[str, ...]  # "left", "right" or "middle"
     leg: np.ndarray  # (B,) true for the bodies of the two legs, from the thigh on
     parent: np.ndarray  # (B,) index of the parent; -1 for the root, which comes first
     #: (B, 3) origin of a body in its parent's frame, the same in every pose: the joints turn bodies about their
@@ -38,25 +37,25 @@ class BodyTrack:
     quat_wxyz: np.ndarray
     shapes: CapsuleShapes  # the capsules in the bodies' frames
     #: Height of the floor: the median over the frames of the body's lowest point, because a foot is on the floor in
-    #: most frames of a walk. NaN where no pose is known.
+    #: most frames of a walk. NaN if no pose is known.
     floor_m: float
 
 
 def body_track(fit: TrialFit) -> BodyTrack:
-    """The body of a fit in every frame of its video, with the shapes that `render_overlay` draws.
+    """Return the body of a fit in every frame of its video, with the shapes that `render_overlay` draws.
 
     Raises `PblError` FILE_FORMAT for a fit of another body model than the installed one.
     """
     body = load_body()
     check_body(fit, body)
-    at, shapes = capsule_frames(body, fit.qpos, fit.scale), capsule_shapes(body, fit.scale)
+    at, shapes = body_frames(body, fit.qpos, fit.scale), capsule_shapes(body, fit.scale)
     known = np.flatnonzero(np.asarray(np.isfinite(at.position_m).all(axis=(1, 2)), bool))
     n, parent = len(body.body_names), np.asarray(body.parent_index)
     quat = np.full((len(at.position_m), n, 4), np.nan)
     if len(known):
         found = Rotation.from_matrix(at.rotation[known].reshape(-1, 3, 3)).as_quat(scalar_first=True)
         found = found.reshape(len(known), n, 4)
-        # q and -q are one rotation; each is turned to its predecessor, so that values in between mean something.
+        # q and -q are one rotation; each gets the sign of its predecessor, so that they can be interpolated.
         turned = np.sign(np.sum(found[1:] * found[:-1], axis=2, keepdims=True))
         found[1:] *= np.cumprod(np.where(turned == 0, 1.0, turned), axis=0)
         quat[known] = found
@@ -78,7 +77,7 @@ def body_track(fit: TrialFit) -> BodyTrack:
 
 
 def _offsets(position_m: np.ndarray, rotation: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """(B, 3): where the bodies of one pose, if there is one, lie in the frames of their parents."""
+    """(B, 3) origins of the bodies of one pose, if there is one, in the frames of their parents."""
     offset = np.zeros((len(parent), 3))
     if len(position_m):
         between = position_m[0, 1:] - position_m[0, parent[1:]]
@@ -95,9 +94,8 @@ def uncertain_sides(
     """Side -> (T,) bool: frames in which its leg is less certain than it looks.
 
     It is behind the other leg (`far_legs`: side, start and end in s, of the cycles: `GaitCycle.far_leg`); or the mean
-    confidence of its points is below `SEEN_CONFIDENCE` (marker sets without points of such names tell nothing); or the
-    standard deviation of one of its angles (`gait.leg_angles_sd`, (T,) deg) is that from which on the check
-    `joints_not_observed` calls a joint not observed.
+    confidence of its points is below `SEEN_CONFIDENCE` (if the marker set has points of these names); or the standard
+    deviation of one of its angles (`gait.leg_angles_sd`, (T,) deg) reaches that of the check `joints_not_observed`.
     """
     time = np.asarray(time_s, float)
     out = {side: np.zeros(len(time), bool) for side in ("left", "right")}

@@ -1,4 +1,4 @@
-"""World points projected into one picture; capsules, keypoints, skeletons and the strip below drawn with OpenCV.
+"""Projection of world points into one picture, and drawing of capsules, keypoints, skeletons and the strip below.
 
 Colours are blue and vermilion of Okabe and Ito (2008), which differ for every colour vision."""
 
@@ -17,7 +17,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.runs import runs
 from pbl_pipeline.video import Camera, turning_radius2
 
-#: Nothing nearer to the camera than this is drawn (m): the pinhole equations grow without bound there.
+#: Least depth of drawn points (m): the pinhole equations grow without bound below.
 NEAR_M = 0.1
 
 
@@ -40,8 +40,8 @@ def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
     """Pixels (..., 2) of camera-frame points (..., 3).
 
     Pinhole with OpenCV's radial-tangential distortion (k1, k2, p1, p2, k3). NaN for points nearer than `NEAR_M` or
-    behind the camera, and for points so far off the axis that the radial polynomial turns back: beyond that angle the
-    polynomial is not a lens, and it would fold the point into the picture.
+    behind the camera, and for points so far off the axis that the radial polynomial turns back, which would fold them
+    into the picture.
     """
     p = np.asarray(points_cam_m, float)
     depth = np.where(p[..., 2] >= NEAR_M, p[..., 2], np.nan)
@@ -56,12 +56,12 @@ def to_pixels(points_cam_m: np.ndarray, camera: Camera) -> np.ndarray:
     return np.stack([m[0, 0] * xd + m[0, 1] * yd + m[0, 2], m[1, 1] * yd + m[1, 2]], axis=-1)
 
 
-#: side -> "#rrggbb". Left is the warm colour, as in most gait laboratories.
+#: Side -> "#rrggbb". Left is the warm colour, as in most gait laboratories.
 SIDE_COLOUR: dict[str, str] = {"right": "#0072b2", "left": "#d55e00", "middle": "#8a8f98"}
 
 
 def bgr(colour: str) -> tuple[int, int, int]:
-    """OpenCV's order of a "#rrggbb" colour."""
+    """Convert a "#rrggbb" colour to OpenCV's order."""
     value = int(colour.lstrip("#"), 16)
     return value & 255, (value >> 8) & 255, value >> 16
 
@@ -93,8 +93,7 @@ def skeleton_lines(names: Sequence[str]) -> list[tuple[int, int, str]]:
 
 
 def draw_skeleton(image: np.ndarray, names: Sequence[str], xy_px: np.ndarray) -> None:
-    """Draw the lines between known points (J, 2) in px into `image` (H, W, 3) uint8 BGR, in place; nothing of a
-    face."""
+    """Draw the lines between known points (J, 2) in px into `image` (H, W, 3) uint8 BGR, in place, without a face."""
     known = np.asarray(np.isfinite(xy_px).all(axis=1), bool)
     width = max(2, round(max(image.shape[:2]) / 320))
     for a, b, side in skeleton_lines(names):
@@ -105,8 +104,8 @@ def draw_skeleton(image: np.ndarray, names: Sequence[str], xy_px: np.ndarray) ->
 
 _CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 24, endpoint=False)) for f in (np.cos, np.sin)], axis=-1)
 _SHIFT = 4  # OpenCV's polygon corners carry this many fractional bits
-_SHADE_DEPTH_M = 0.35  # this far before or behind the middle of the body the shading is full
-_FAR_PX = 20_000.0  # polygons that reach further than this are cut: OpenCV counts in 32 bit
+_SHADE_DEPTH_M = 0.35  # distance before or behind the middle of the body at which the shading is full
+_FAR_PX = 20_000.0  # polygons that reach further are cut: OpenCV counts in 32 bit
 
 
 def draw_body(
@@ -125,10 +124,10 @@ def draw_body(
     Parameters
     ----------
     body_names
-        The body of each of the G capsules. Its side (`_r`, `_l`) chooses the colour; the capsules of one body are
+        The body of each of the G capsules. Its side (`_r`, `_l`) determines the colour; the capsules of one body are
         drawn as one shape with one outline.
     start_m, end_m : (G, 3)
-        Ends of the axes, world frame. Capsules with NaN are left out; what lies behind `NEAR_M` is cut off.
+        Ends of the axes, world frame. Capsules with NaN are not drawn; parts behind `NEAR_M` are cut off.
     radius_m : (G,)
     quat_wxyz : (4,)
         Camera to world.
@@ -154,11 +153,11 @@ def draw_body(
     for name in sorted(outlines, key=lambda n: -depth[n]):
         corners = [np.rint(o * (1 << _SHIFT)).astype(np.int32) for o in outlines[name]]
         fill, edge = _shaded(SIDE_COLOUR[side_of(name)], (middle - depth[name]) / _SHADE_DEPTH_M)
-        # All outlines before all fills: what remains of them is the outline of the whole.
+        # All outlines before all fills, so that only the outline of the whole remains.
         cv2.polylines(layer, corners, True, edge, 2, cv2.LINE_AA, _SHIFT)
         for c in corners:
             cv2.fillConvexPoly(layer, c, fill, cv2.LINE_AA, _SHIFT)
-    # Only the rectangle around the body is blended: on a large frame that is most of the time saved.
+    # Only the rectangle around the body is blended, which saves most of the time on a large frame.
     every = np.concatenate([o for group in outlines.values() for o in group])
     limit = [image.shape[1], image.shape[0]]
     x0, y0 = (int(v) for v in np.clip(every.min(0) - 3, 0, limit))
@@ -169,10 +168,10 @@ def draw_body(
 
 
 def capsule_outline(start_cam_m: np.ndarray, end_cam_m: np.ndarray, radius_m: float, camera: Camera):
-    """Convex outline (K, 2) in px of a capsule given in the camera frame; None where nothing of it can be drawn.
+    """Convex outline (K, 2) in px of a capsule in the camera frame; None if nothing of it can be drawn.
 
-    The outline is the hull of the discs that the two end spheres project to. A disc stands for the ellipse that a
-    sphere really projects to off the axis; at 30 degrees off the axis the two differ by 15 % of the radius.
+    The outline is the hull of the projections of the two end spheres, taken as discs. Off the axis they are really
+    ellipses; at 30 degrees the two differ by 15 % of the radius.
     """
     ends = np.stack([start_cam_m, end_cam_m]).astype(float)
     if not np.all(np.isfinite(ends)) or np.all(ends[:, 2] < NEAR_M):
@@ -226,7 +225,7 @@ _FONT_NAME = "sans"  # OpenCV carries this font itself
 
 
 class Event(Protocol):
-    """What is drawn of a gait event: `side` "left" or "right", `event` "foot_down" or "foot_up"."""
+    """Fields of a gait event that are drawn: `side` "left" or "right", `event` "foot_down" or "foot_up"."""
 
     @property
     def time_s(self) -> float: ...
@@ -330,7 +329,7 @@ class Strip:
         right: bool = False,
         weight: int = 400,
     ) -> int:
-        """Write `text` with its base line at `at` (left end, or right end if `right`); returns the x it ends at."""
+        """Write `text` with its base line at `at` (left end, or right end if `right`); return the x of its end."""
         flags = cv2.PUT_TEXT_ALIGN_RIGHT if right else cv2.PUT_TEXT_ALIGN_LEFT
         end, _ = cv2.putText(picture, text, at, colour, self._font, self._text_px, weight, flags)
         return int(end[0])

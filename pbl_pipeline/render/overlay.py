@@ -1,4 +1,4 @@
-"""The fitted body drawn over the recording: a video that browsers play, and single frames for the report."""
+"""Overlay of the fitted body on the recording: a video that browsers play, and single frames for the report."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _changed = functools.partial(
 
 
 class _Painter:
-    """Draws one trial's body and keypoints into its frames, at any size of the picture."""
+    """Draws the body and keypoints of one trial into its frames, at any size of the picture."""
 
     def __init__(self, fit: TrialFit, keypoints: Keypoints | None) -> None:
         if keypoints is not None and len(keypoints.time_s) != len(fit.time_s):
@@ -51,7 +51,7 @@ class _Painter:
         self._body, self._block, self._capsules = body, -1, None
 
     def _pose(self, index: int) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Body names, starts, ends and radii of the capsules in one frame; posed in blocks, so that memory stays."""
+        """Body names, starts, ends and radii of the capsules in one frame; computed in blocks to limit the memory."""
         block, row = divmod(index, _BLOCK)
         if self._capsules is None or block != self._block:
             part = self.fit.qpos[block * _BLOCK : (block + 1) * _BLOCK]
@@ -63,7 +63,7 @@ class _Painter:
         return index < len(self._known) and bool(self._known[index])
 
     def box_px(self, index: int) -> np.ndarray | None:
-        """x0, y0, x1, y1 around the drawn body in the full-size frame; None where nothing of it is drawn."""
+        """x0, y0, x1, y1 around the drawn body in the full-size frame; None if nothing of it is drawn."""
         if not self.known(index):
             return None
         _, start_m, end_m, radius = self._pose(index)
@@ -109,29 +109,26 @@ def render_overlay(
     *,
     events: Sequence[Event] = (),
     max_side_px: int = 1280,
-    crf: int = 23,
 ) -> Path:
     """Write the recording with the fitted body over it as H.264 in MP4, and return its path.
 
-    Every frame of the video is in the output at its own time stamp (variable frame rate is kept); frames in which the
-    fit is unknown show the bare picture. Below the picture runs a strip with the knee flexion of both sides, the foot
-    contacts and the time. Memory does not grow with the length of the video.
+    Every frame of the video is in the output at its own time stamp (variable frame rate is kept); frames without a fit
+    show the bare picture. A strip below the picture shows the knee flexion of both sides, the foot contacts and the
+    time. Memory does not grow with the length of the video.
 
-    Raises `PblError` VIDEO_* when the video cannot be read; VIDEO_CHANGED when its frames are not those of the fit;
-    FILE_FORMAT when the keypoints are of another video.
+    Raises `PblError` VIDEO_* if the video cannot be read; VIDEO_CHANGED if its frames are not those of the fit;
+    FILE_FORMAT if the keypoints are of another video.
 
     Parameters
     ----------
     fit
         One trial; its frames are those of the video.
     out_path
-        An .mp4 file; written beside it first and moved when complete, so that no half file is left under this name.
+        An .mp4 file; it appears under this name when it is complete.
     events
         Foot contacts of this trial, `GaitEvents.events`.
     max_side_px
         The picture is scaled down until its longer side is at most this.
-    crf
-        x264's quality, 0 (lossless) to 51; 23 is its default.
     """
     out_path = Path(out_path)
     painter = _Painter(fit, keypoints)
@@ -156,7 +153,7 @@ def render_overlay(
             yield frame.time_s, picture
 
     try:
-        write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf)
+        write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf=23)
         if count != len(fit.time_s):
             raise _changed(f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
         part.replace(out_path)
@@ -174,12 +171,12 @@ def overlay_frames(
     max_side_px: int = 1280,
     crop_to_body: bool = False,
 ) -> list[np.ndarray]:
-    """Frames `indices` with the fitted body drawn, in the order asked for: BGR pictures (H, W, 3) uint8.
+    """Frames `indices` with the fitted body drawn, in this order: BGR pictures (H, W, 3) uint8.
 
-    `crop_to_body` cuts each picture to the drawn person with a margin (4:3 where the frame allows it); a frame whose
-    fit is unknown stays whole. The longer side is then scaled down to at most `max_side_px`.
+    `crop_to_body` crops each picture to the drawn person with a margin (4:3 if the frame allows it); a frame without a
+    fit stays whole. The longer side is then scaled down to at most `max_side_px`.
 
-    Raises `PblError` as `render_overlay`; USAGE when a frame does not exist.
+    Raises `PblError` as `render_overlay`; USAGE if a frame does not exist.
     """
     wanted = sorted({int(i) for i in indices})
     if wanted and (wanted[0] < 0 or wanted[-1] >= len(fit.time_s)):
@@ -211,12 +208,12 @@ def overlay_frames(
     return [pictures[int(i)] for i in indices]
 
 
-def report_indices(fit: TrialFit, n: int = 3) -> list[int]:
-    """Frames for the report: `n` of those with a known fit, evenly spread, not at the very ends. Fewer if there are."""
+def report_indices(fit: TrialFit) -> list[int]:
+    """Frames for the report: three of those with a known fit, or fewer, evenly spread, not at the very ends."""
     known = np.flatnonzero(_known(fit))
     if not len(known):
         return []
-    picks = known[np.rint((np.arange(n) + 0.5) / n * (len(known) - 1)).astype(int)]
+    picks = known[np.rint((np.arange(3) + 0.5) / 3 * (len(known) - 1)).astype(int)]
     return sorted({int(i) for i in picks})
 
 
@@ -227,19 +224,19 @@ def _known(fit: TrialFit) -> np.ndarray:
 
 
 def _even_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
-    """Size scaled down to the longest side allowed, both sides even: 4:2:0 colour needs that."""
+    """Size scaled down to the longest side allowed, both sides even, as 4:2:0 colour requires."""
     scale = min(1.0, max_side_px / max(size))
     return max(2, 2 * round(size[0] * scale / 2)), max(2, 2 * round(size[1] * scale / 2))
 
 
 def _resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    # Averaging areas is slow and needed only where pixels would be skipped.
+    # Averaging areas is slow and needed only if pixels would be skipped.
     way = cv2.INTER_AREA if size[0] < 0.6 * image.shape[1] else cv2.INTER_LINEAR
     return cv2.resize(image, (max(1, size[0]), max(1, size[1])), interpolation=way)
 
 
 def _crop(image: np.ndarray, box_px: np.ndarray | None) -> np.ndarray:
-    """The part of the picture around the box: 4:3, the body four fifths of its height, within the picture."""
+    """Part of the picture around the box: 4:3, the body four fifths of its height, within the picture."""
     if box_px is None:
         return image
     height, width = image.shape[:2]

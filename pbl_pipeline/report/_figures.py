@@ -1,4 +1,4 @@
-"""Charts and pictures of the page, made from results, and what a report shows beside its visit."""
+"""Charts and pictures of the report."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """One frame with the fitted body drawn over it, as `render.overlay_frames` gives it: (H, W, 3) uint8 BGR."""
+    """One frame with the fitted body drawn over it, from `render.overlay_frames`: (H, W, 3) uint8 BGR."""
 
     index: int
     time_s: float
@@ -34,7 +34,7 @@ _JPEG_QUALITY = 84
 
 
 def cycle_charts(cycles: Sequence[GaitCycle], bands: NormalBands) -> list[dict]:
-    """One chart per angle over the cycles that count: the joints first, then the pelvis. Empty without curves."""
+    """Draw one chart per angle over the used cycles: the joints first, then the pelvis. Empty without curves."""
     return [
         {
             "name": curve.title,
@@ -51,7 +51,7 @@ def _cycle_label(title: str, ranges: Ranges) -> str:
 
 
 def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
-    """The joint angles over the recording. Empty where the body was fitted in no frame."""
+    """Draw the joint angles over the recording. Empty if the body was fitted in no frame."""
     if not np.isfinite(fit.qpos).any():
         return []
     sides = leg_angles(fit)
@@ -65,7 +65,7 @@ def time_charts(fit: TrialFit, events: GaitEvents | None) -> list[dict]:
 
 
 def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
-    """Foot contacts over the recording; None without events."""
+    """Draw the foot contacts over the recording; None without events."""
     if not events.events:
         return None
     counts = ", ".join(
@@ -82,13 +82,13 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
 
 
 def known_spans(fit: TrialFit) -> list[tuple[float, float]]:
-    """Stretches (start, stop) in s in which the body is fitted."""
+    """Spans (start, stop) in s in which the body is fitted."""
     known = np.isfinite(np.asarray(fit.qpos, float)).all(axis=1)
     return [(float(fit.time_s[run][0]), float(fit.time_s[run][-1])) for run in runs(known)]
 
 
 def index_chart(values: dict[str, list[float]], title: str) -> Markup | None:
-    """The index of each cycle; None without any."""
+    """Draw the index of each cycle; None without any."""
     if not any(values.values()):
         return None
     means = ", ".join(
@@ -98,7 +98,7 @@ def index_chart(values: dict[str, list[float]], title: str) -> Markup | None:
 
 
 def picture(trial: str, p: Picture) -> dict:
-    """An overlay frame as a data URI with its texts."""
+    """Encode an overlay frame as a data URI with its texts."""
     ok, data = cv2.imencode(".jpg", p.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not ok:
         raise ValueError(f"picture of frame {p.index} cannot be encoded: shape {p.image.shape}, {p.image.dtype}")
@@ -112,7 +112,7 @@ def picture(trial: str, p: Picture) -> dict:
 
 
 def legend(*items: str) -> list[tuple[Markup, str]]:
-    """Key of a chart: samples of lines and areas with their words, from the names "left", "norm", ..."""
+    """Legend of a chart: samples of lines and areas with their texts, by the names "left", "norm", ..."""
     left, right = SIDE_COLOUR["left"], SIDE_COLOUR["right"]
     samples = {
         "left": (_line(left, 2.4, "7 3"), "Left"),

@@ -12,20 +12,20 @@ from pbl_pipeline import charts
 from pbl_pipeline.gait import GaitCycle, NormalBands, far_leg_of
 from pbl_pipeline.gait.events import SIDES
 
-#: Of each side the lowest and highest value (deg) of its mean curve.
+#: Side -> lowest and highest value (deg) of its mean curve.
 Ranges = dict[str, tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True)
 class CycleCurve:
-    """One angle: its chart; lowest and highest value (deg) of each side's mean curve and of that of the norm."""
+    """One angle with its chart."""
 
     name: str
     title: str
-    positive: str
+    positive: str  # the positive direction
     picture: Markup
     ranges: Ranges
-    norm: tuple[float, float] | None
+    norm: tuple[float, float] | None  # lowest and highest value (deg) of the norm's mean curve
 
 
 def cycle_curves(
@@ -34,14 +34,14 @@ def cycle_curves(
     names: Mapping[str, tuple[str, str]],
     label: Callable[[str, Ranges], str],
 ) -> list[CycleCurve]:
-    """Return the angles of `names` that the used cycles have.
+    """Draw the angles of `names` that the used cycles have.
 
     Parameters
     ----------
     names
-        Name of the angle -> its title and what is positive, such as `words.ANGLES`.
+        Name of the angle -> its title and positive direction, such as `words.ANGLES`.
     label
-        Says in words what a chart shows, of the angle's title and its ranges.
+        Describes a chart in words, by the angle's title and its ranges.
     """
     usable = [c for c in cycles if c.used and c.curves]
     faint = far_leg_of(usable) if usable else ""

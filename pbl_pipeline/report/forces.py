@@ -1,4 +1,4 @@
-"""The section on forces and joint moments."""
+"""Section of the report on forces and joint moments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 
 #: Smallest range of a chart by unit.
 _LEAST = {"BW": 0.2, "Nm/kg": 0.5, "W/kg": 1.0}
-#: The section is folded where the 90 % interval of the loading peak reaches further than this from it (body weights).
+#: The section is folded if half the 90 % interval of the loading peak is larger (body weights).
 _UNSURE_BW = 0.10
 _NOTE = (
     "From the motion alone, by the laws of Newton and Euler: no force was measured. Per body weight (BW) and kilogram. "
@@ -28,7 +28,7 @@ _NOTE = (
 
 
 def forces_section(visit: Visit) -> dict | None:
-    """Return the section for the template; None where forces were not computed."""
+    """Return the section for the template; None if forces were not computed."""
     kinetics = visit.kinetics
     if kinetics is None:
         return None
@@ -79,10 +79,9 @@ def _label(title: str, unit: str, n: int) -> str:
 
 
 def force_charts(kinetics: Kinetics, label: Callable[[str, str, int], str]) -> list[dict]:
-    """Return one chart for each curve that cycles have; of hip and knee, and powers, only where a measure of them is
-    known.
+    """Draw a chart for each curve that cycles have; of hip and knee, and of powers, only if a measure of them is known.
 
-    `label` describes a chart for those who do not see it, by the curve's title, its unit and the number of cycles.
+    `label` describes a chart for screen readers, by the curve's title, its unit and the number of cycles.
     """
     hidden = [
         text

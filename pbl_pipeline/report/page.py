@@ -1,4 +1,4 @@
-"""The page of a report, section by section, as plain values for the template."""
+"""Page of a report: plain values for the template, section by section."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check])
         NEEDS_CHOICE: "Several people are in view and none is clearly the subject:",
         FAIL: "The chain ended before there was anything to measure:"
         if metrics is None
-        else "A check failed. What is shown below is what came out, not how the person moves:",
+        else "A check failed. The results below do not show how the person moves:",
     }
     points = [f"{check_name(c)}: {c.advice}" if c.advice else check_name(c) for c in notable]
     return {
@@ -156,10 +156,10 @@ def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check])
 def _why_empty(visit: Visit) -> str:
     metrics = visit.measures
     if metrics is None or not metrics.reason:
-        return "Nobody walks in these recordings."
+        return "No one walks in these recordings."
     if len(metrics.trials) == 1:
         return sentence(metrics.trials[0].reason or metrics.reason)
-    return metrics.reason + "."  # begins with the name of a trial, which keeps its spelling
+    return metrics.reason + "."  # begins with the name of a trial, which is not capitalised
 
 
 def _tile(key: str, m: Measure | None, reason: str) -> dict:
@@ -190,7 +190,7 @@ def _gdi_tile(gdi: Gdi) -> dict:
 
 
 def _interval(gdi: Gdi) -> str:
-    """The index's 90 % interval and its minimal change; empty where the angles' error is not known."""
+    """The index's 90 % interval and its minimal change; "" if the angles' error is not known."""
     if gdi.interval is None or gdi.minimal_change is None:
         return ""
     low, high = (number(v, 0) for v in gdi.interval)
@@ -217,7 +217,7 @@ def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
 
 
 def _error(sd: float | None, decimals: int) -> str:
-    """Half the 90 % interval of a value; empty where its error is not known."""
+    """Half the 90 % interval of a value; "" if its error is not known."""
     return "" if sd is None else f"\N{PLUS-MINUS SIGN}{number(Z90 * sd, decimals)}"
 
 
@@ -277,7 +277,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle], people: str) -> dict:
 
 
 def _profile(gdi: Gdi) -> list[dict]:
-    """Rows of the Movement Analysis Profile: how far each angle is from the norm's mean curve."""
+    """Rows of the Movement Analysis Profile: difference of each angle from the norm's mean curve."""
     p = gdi.profile
     if p is None:
         return []
@@ -409,13 +409,12 @@ def write_report(
 ) -> Path:
     """Write the report of a visit as one HTML file and return its path.
 
-    The file holds its pictures, charts and styles and asks for nothing from elsewhere, so it can be mailed, printed
-    and opened from a folder. Every text is escaped. A visit without gait gives a page that says so and shows the
-    angles over time. The file appears when it is complete.
+    The file contains its pictures, charts and styles and loads nothing, so that it can be mailed, printed and opened
+    from a folder. Every text is escaped. The page of a visit without gait states that and shows the angles over time.
+    The file appears when it is complete.
 
-    `pictures`: by the name of the recording. `norm`: the set of the index; None for the one that the measures name,
-    where it is one that ships. `language`: one of `texts.LANGUAGES`. Raises what `Recording.fit` and
-    `Recording.keypoints` raise.
+    `pictures`: by the name of the recording. `norm`: the set of the index; None for the one that the measures name, if
+    it is included. `language`: one of `texts.LANGUAGES`. Raises as `Recording.fit` and `Recording.keypoints`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Names, numbers and sentences as people read them."""
+"""Names, numbers and sentences of the report."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def check_name(check: Check) -> str:
 
 
 def sentence(text: str) -> str:
-    """The text with a capital at its start and a full stop at its end."""
+    """Capitalise a text and end it with a full stop."""
     text = text.strip()
     return text and text[0].upper() + text[1:] + ("" if text[-1] in ".!?" else ".")
 
 
-def plural(n: int, one: str, many: str | None = None) -> str:
+def plural(n: int, one: str) -> str:
     """ "1 recording", "2 recordings"."""
-    return f"{n} {one if n == 1 else many or one + 's'}"
+    return f"{n} {one}{'s' * (n != 1)}"
 
 
 def size(n_bytes: int) -> str:

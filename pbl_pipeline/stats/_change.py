@@ -1,6 +1,6 @@
 """Paired values: standardised response mean, Cohen's d_z, Wilcoxon's signed ranks, agreement, the paper's errors.
 
-Everywhere change is post - pre, one value per person; without `post`, `pre` holds the changes themselves.
+Change is post - pre, one value per person; without `post`, `pre` holds the changes themselves.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
     """Limits of agreement of (N,) and (N,) values, one pair per person (Bland & Altman 1986, Lancet 327:307-310).
 
     The intervals of the limits are exact for normal differences (noncentral t; Carkeet 2015, Optom Vis Sci 92:e71-80).
-    Bland and Altman's own, limit and t sqrt(3 / n) sd, are nearly that from 50 pairs on.
+    Bland and Altman's, limit and t sqrt(3 / n) sd, are nearly equal from 50 pairs on.
 
     Raises `PblError` STATS_INPUT: fewer than three pairs, NaN, other lengths, all differences the same.
     """
@@ -71,9 +71,9 @@ def bland_altman(a: Any, b: Any, confidence: float = 0.95) -> BlandAltman:
     )
 
 
-#: Fewest persons whose change is judged: with fewer a jackknife or bootstrap has nothing to vary.
+#: Least number of persons for a jackknife or bootstrap of their change.
 MIN_PERSONS = 3
-#: Resamples that are ranked at a time (memory).
+#: Number of resamples that are ranked at a time, for the memory.
 _CHUNK = 2000
 
 
@@ -96,9 +96,8 @@ class Wilcoxon:
 
     statistic: float  # sum of the ranks of the positive changes
     p: float  # Two-sided; exact for up to 50 persons without equal changes, by `scipy.stats.wilcoxon`
-    #: Persons in all; those who did not change, whom the test leaves out.
-    n: int
-    zeros: int
+    n: int  # all persons
+    zeros: int  # persons who did not change, whom the test ignores
     effect: Estimate  # `effect_size` with its interval
     rank_biserial: float  # Matched-pairs rank-biserial correlation: (positive - negative) / all ranks (Kerby 2014)
 
@@ -157,8 +156,8 @@ def effect_size(
     with signs s and ranks R: the cosine between the signed ranks and ones, hence the scale. The paper does not name its
     n; its upper limit of 0.91 for mJOA-LE with 17 persons is out of reach without equal or absent changes.
     Interval: percentiles over `n_resamples` resamples of persons, drawn from `seed`, taken further out for few persons
-    (expanded percentiles, Hesterberg 2015, Am Stat 69:371-386). NaN where all who changed did so in one direction:
-    every resample does, too, and cannot show what other persons would do.
+    (expanded percentiles, Hesterberg 2015, Am Stat 69:371-386). NaN if all who changed did so in one direction: then
+    every resample does, and does not show how other persons would change.
 
     Raises `PblError` STATS_INPUT: fewer than three persons, NaN, all changes the same.
 
@@ -201,9 +200,9 @@ def wilcoxon(
 
 
 def _effect(change: np.ndarray) -> np.ndarray:
-    """(B,) effect sizes of (B, N) changes; 0 where nobody of a resample changed."""
+    """(B,) effect sizes of (B, N) changes; 0 for a resample without change."""
     moved = change != 0
-    # Those who did not change hold the lowest ranks; without them the others' begin at 1.
+    # Persons without change have the lowest ranks; without them the others' begin at 1.
     ranks = (stats.rankdata(np.abs(change), axis=1) - (~moved).sum(axis=1, keepdims=True)) * moved
     norm = np.sqrt(moved.sum(axis=1) * (ranks**2).sum(axis=1))
     return (np.sign(change) * ranks).sum(axis=1) / np.where(norm > 0, norm, 1.0)

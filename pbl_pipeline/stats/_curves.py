@@ -21,10 +21,9 @@ CURVE_METHODS = ("max-t", "cluster")
 class Phase:
     """A part of the cycle in which the curves differ."""
 
-    #: Its first and last point, in percent of the cycle.
-    first: float
+    first: float  # first point, in percent of the cycle
     last: float
-    sign: int  # 1 where a is larger than b, else -1
+    sign: int  # 1 if a is larger than b, else -1
     p: float  # corrected for the whole cycle: of the cluster, or ("max-t") the smallest of its points
 
 
@@ -32,26 +31,21 @@ class Phase:
 class CurveTest:
     """A test of two sets of curves."""
 
-    #: As asked.
-    method: str
+    method: str  # these three: as passed
     paired: bool
     alpha: float
-    #: (P,) points of the cycle; mean of a - b over persons, in the unit of the curves; its t; p corrected for the whole
-    #: cycle ("cluster": that of the cluster a point is in, 1 outside).
-    percent: np.ndarray
-    difference: np.ndarray
-    t: np.ndarray
-    p: np.ndarray
+    percent: np.ndarray  # (P,) points of the cycle
+    difference: np.ndarray  # (P,) mean of a - b over persons, in the unit of the curves
+    t: np.ndarray  # (P,)
+    p: np.ndarray  # (P,) corrected for the whole cycle ("cluster": of the cluster of a point, 1 outside)
     threshold: float  # "max-t": |t| above it is significant. "cluster": |t| above it belongs to a cluster.
     p_value: float  # of the hypothesis that the curves differ nowhere: the smallest of `p`
     phases: tuple[Phase, ...]  # where they differ, p <= alpha
-    #: Persons (not curves).
-    n_a: int
+    n_a: int  # persons (not curves)
     n_b: int
-    #: How many, the data's own among them; whether these are all there are.
-    permutations: int
-    exact: bool
-    smallest_p: float  # no smaller p is possible with so few persons and permutations
+    permutations: int  # their number, including the data's own order
+    exact: bool  # all possible permutations
+    smallest_p: float  # smallest possible p with these persons and permutations
 
 
 def curve_test(
@@ -67,7 +61,7 @@ def curve_test(
     n_permutations: int = 10_000,
     seed: int = 0,
 ) -> CurveTest:
-    """Where over the gait cycle curves of two conditions, or of two groups of persons, differ. Two-sided.
+    """Test where curves of two conditions, or of two groups of persons, differ over the gait cycle. Two-sided.
 
     Nonparametric mapping (Nichols & Holmes 2002, Hum Brain Mapp 15:1-25; for gait curves Pataky et al. 2015, J Biomech
     48:1277-1285). A person's curves are averaged first and persons are permuted, never repeats, so that persons may
@@ -76,19 +70,19 @@ def curve_test(
     differ in variance and size (Janssen 1997, Stat Probab Lett 36:9-21).
     "max-t" compares each |t| with the largest over the cycle, and judges each point. "cluster" compares the sum of |t|
     over neighbouring points of one sign with |t| above its quantile at `cluster_p` (Maris & Oostenveld 2007, J Neurosci
-    Methods 164:177-190): it finds long weak phases and judges no single point.
+    Methods 164:177-190): it finds long weak phases, but does not test single points.
 
     Raises `PblError` STATS_INPUT: NaN, other shapes, a point at which no curve differs, persons with one condition only
-    (paired) or in both groups (unpaired), so few persons or permutations that no p could be as small as `alpha`.
+    (paired) or in both groups (unpaired), too few persons or permutations for a p of `alpha`.
 
     Parameters
     ----------
     a, b : (N, P), (M, P)
         Curves at the same P points from 0 to 100 % of the cycle, in one unit.
     persons_a, persons_b : (N,), (M,)
-        Whose curve each is. Without them each row is a person of its own ("paired": the same in both, in order).
+        Person of each curve. Without them each row is another person ("paired": the same in both, in order).
     n_permutations
-        At most; all there are where these are no more.
+        Largest number; all possible ones if they are fewer.
     """
     one_of(method, CURVE_METHODS, "method")
     for value, name in ((alpha, "alpha"), (cluster_p, "cluster_p")):
@@ -177,7 +171,7 @@ def _other_persons(a: list[Any], b: list[Any]) -> None:
 
 
 def _scaled(curves: np.ndarray) -> np.ndarray:
-    """The curves in units of their root mean square at each point, which leaves t as it is."""
+    """Curves in units of their root mean square at each point, which does not change t."""
     flat = [i for i, values in enumerate(curves.T) if not len(values) or not differ(values)]
     if len(flat):
         raise refuse(
@@ -189,7 +183,7 @@ def _scaled(curves: np.ndarray) -> np.ndarray:
 
 
 def _flipped(d: np.ndarray, most: int, generator: np.random.Generator) -> tuple[np.ndarray, bool]:
-    """(B, P) t of (n, P) differences under sign flips, the data's own first; whether B is all there are."""
+    """(B, P) t of (n, P) differences under sign flips, without flips first; and True if these are all possible ones."""
     n = len(d)
     exact = 2**n <= most
     if exact:
@@ -198,7 +192,7 @@ def _flipped(d: np.ndarray, most: int, generator: np.random.Generator) -> tuple[
         signs = 1.0 - 2.0 * generator.integers(2, size=(most, n))
         signs[0] = 1.0
     mean = signs @ d / n
-    variance = ((d**2).sum(axis=0) / n - mean**2) / (n - 1)  # of the mean; a sign changes no square
+    variance = ((d**2).sum(axis=0) / n - mean**2) / (n - 1)  # of the mean; signs do not change squares
     return mean / np.sqrt(np.maximum(variance, 1e-18)), exact
 
 
@@ -225,14 +219,14 @@ def _relabelled(x: np.ndarray, n_a: int, most: int, generator: np.random.Generat
 
 
 def _by_maximum(size: np.ndarray, alpha: float) -> tuple[float, np.ndarray]:
-    """Critical |t|, and p of each point: the fraction of permutations whose largest |t| is no smaller."""
+    """Critical |t|, and p of each point: the fraction of permutations whose largest |t| is at least as large."""
     largest = np.sort(size.max(axis=1))
     p = _share(largest, size[0])
     return float(largest[len(largest) - 1 - int(alpha * len(largest) + 1e-9)]), p
 
 
 def _by_cluster(t: np.ndarray, threshold: float) -> np.ndarray:
-    """p of each point: the fraction of permutations with a cluster of no smaller mass than its own; 1 outside."""
+    """p of each point: the fraction of permutations with a cluster of at least the mass of its own; 1 outside."""
     sign = np.sign(t) * (np.abs(t) > threshold)
     largest, mass = np.zeros(len(t)), np.zeros(len(t))
     for i in range(t.shape[1]):
@@ -247,5 +241,5 @@ def _by_cluster(t: np.ndarray, threshold: float) -> np.ndarray:
 
 
 def _share(ordered: np.ndarray, values: Any) -> Any:
-    """Fraction of `ordered` that is no smaller than each value; equal ones differ in the last digits."""
+    """Fraction of `ordered` that is at least each value, up to the last digits."""
     return 1 - np.searchsorted(ordered, np.asarray(values) * (1 - 1e-9)) / len(ordered)

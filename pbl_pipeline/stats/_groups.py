@@ -32,15 +32,14 @@ class Correlation(Estimate):
     kind: str  # one of `CORRELATIONS`
     p: float  # Two-sided, against 0, by Student's t with `df` degrees of freedom
     df: int
-    #: Pairs of values; persons that they are of (as many, unless "repeated").
-    n: int
-    persons: int
+    n: int  # pairs of values
+    persons: int  # as many, unless "repeated"
 
 
 def correlation(x: Any, y: Any, kind: str = "pearson", persons: Any = None, confidence: float = 0.95) -> Correlation:
     """Correlation of (N,) and (N,) values, of any units.
 
-    "pearson" for two continuous measures, "spearman" where one is ordinal (the paper, Statistics): one pair per person.
+    "pearson" for two continuous measures, "spearman" if one is ordinal (the paper, Statistics): one pair per person.
     "repeated": the common correlation within persons of several pairs each (Bakdash & Marusich 2017, Front Psychol
     8:456). Several pairs of a person in the first two kinds would make the interval too narrow.
     Intervals: Fisher's z with standard error 1 / sqrt(df - 1), where df = n - 2, or pairs - persons - 1 ("repeated");
@@ -77,7 +76,7 @@ def correlation(x: Any, y: Any, kind: str = "pearson", persons: Any = None, conf
 
 
 def _within(a: np.ndarray, b: np.ndarray, persons: Any) -> tuple[np.ndarray, np.ndarray, int]:
-    """The values less the person's mean, and how many persons."""
+    """Values minus the person's mean, and the number of persons."""
     if persons is None:
         raise refuse('kind "repeated" without persons', "the person of each pair", "pass persons")
     index, names = labels(persons, "persons", len(a))
@@ -97,10 +96,10 @@ CORRECTIONS = ("holm", "benjamini-hochberg")
 
 
 def adjust(p: Any, method: str = "holm") -> np.ndarray:
-    """(N,) adjusted p of the (N,) p of one family of tests: those of at most alpha are significant.
+    """Adjust the (N,) p of one family of tests: adjusted p of at most alpha are significant.
 
-    "holm" keeps the chance of any false alarm (Holm 1979, Scand J Stat 6:65-70), "benjamini-hochberg" the expected
-    fraction of false alarms among what is found (Benjamini & Hochberg 1995, J R Stat Soc B 57:289-300).
+    "holm" controls the probability of any false positive (Holm 1979, Scand J Stat 6:65-70), "benjamini-hochberg" the
+    expected fraction of false positives among the positives (Benjamini & Hochberg 1995, J R Stat Soc B 57:289-300).
 
     Raises `PblError` STATS_INPUT: unknown method, no p, NaN, p outside 0 to 1.
     """
@@ -208,7 +207,7 @@ def _two(a: Any, b: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _newcombe(probability: float, n_a: int, n_b: int, confidence: float) -> tuple[float, float]:
-    """Interval of P(a > b) + P(a = b) / 2: the values whose own standard error reaches `probability`."""
+    """Interval of P(a > b) + P(a = b) / 2: the values whose standard error reaches `probability`."""
     z = stats.norm.isf((1 - confidence) / 2)
     others = (n_a + n_b) / 2 - 1
 
@@ -216,7 +215,7 @@ def _newcombe(probability: float, n_a: int, n_b: int, confidence: float) -> tupl
         shape = 1 + others * (1 - p) / (2 - p) + others * p / (1 + p)
         return float((p - probability) ** 2 - z**2 * p * (1 - p) * shape / (n_a * n_b))
 
-    # At 0 and 1 the standard error is 0: there, too, the root sought is the other one.
+    # The standard error is 0 at 0 and 1, where the other root is wanted.
     low = 0.0 if probability <= 0 else optimize.brentq(excess, 0.0, min(probability, 1 - 1e-9))
     high = 1.0 if probability >= 1 else optimize.brentq(excess, max(probability, 1e-9), 1.0)
     return float(low), float(high)  # pyright: ignore[reportArgumentType]

@@ -16,17 +16,14 @@ from .types import Estimate, differ, fraction, labels, numbers, one_of, refuse
 class MeanSquares:
     """Mean squares of a subjects x raters table; with missing ratings those of an equivalent complete one."""
 
-    #: Mean squares. `error` is that within subjects in the one-way model; `raters` equals it in models 1 and 3.
     subjects: float
-    raters: float
-    error: float
-    #: Their degrees of freedom.
-    df_subjects: int
+    raters: float  # equals `error` in models 1 and 3
+    error: float  # that within subjects in the one-way model
+    df_subjects: int  # degrees of freedom of the three
     df_raters: int
     df_error: int
-    #: Subjects per rater, ratings per subject: harmonic means where ratings are missing.
-    n: float
-    k: float
+    n: float  # subjects per rater, the harmonic mean if ratings are missing
+    k: float  # ratings per subject, likewise
 
 
 def mean_squares(ratings: np.ndarray, model: int) -> MeanSquares:
@@ -39,7 +36,7 @@ def mean_squares(ratings: np.ndarray, model: int) -> MeanSquares:
     Raises `PblError` STATS_INPUT.
     """
     seen = np.isfinite(ratings)
-    if model == 1 and len(ratings) > 1:  # a column is not a rater: it may be empty where cycles are few
+    if model == 1 and len(ratings) > 1:  # a column is not a rater: it may be empty for few cycles
         ratings, seen = ratings[:, seen.any(axis=0)], seen[:, seen.any(axis=0)]
     of_subject, of_rater = seen.sum(axis=1), seen.sum(axis=0)
     n, k = ratings.shape
@@ -80,10 +77,10 @@ def mean_squares(ratings: np.ndarray, model: int) -> MeanSquares:
 def _reml(y: np.ndarray, seen: np.ndarray, model: int) -> np.ndarray:
     """Variances of subjects, raters and error of y (n, k; zero where not `seen`).
 
-    y = mean + subject + rater + error; raters are random (model 2), fixed (3) or none (1). Searched are the standard
-    deviations of subjects and raters relative to that of the error, which follows in closed form. With
-    D = I + a S S' (S: subjects) and Z the raters' columns, the likelihood needs no more than the (k, k) matrix
-    Z' D^-1 Z and the (k,) vector Z' D^-1 y (Woodbury's identity): its cost grows with n k^2, not with (n k)^3.
+    y = mean + subject + rater + error; raters are random (model 2), fixed (3) or none (1). The standard deviations of
+    subjects and raters are optimised relative to that of the error, which follows in closed form. With D = I + a S S'
+    (S: subjects) and Z the raters' columns, the likelihood only needs the (k, k) matrix Z' D^-1 Z and the (k,) vector
+    Z' D^-1 y (Woodbury's identity): its cost grows with n k^2, not with (n k)^3.
     """
     mask = seen.astype(float)
     counts, sums = mask.sum(axis=1), y.sum(axis=1)
@@ -125,7 +122,7 @@ ICC_KINDS = ("1,1", "2,1", "3,1", "1,k", "2,k", "3,k")
 ICC_INTERVALS = ("f", "generalized")
 #: Draws of the mean squares for "generalized": another seed changes its limits by some 0.003.
 _DRAWS = 50_000
-#: A variance below this part of the mean squares is zero.
+#: A variance below this fraction of the mean squares is zero.
 _ROUNDING = 1e-12
 
 
@@ -134,13 +131,12 @@ class Icc(Estimate):
     """An intraclass correlation."""
 
     kind: str  # one of `ICC_KINDS`
-    #: Subjects; ratings per subject, of which "1,k" to "3,k" are the mean: their harmonic mean where some are missing.
-    n: int
-    k: float
-    missing: int  # how many ratings were NaN: with any, the variances are by REML
+    n: int  # subjects
+    k: float  # ratings per subject, of which "1,k" to "3,k" are the mean: the harmonic mean if some are missing
+    missing: int  # number of NaN ratings: with any, the variances are by REML
     #: Standard error of measurement of one rating ("x,1") or of the mean of k ("x,k"), in the unit of the ratings: the
     #: square root of the variance that is not the subjects', so sd sqrt(1 - ICC) (Weir 2005, J Strength Cond Res
-    #: 19:231-240). Kinds 2 count the variance of the raters with it, kinds 3 do not.
+    #: 19:231-240). Kinds 2 include the variance of the raters, kinds 3 do not.
     sem: float
 
     @property
@@ -155,7 +151,7 @@ class Icc(Estimate):
 
 
 def minimal_detectable_change(sem: float, confidence: float = 0.95) -> float:
-    """z sqrt(2) SEM: what the difference of two measurements of an unchanged person exceeds in 1 - confidence of cases.
+    """z sqrt(2) SEM: two measurements of an unchanged person differ by more in 1 - confidence of cases.
 
     Weir 2005. Raises `PblError` STATS_INPUT.
     """
@@ -165,7 +161,7 @@ def minimal_detectable_change(sem: float, confidence: float = 0.95) -> float:
 
 
 def ratings_table(values: Any, subjects: Any, raters: Any = None) -> np.ndarray:
-    """(subjects, raters) array for `icc` from (N,) values in long form, NaN where a rating does not exist.
+    """(subjects, raters) array for `icc` from (N,) values in long form, NaN for a missing rating.
 
     Without `raters` a subject's ratings count 1, 2, ... in their order (cycles of a recording). Subjects and raters are
     in the order in which they first appear. Raises `PblError` STATS_INPUT, also for two ratings by one rater.
@@ -189,27 +185,24 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
     The paper's ICC2 and ICC2k (Clinical Construct Validity; Table 2) are "2,1" and "2,k" over steps of one day.
 
     Raises `PblError` STATS_INPUT: unknown kind, another shape, infinite values, fewer than two subjects or raters, all
-    ratings equal, a subject or rater without any rating, no subject with two ratings; no variance of which subjects
-    could have a share; for the mean of k ratings also means of the subjects that differ so little that it is not
-    defined.
+    ratings equal, a subject or rater without any rating, no subject with two ratings; no variance between subjects; for
+    the mean of k ratings also means of the subjects that differ so little that it is not defined.
 
-    Returns `Icc`, with low <= value <= high <= 1. A value is negative where subjects differ less than error alone would
-    make them; `low` of a mean of k is -inf where the ratings put no lower bound on it.
+    Returns `Icc`, with low <= value <= high <= 1. A value is negative if subjects differ less than by error alone;
+    `low` of a mean of k is -inf if the ratings put no lower bound on it.
 
     Parameters
     ----------
     ratings : (n, k)
-        Subjects x raters (visits, cycles), in any unit. NaN is a missing rating: `_components.mean_squares` tells how
-        such tables are treated; no subject is left out.
+        Subjects x raters (visits, cycles), in any unit. NaN: missing (`mean_squares`); no subject is dropped.
     kind
         One of `ICC_KINDS`. "1,1": each subject has its own raters (cycles of a recording). "2,1": the raters are a
         sample and their means count as disagreement. "3,1": these raters alone, their means do not count (visits
-        between which everybody may have changed). "k" for the mean of k ratings.
-
+        between which all subjects may have changed). "k" for the mean of k ratings.
     interval
         "f" as above. "generalized": from draws of the mean squares, with `seed` (Weerahandi 1993, J Am Stat Assoc
         88:899-905; compared by Ionan et al. 2014, BMC Med Res Methodol 14:121). For kinds 2 with few raters whose means
-        differ: there "f" holds the truth in as few as 80 % of studies (docs/statistics.md).
+        differ: then "f" contains the truth in as few as 80 % of studies (docs/statistics.md).
     """
     one_of(kind, ICC_KINDS, "kind")
     one_of(interval, ICC_INTERVALS, "interval")
@@ -254,7 +247,7 @@ def icc(ratings: Any, kind: str, confidence: float = 0.95, interval: str = "f", 
 
 
 def _of_mean(r: float, k: float) -> float:
-    """Reliability of a mean of k ratings from that of one (Spearman & Brown); -inf where it has no lower bound."""
+    """Reliability of a mean of k ratings from that of one (Spearman & Brown); -inf if it has no lower bound."""
     scale = 1 + (k - 1) * r
     return k * r / scale if scale > _ROUNDING else -np.inf
 
@@ -267,7 +260,7 @@ def _limits(ms: MeanSquares, value: float, model: int, tail: float) -> tuple[flo
         parts = np.array([weight_raters * ms.raters, weight_error * ms.error])
         spread = (parts**2 / (ms.df_raters, ms.df_error)).sum()
         df = parts.sum() ** 2 / spread if spread > 0 else ms.df_error
-        # A negative reliability weighs the raters negatively; of a sum of variances the degrees are never fewer.
+        # A negative reliability weights the raters negatively; a sum of variances never has fewer degrees.
         df = max(df, min(ms.df_raters, ms.df_error))
         noise = ms.k * ms.raters + (ms.k * ms.n - ms.k - ms.n) * ms.error
         lower, upper = stats.f.isf(tail, ms.df_subjects, df), stats.f.isf(tail, df, ms.df_subjects)
@@ -282,7 +275,7 @@ def _limits(ms: MeanSquares, value: float, model: int, tail: float) -> tuple[flo
 
 
 def _drawn_limits(ms: MeanSquares, model: int, tail: float, seed: int) -> tuple[float, float]:
-    """Limits of the reliability of one rating: quantiles over variances of which these mean squares could be a draw."""
+    """Limits of the reliability of one rating: quantiles over variances that could have these mean squares."""
     g = np.random.default_rng(seed)
     error = ms.error * ms.df_error / g.chisquare(ms.df_error, _DRAWS)
     subjects = np.maximum(ms.subjects * ms.df_subjects / g.chisquare(ms.df_subjects, _DRAWS) - error, 0) / ms.k

@@ -1,4 +1,4 @@
-"""A number with its interval, and what several statistics ask of their values."""
+"""Estimates with their intervals, and checks of the values of statistics."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy import optimize, stats
 
 from pbl_pipeline.errors import PblError
 
-#: Beyond this, and as a spread below its inverse, squares are no longer numbers of a computer.
+#: Largest value, and inverse of the least spread: squares beyond overflow.
 _LARGEST = 1e100
 refuse = functools.partial(PblError, "STATS_INPUT")
 
 
 def numbers(values: Any, name: str, ndim: int = 1, missing: bool = False) -> np.ndarray:
-    """`values` as a float array of `ndim` dimensions without infinite values and, unless `missing`, without NaN.
+    """Return `values` as a float array of `ndim` dimensions without infinite values and, unless `missing`, without NaN.
 
     Raises `PblError` STATS_INPUT.
     """
@@ -40,7 +40,7 @@ def numbers(values: Any, name: str, ndim: int = 1, missing: bool = False) -> np.
 
 
 def sample(values: Any, name: str, at_least: int) -> np.ndarray:
-    """(N,) finite values of which there are `at_least` and not all the same. Raises `PblError` STATS_INPUT."""
+    """Return (N,) finite values, `at_least` so many and not all the same. Raises `PblError` STATS_INPUT."""
     array = numbers(values, name)
     if len(array) < at_least:
         raise refuse(f"{name}: {len(array)} values", f"at least {at_least}", "record more persons")
@@ -50,20 +50,20 @@ def sample(values: Any, name: str, at_least: int) -> np.ndarray:
 
 
 def differ(values: np.ndarray) -> bool:
-    """Whether values differ by more than their last digits."""
+    """True if values differ by more than their last digits."""
     return bool(np.ptp(values) > 1e-12 * np.abs(values).max() + 1 / _LARGEST)
 
 
 def same_length(a: np.ndarray, b: np.ndarray) -> None:
-    """Raises `PblError` STATS_INPUT where `a` and `b` cannot be pairs."""
+    """Raise `PblError` STATS_INPUT if `a` and `b` cannot be pairs."""
     if len(a) != len(b):
         raise refuse(f"{len(a)} and {len(b)} values", "pairs", "pass both values of each person, in the same order")
 
 
 def changes(pre: Any, post: Any, at_least: int) -> np.ndarray:
-    """(N,) differences post - pre, or `pre` itself as the differences where `post` is None.
+    """(N,) differences post - pre, or `pre` itself as the differences if `post` is None.
 
-    Raises `PblError` STATS_INPUT, also where all changes are the same.
+    Raises `PblError` STATS_INPUT, also if all changes are the same.
     """
     if post is None:
         return sample(pre, "changes", at_least)
@@ -87,27 +87,27 @@ def labels(values: Any, name: str, length: int) -> tuple[np.ndarray, list[Any]]:
 
 
 def count(value: int, name: str) -> int:
-    """Raises `PblError` STATS_INPUT where `value` is less than 1."""
+    """Return a number of at least 1. Raises `PblError` STATS_INPUT."""
     if value < 1:
         raise refuse(f"{name} {value}", "a whole number of at least 1", f"correct {name}")
     return int(value)
 
 
 def fraction(value: float, name: str) -> float:
-    """A number between 0 and 1, both excluded. Raises `PblError` STATS_INPUT."""
+    """Return a number between 0 and 1, both excluded. Raises `PblError` STATS_INPUT."""
     if not 0 < value < 1:
         raise refuse(f"{name} {value}", "a number between 0 and 1", f"correct {name}")
     return float(value)
 
 
 def one_of(value: str, names: tuple[str, ...], what: str) -> str:
-    """Raises `PblError` STATS_INPUT where `value` is none of `names`."""
+    """Return one of `names`. Raises `PblError` STATS_INPUT."""
     if value not in names:
         raise refuse(f"{what} {value!r}", f"one of {', '.join(names)}", "choose one of these")
     return value
 
 
-#: scipy's noncentral t has six correct digits up to here.
+#: Largest t at which scipy's noncentral t has six correct digits.
 _LARGEST_T = 1e4
 
 
@@ -115,11 +115,10 @@ _LARGEST_T = 1e4
 class Estimate:
     """A statistic with its confidence interval."""
 
-    #: The statistic and the limits of its interval, in the unit of the statistic.
     value: float
-    low: float
+    low: float  # limits of the interval, in the unit of the statistic
     high: float
-    confidence: float  # of the interval, 0.95 unless asked otherwise
+    confidence: float  # of the interval, 0.95 by default
 
 
 def fisher_z(r: float, standard_error: float, confidence: float) -> Estimate:
@@ -133,7 +132,7 @@ def fisher_z(r: float, standard_error: float, confidence: float) -> Estimate:
 def noncentrality(t: float, df: float, confidence: float) -> tuple[float, float]:
     """Interval of the noncentrality of which `t` is one draw (exact; Steiger & Fouladi 1997).
 
-    Raises `PblError` STATS_INPUT for |t| beyond what is computed with certainty.
+    Raises `PblError` STATS_INPUT for |t| above `_LARGEST_T`.
     """
     if abs(t) > _LARGEST_T:
         raise refuse(f"a mean of {abs(t):.0f} standard errors", "values that differ among persons", "check the column")
@@ -141,7 +140,7 @@ def noncentrality(t: float, df: float, confidence: float) -> tuple[float, float]
     width = 10 * np.sqrt(1 + t**2 / (2 * df))
 
     def excess(nc: float, probability: float) -> float:
-        # Far from t the distribution function is not computed (NaN); it is 1 below and 0 above.
+        # Far from t scipy returns NaN for the distribution function, which is 1 below and 0 above.
         return float(np.nan_to_num(stats.nct.cdf(t, df, nc), nan=float(nc < t))) - probability
 
     low, high = (optimize.brentq(excess, t - width, t + width, (p,), xtol=1e-10) for p in (1 - tail, tail))

@@ -7,7 +7,6 @@ from .types import (
     FIRST_ROLES,
     FRAMES,
     KEYS,
-    SIDES,
     Column,
     StudyData,
     StudyDescription,

@@ -1,4 +1,4 @@
-"""A study as one folder of tidy CSV files, with other codes for its persons where asked."""
+"""A study as one folder of tidy CSV files, with new codes for its persons if wanted."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ _missing = functools.partial(
 _format = functools.partial(PblError, "FILE_FORMAT")
 
 
-def deidentified(study: StudyData, prefix: str = "P") -> tuple[StudyData, pd.DataFrame]:
-    """The study with new codes, and the key to them: `subject, visit, new_subject, new_visit`. Keep the key apart.
+def deidentified(study: StudyData) -> tuple[StudyData, pd.DataFrame]:
+    """Replace the codes of a study, and return it with the key: `subject, visit, new_subject, new_visit`.
 
     Persons are numbered in random order, and each person's visits V1, V2, ... in order of their days, since a visit is
-    often named by its date. Rows are put in order of the new codes. Columns of `visits` beyond those of `FRAMES` are
-    left out. `reason` and the texts of the description stay: read them before the study leaves the house.
+    often named by its date. Rows are sorted by the new codes. Columns of `visits` beyond those of `FRAMES` are dropped.
+    `reason` and the texts of the description are kept: read them before you pass the study on, and keep the key apart.
     """
     visits: Any = study.visits.sort_values(["subject", "days", "visit"])
     persons = list(dict.fromkeys(visits["subject"]))
     secrets.SystemRandom().shuffle(persons)
     width = max(3, len(str(len(persons))))
-    codes = {old: f"{prefix}{i:0{width}d}" for i, old in enumerate(persons, 1)}
+    codes = {old: f"P{i:0{width}d}" for i, old in enumerate(persons, 1)}
     key: Any = visits[["subject", "visit"]].assign(
         new_subject=visits["subject"].map(codes),
         new_visit=[f"V{n}" for n in visits.groupby("subject").cumcount() + 1],
@@ -62,15 +62,15 @@ def deidentified(study: StudyData, prefix: str = "P") -> tuple[StudyData, pd.Dat
 
 FORMAT = "pbl-study-1"
 _ABOUT, _DICTIONARY, _SCRIPT = "study.json", "dictionary.csv", "make_report.py"
-#: Bytes of a file that is read; curves are wide.
+#: Most bytes of a file that is read; curves are wide.
 _MAX_BYTES = {"curves": 128 * MIB}
 _MAX_HEADER = 64 * 1024
-#: Digits: curves to a thousandth of a degree.
+#: Format of numbers; curves have a thousandth of a degree.
 _DIGITS = {"curves": "%.6g"}
 
 
 def write_study(study: StudyData, folder: str | Path) -> list[Path]:
-    """Write a study as `<frame>.csv`, `dictionary.csv`, `study.json` and `make_report.py`; returns the paths.
+    """Write a study as `<frame>.csv`, `dictionary.csv`, `study.json` and `make_report.py`; return the paths.
 
     Numbers have 8 digits, curves 6. The folder is made; files of these names in it are replaced.
 
@@ -101,8 +101,8 @@ def read_study(folder: str | Path) -> StudyData:
     """Read the folder of `write_study`.
 
     Raises `PblError` FILE_MISSING: no such folder, no `study.json` or a file that it names. FILE_FORMAT: a file that
-    cannot be read, is too large, or is not the one whose SHA-256 `study.json` names (without the key `files` none is
-    compared). STUDY_INVALID: as `StudyData`, and where numbers of persons or visits differ from those of `study.json`.
+    cannot be read, is too large, or has not the SHA-256 in `study.json` (without the key `files` none is compared).
+    STUDY_INVALID: as `StudyData`, and numbers of persons or visits that differ from those of `study.json`.
     """
     folder = Path(folder)
     about = _about(folder / _ABOUT)
@@ -144,7 +144,7 @@ def read_study(folder: str | Path) -> StudyData:
 
 
 def data_dictionary(study: StudyData) -> pd.DataFrame:
-    """One row per column of each file: `file, column, kind, unit, meaning`."""
+    """Describe the columns of each file, in rows of `file, column, kind, unit, meaning`."""
     rows = [
         {"file": f"{n}.csv", "column": c.name, "kind": c.kind, "unit": c.unit, "meaning": c.meaning}
         for n, columns in FRAMES.items()
@@ -160,7 +160,7 @@ def data_dictionary(study: StudyData) -> pd.DataFrame:
 
 
 def content_hash(study: StudyData) -> str:
-    """16 digits of a SHA-256 over the frames as they are written: the same for the same study."""
+    """First 16 digits of the SHA-256 of the frames as they are written: equal for equal studies."""
     parts = "".join(_sha256(_csv(name, getattr(study, name))) for name in FRAMES)
     return _sha256(parts.encode())[:16]
 

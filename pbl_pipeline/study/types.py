@@ -1,4 +1,4 @@
-"""The data of a study, and the columns of its frames."""
+"""Data of a study, and the columns of its frames."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ invalid = functools.partial(PblError, "STUDY_INVALID")
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """A column. `kind`: "label" (text, never empty), "text", "number" (empty: unknown), "flag" (true or false).
-    `optional`: a study that lacks it has empty texts there."""
+    """A column of a frame."""
 
     name: str
-    kind: str
+    kind: str  # "label" (text, never empty), "text", "number" (empty: unknown) or "flag" (true or false)
     unit: str
     meaning: str
-    optional: bool = False
+    optional: bool = False  # may be missing: then its texts are empty
 
 
 def _frames() -> dict[str, tuple[Column, ...]]:
@@ -45,10 +44,10 @@ def _frames() -> dict[str, tuple[Column, ...]]:
     return {frame: tuple(columns) for frame, columns in found.items()}
 
 
-#: Frame -> columns in their order (frame_columns.csv). `visits` may have more; they are carried along.
+#: Frame -> columns in their order (frame_columns.csv). `visits` may have more, which are kept.
 FRAMES = _frames()
 
-#: Frame -> the columns of which no two rows may have the same values.
+#: Frame -> the columns that identify a row.
 KEYS: dict[str, tuple[str, ...]] = {
     "visits": ("subject", "visit"),
     "measures": ("subject", "visit", "side", "measure"),
@@ -68,14 +67,13 @@ _LONGEST = 200
 class StudyDescription:
     """A study and how it was made."""
 
-    #: Of the frozen slice; the hash covers its rows. "" where there is no slice.
-    name: str = ""
-    hash: str = ""
+    name: str = ""  # of the frozen slice, "" without one
+    hash: str = ""  # of its rows
     #: Stage -> method, such as {"fit": "blazepose-2"}.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    code_version: str = ""  # of the code that made the values
-    event: str = ""  # what the days of the visits count from, such as "surgery"
-    #: Roles between which change is judged, and the group that is expected to change. "": the first and the last role
+    code_version: str = ""  # of the code that computed the values
+    event: str = ""  # day 0 of the visits, such as "surgery"
+    #: Roles between which change is assessed, and the group that is expected to change. "": the first and the last role
     #: by their days, and the group with the most persons who have both.
     change_from: str = ""
     change_to: str = ""
@@ -87,15 +85,15 @@ class StudyDescription:
 class StudyData:
     """A study as pandas frames, without a database; docs/study.md names the columns (`FRAMES` in code).
 
-    Columns are put in order and given their types when it is made; an absent frame is an empty one. Persons are codes.
+    Columns are sorted and typed when it is made; a missing frame is an empty one. Persons are codes.
 
-    Raises `PblError` STUDY_INVALID: no visit, a column absent or of another kind, infinite values, the same row twice,
-    a row of a visit that is not there, a person in two groups, a role twice among the visits of a person that count, an
-    excluded visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two units, an
-    unknown score or one outside its range.
+    Raises `PblError` STUDY_INVALID: no visit, a column missing or of another kind, infinite values, the same row twice,
+    a row of an unknown visit, a person in two groups, a role twice among the included visits of a person, an excluded
+    visit without a reason, a first visit (`FIRST_ROLES`) after another, a measure or curve with two units, an unknown
+    score or one outside its range.
     """
 
-    visits: pd.DataFrame  # one row per visit, also those that do not count (`included` false, with `reason`)
+    visits: pd.DataFrame  # one row per visit, also of excluded ones (`included` false, with `reason`)
     #: Long: one row per visit, side and gait measure.
     measures: pd.DataFrame = dataclasses.field(default_factory=pd.DataFrame)
     #: Long: one row per visit and clinical score; range and direction of each score.
@@ -127,22 +125,24 @@ class StudyData:
                 raise invalid(f"side {frame.loc[odd, 'side'].iloc[0]!r}", ", ".join(SIDES), "correct the side", name)
         _check_units(self.measures, "measures", "measure")
         _check_units(self.curves, "curves", "variable")
-        _check_index(self.measures)
+        measures: Any = self.measures
+        if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
+            raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
         _check_scores(self.scores, self.instruments)
 
     @property
     def n_subjects(self) -> int:
-        """Persons, also those without a visit that counts."""
+        """Number of persons, also those without an included visit."""
         return len(set(self.visits["subject"]))
 
     @property
     def n_visits(self) -> int:
-        """Visits, also those that do not count."""
+        """Number of visits, also excluded ones."""
         return len(self.visits)
 
 
 def typed(name: str, frame: pd.DataFrame) -> pd.DataFrame:
-    """A copy of a frame with its columns in order and of their kinds. Raises `PblError` STUDY_INVALID."""
+    """Copy a frame with its columns sorted and typed. Raises `PblError` STUDY_INVALID."""
     columns, frame = FRAMES[name], frame.reset_index(drop=True)
     if not len(frame) and not len(frame.columns):
         frame = pd.DataFrame({c.name: [] for c in columns})
@@ -222,11 +222,6 @@ def _check_units(frame: Any, name: str, what: str) -> None:
         raise invalid(f"{what} {odd.index[0]} in {odd.iloc[0]} units", "one unit", "convert the values", name)
 
 
-def _check_index(measures: Any) -> None:
-    if ((measures["measure"] == "gdi") & (measures["side"] == "both")).any():
-        raise invalid("gdi of both sides", "that index in visits only", "remove it here", "measures")
-
-
 def _check_scores(scores: Any, instruments: Any) -> None:
     table = instruments.set_index("instrument")
     if (odd := ~scores["instrument"].isin(table.index)).any():
@@ -256,7 +251,7 @@ def _check_scores(scores: Any, instruments: Any) -> None:
 
 
 def classes_of(text: str) -> list[tuple[float, str]]:
-    """Classes of an instrument, lowest first: (lowest value, name). Raises `PblError` STUDY_INVALID."""
+    """Parse the classes of an instrument, lowest first: (lowest value, name). Raises `PblError` STUDY_INVALID."""
     found = []
     for part in filter(None, (p.strip() for p in text.split(";"))):
         number, _, word = part.partition(" ")
@@ -272,16 +267,16 @@ def classes_of(text: str) -> list[tuple[float, str]]:
 
 
 def minimal_change_at(before: float, change: float | None, classes: str) -> float | None:
-    """Minimal important change of a score that was `before`, in its unit; None where none is taken over.
+    """Minimal important change of a score that was `before`, in its unit; None if there is none.
 
-    Raises `PblError` STUDY_INVALID: `classes` that are not positive numbers by values in order.
+    Raises `PblError` STUDY_INVALID: `classes` that are not positive numbers by increasing values.
 
     Parameters
     ----------
     change
-        The one of all values, where there is one.
+        The one of all values, if any.
     classes
-        Changes by the lowest value before, such as "0 3; 12 2; 15 1", which then hold instead of `change`; or "".
+        Changes by the lowest value before, such as "0 3; 12 2; 15 1", which replace `change`; or "".
     """
     for lowest, text in classes_of(classes):
         try:

@@ -1,4 +1,4 @@
-"""The report of a study: statistics, figures, tables, one page (docs/study.md)."""
+"""Report of a study: statistics, figures, tables and one page (docs/study.md)."""
 
 from .figures import Figure
 from .page import study_figures, write_study_report

@@ -21,13 +21,13 @@ from pbl_pipeline.stats import CurveTest, Estimate
 
 from .results import CurveResult, summary
 
-#: Colours that differ also for the colour-blind (Okabe & Ito): the changing group, the others in order.
-# Orange and blue are those of the sides (`render.SIDE_COLOUR`) and of nothing else.
+#: Colours that colour-blind people can distinguish (Okabe & Ito): the changing group, the others in order.
+# Orange and blue are reserved for the sides (`render.SIDE_COLOUR`).
 GROUP_COLOURS = ("#00835f", "#b4588f", "#22262b", "#7d8b00", "#7a1f4b", "#878f97")
 BEFORE, AFTER = "#22262b", "#00835f"
 _INK, _LINE, _PERSON, _PHASE = "#2a2e33", "#b9bfc5", "#8a939c", "#e9e6a8"
 _SIZE, _NARROW = (4.9, 3.3), (3.5, 3.2)
-#: Text stays text in both formats, "$" is a character like others, and the same figure has the same bytes.
+#: Text stays text in both formats, "$" is an ordinary character, and equal figures have equal bytes.
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "pbl",
@@ -51,16 +51,16 @@ _STYLE: dict[Any, Any] = {
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A chart with its words."""
+    """A chart with its texts."""
 
     name: str  # stem of its files
-    title: str  # what it shows
-    note: str  # how many persons, and which test
+    title: str
+    note: str  # number of persons, and the test
     drawing: Drawing
     colours: Mapping[str, str] = dataclasses.field(default_factory=dict)  # legend: words -> colour
 
     def data_uri(self) -> str:
-        """Return the drawing as the address of an image in a page, which has the words itself."""
+        """Return the drawing without texts as the address of an image in a page."""
         return "data:image/svg+xml;base64," + base64.b64encode(self._saved("svg")).decode()
 
     def svg(self, footer: Sequence[str] = ()) -> str:
@@ -100,7 +100,7 @@ def colours_of(groups: Sequence[str]) -> dict[str, str]:
 
 
 def draw_means(rows: pd.DataFrame, roles: Sequence[str], groups: Sequence[str], label: str) -> Drawing:
-    """Mean and interval by visit, a line per group; rows of `visit_means` of one measure."""
+    """Draw mean and interval by visit, a line per group; rows of `visit_means` of one measure."""
     frame: Any = rows
     axes = _axes(_SIZE, label)
     _categories(axes, roles)
@@ -113,7 +113,7 @@ def draw_means(rows: pd.DataFrame, roles: Sequence[str], groups: Sequence[str], 
 
 
 def draw_pairs(both: pd.DataFrame, names: tuple[str, str], label: str) -> Drawing:
-    """A line per person from before to after, their means with 95 % intervals beside them."""
+    """Draw a line per person from before to after, and their means with 95 % intervals."""
     values = both[["pre", "post"]].to_numpy(float)
     axes = _axes(_NARROW, label)
     _categories(axes, names)
@@ -130,7 +130,7 @@ def draw_scatter(
     colours: Sequence[str],
     line: bool,
 ) -> Drawing:
-    """A dot per person, y over x, by group; with the line of least squares over all where `line`."""
+    """Draw a dot per person, y over x, by group; with `line` the least-squares line over all."""
     x, y = (np.concatenate([p[i] for p in parts.values()]) for i in (0, 1))
     axes = _axes(_SIZE, names[1])
     axes.set_xlabel(names[0])
@@ -145,7 +145,7 @@ def draw_scatter(
 
 
 def draw_groups(parts: Mapping[str, np.ndarray], label: str, colours: Mapping[str, str] | None = None) -> Drawing:
-    """Values by group: a dot per person, a box of the quartiles with the median."""
+    """Draw values by group: a dot per person, a box of the quartiles with the median."""
     axes = _axes(_SIZE, label)
     _categories(axes, [f"{name}\nn = {len(v)}" for name, v in parts.items()])
     generator = np.random.default_rng(0)
@@ -160,7 +160,7 @@ def draw_groups(parts: Mapping[str, np.ndarray], label: str, colours: Mapping[st
 
 
 def draw_curves(result: CurveResult, colours: tuple[str, str], label: str) -> Drawing:
-    """Mean curves with one standard deviation each way; where they differ, a shaded phase and a bar at the foot."""
+    """Draw mean curves with one standard deviation; phases of difference are shaded, with a bar below."""
     axes = _axes(_SIZE, label)
     axes.set(xlim=(0, 100), xticks=[0, 25, 50, 75, 100], xlabel="gait cycle (%)")
     if isinstance(result.test, CurveTest):
@@ -177,7 +177,7 @@ def draw_curves(result: CurveResult, colours: tuple[str, str], label: str) -> Dr
 
 
 def draw_forest(rows: Sequence[tuple[str, str, Estimate]]) -> Drawing:
-    """Estimates with their intervals, one row each: name, colour, estimate; a line at 0."""
+    """Draw estimates with their intervals, one row each (name, colour, estimate), and a line at 0."""
     axes = _axes((6.5, 0.36 * len(rows) + 0.6), "")
     axes.grid(axis="both")
     axes.grid(visible=False, axis="y")

@@ -44,11 +44,11 @@ def write_study_report(
     change_group: str = "",
     pdf: bool = True,
 ) -> list[Path]:
-    """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; returns the paths, the page first.
+    """Write `report.html`, `figures/*.svg` and `*.pdf`, `tables/*.csv` and `*.tex`; return the paths, the page first.
 
-    The page asks for nothing from elsewhere. Where the values do not support a statistic, the reason stands instead;
-    the CSV tables have its code as well. `change_from`, `change_to` (roles) and `change_group` take precedence over
-    those of the study's description. Without `pdf` the figures are SVG alone, in a third of the time.
+    The page loads nothing from elsewhere. A statistic that the values do not support is replaced by the reason, in the
+    CSV tables also by its code. `change_from`, `change_to` (roles) and `change_group` take precedence over those of the
+    study's description. Without `pdf` the figures are SVG alone, in a third of the time.
 
     Raises `PblError` FILE_UNWRITABLE; USAGE, STUDY_INVALID as `plan`.
     """
@@ -140,7 +140,7 @@ def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
 
 
 def study_figures(study: StudyData, results: StudyResults) -> dict[str, Figure]:
-    """All figures of a report, by name; a notebook shows one as it is."""
+    """Draw all figures of a report, by name; a notebook displays them."""
     return {f.name: f for figures in _sections(study, results).values() for f in figures}
 
 
@@ -155,8 +155,8 @@ def _sections(study: StudyData, results: StudyResults) -> dict[str, list[Figure]
 
 
 def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
-    """As the paper's figure 5: A curves of groups, B the index by class of a score, C over a continuous score, D by
-    group, E over an ordinal score."""
+    """Figures as the paper's figure 5: A curves of groups, B the index by class of a score, C over a continuous score,
+    D by group, E over an ordinal score."""
     yield from _curve_figures(study, results, "")
     measure = INDEX if INDEX in results.plan.measures else next(iter(results.plan.measures), "")
     if not measure:
@@ -256,7 +256,7 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
 
 
 def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> Iterator[Figure]:
-    """Those of "change", or ("") those between groups, as the paper's figure 5 A."""
+    """Figures of curves, of "change" or ("") between groups, as the paper's figure 5 A."""
     groups = colours_of(results.plan.groups)
     for c in results.curves:
         if (c.comparison == "change") != (comparison == "change") or not len(c.a) or not len(c.b):

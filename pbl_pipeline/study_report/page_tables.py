@@ -1,4 +1,4 @@
-"""Tables of a study as people read them: the paper's Table 2 and SRM table, and the others."""
+"""Tables of a study for the page: the paper's Table 2 and SRM table, and others."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ _MINUS = "\N{MINUS SIGN}"
 _NONE = "\N{EN DASH}"
 _INDICES = {INDEX: "GDI", "gps_deg": "Gait Profile Score"}
 _STARS = "* p < 0.05, not corrected for the number of tests"
-#: Of a table that shows it.
+#: Note of tables with this column.
 _HOLM = "p, Holm: corrected for those"
 
 
 @dataclasses.dataclass(frozen=True)
 class PageTable:
-    """A table as it is shown."""
+    """A table as shown on the page."""
 
     name: str  # stem of its files
-    #: What it shows; how to read it.
     title: str
-    note: str
+    note: str  # how to read it
     body: pd.DataFrame  # texts; its columns may have two levels
-    messages: tuple[tuple[str, str], ...] = ()  # why cells without a number have none: (mark of the cells, text)
+    messages: tuple[tuple[str, str], ...] = ()  # reasons for cells without a number: (mark of the cells, text)
 
     def head(self) -> list[list[tuple[str, int]]]:
         """Rows of the head: (text, columns that it spans)."""
@@ -52,7 +51,7 @@ class PageTable:
         return rows
 
     def latex(self, footer: str) -> str:
-        """For the booktabs package."""
+        """Return LaTeX for the booktabs package."""
         notes = " ".join(f"{mark}: {text}." for mark, text in self.messages)
         text: str = self.body.replace(_MINUS, "-", regex=True).to_latex(
             index=False,
@@ -66,7 +65,7 @@ class PageTable:
 
 
 class _Marks:
-    """Reasons why cells of a table have no number, each once."""
+    """Reasons for cells without a number, each once."""
 
     def __init__(self) -> None:
         self.found: dict[str, str] = {}
@@ -81,7 +80,7 @@ class _Marks:
 
 
 def _labels(body: pd.DataFrame) -> int:
-    """Columns of texts at the left."""
+    """Number of columns of texts at the left."""
     head = [str(c[-1] if isinstance(c, tuple) else c) for c in body.columns]
     return sum(
         c in ("", "Measure", "Group", "Visit", "Score", "Persons", "Of", "Kind", "By", "A", "B", "Test")
@@ -90,13 +89,13 @@ def _labels(body: pd.DataFrame) -> int:
 
 
 def title_of(study: StudyData, name: str) -> str:
-    """A measure, score or angle as people read it, with its unit."""
+    """Title of a measure, score or angle, with its unit."""
     unit, short = unit_of(study, name), short_of(name)
     return f"{short} ({unit})" if unit and not short.endswith(f"({unit})") else short
 
 
 def short_of(name: str) -> str:
-    """Without its unit, unless that is what tells it from another, as in 10MWT_s and 10MWT_m_per_s."""
+    """Title without the unit, unless the unit distinguishes it from another, as in 10MWT_s and 10MWT_m_per_s."""
     names = MEASURES | TASKS | ANGLES | FOOT_ANGLES | PELVIS_ANGLES
     if name in names:
         return names[name][0]
@@ -108,7 +107,7 @@ def short_of(name: str) -> str:
 
 
 def unit_of(study: StudyData, name: str) -> str:
-    """The unit as the study writes it."""
+    """Unit as in the study."""
     for frame, column in ((study.measures, "measure"), (study.curves, "variable")):
         rows: Any = frame[frame[column] == name]
         if len(rows):
@@ -120,12 +119,12 @@ def unit_of(study: StudyData, name: str) -> str:
 
 
 def number(value: float, digits: int) -> str:
-    """With a fixed number of decimals and a true minus; "" for NaN."""
+    """Format a number with fixed decimals and a true minus; "" for NaN."""
     return "" if not math.isfinite(value) else f"{value:.{digits}f}".replace("-", _MINUS)
 
 
 def digits_of(values: Any) -> int:
-    """Decimals that show three digits of typical values."""
+    """Number of decimals that show three digits of typical values."""
     known = np.abs(np.asarray(values, float))
     known = known[np.isfinite(known)]
     size = float(np.median(known)) if len(known) else 1.0
@@ -133,14 +132,14 @@ def digits_of(values: Any) -> int:
 
 
 def p_text(p: float) -> str:
-    """p with two digits, below 0.001 with its power."""
+    """Format p with two digits, below 0.001 as a power."""
     if not math.isfinite(p):
         return ""
     return f"{p:.2g}" if p >= 0.001 else f"{p:.0e}".replace("e-0", "e-").replace("-", _MINUS)
 
 
 def estimate(row: Any, marks: _Marks, digits: int = 2, star: bool = False) -> str:
-    """`0.84 (0.81 to 0.86)` of a row with `value, low, high, p, code, message`, with a star where p < 0.05."""
+    """Format a row with `value, low, high, p, code, message` as `0.84 (0.81 to 0.86)`, with a star for p < 0.05."""
     if row["code"]:
         return marks(row["message"])
     limits = f"({number(row['low'], digits)} to {number(row['high'], digits)})"
@@ -149,7 +148,7 @@ def estimate(row: Any, marks: _Marks, digits: int = 2, star: bool = False) -> st
 
 
 def all_tables(study: StudyData, results: StudyResults) -> dict[str, PageTable]:
-    """Every table of the report, by name."""
+    """Make the tables of the report, by name."""
     made = (
         flow(results),
         table2(results),
@@ -173,7 +172,7 @@ def _table(name: str, title: str, note: str, frame: pd.DataFrame, columns: _Colu
 
 
 def flow(results: StudyResults) -> PageTable:
-    """Who is in and out."""
+    """Participant flow."""
     columns: _Columns = {
         "Group": lambda r: str(r["group"]),
         "Visit": lambda r: str(r["role"]),
@@ -185,8 +184,8 @@ def flow(results: StudyResults) -> PageTable:
         "Of them without index": lambda r: str(r["without_index"]),
         "Why left out": lambda r: str(r["reasons"]),
     }
-    note = "Visits by group; persons left out are in no number below."
-    return _table("flow", "Who is in and out", note, results.flow, columns, _Marks())
+    note = "Visits by group. Excluded visits are not counted below."
+    return _table("flow", "Participant flow", note, results.flow, columns, _Marks())
 
 
 def table2(results: StudyResults) -> PageTable:
@@ -344,20 +343,13 @@ def groups(results: StudyResults) -> PageTable:
 
 
 def phases(results: StudyResults) -> PageTable:
-    """Where curves differ."""
+    """Phases in which curves differ."""
     marks, rows = _Marks(), []
     for c in results.curves:
         row = {"Measure": short_of(c.angle), "Of": comparison_of(c)}
         if not hasattr(c.test, "phases"):
             error: Any = c.test
-            rows.append(
-                {
-                    **row,
-                    "Phase (% of cycle)": marks(reason(error)),
-                    "Largest difference (deg)": "",
-                    "p": "",
-                }
-            )
+            rows.append({**row, "Phase (% of cycle)": marks(reason(error))})
             continue
         test: Any = c.test
         found = test.phases or (None,)
@@ -385,7 +377,7 @@ def phases(results: StudyResults) -> PageTable:
 
 
 def comparison_of(result: Any) -> str:
-    """Who is compared with whom, as a - b."""
+    """Names of the compared groups or roles, as a - b."""
     a, b = result.names
     return f"{a or 'none'} {_MINUS} {b}"
 

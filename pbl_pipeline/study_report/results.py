@@ -1,4 +1,4 @@
-"""The statistics of a study as long tables: one row per number, with its interval, or the code that says why not."""
+"""Statistics of a study as long tables: one row per number, with its interval, or the code of the reason why not."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class CurveResult:
     """A comparison of mean curves of an angle."""
 
     angle: str  # name
-    comparison: str  # between whom: "change", or two names
-    test: CurveTest | PblError  # the test, or why there is none
+    comparison: str  # "change", or two names
+    test: CurveTest | PblError  # the test, or the reason why there is none
     left_out: int  # persons whose curves have unknown points
     a: np.ndarray  # (N, 101) curves of the persons tested; of "change" those after
     b: np.ndarray  # (M, 101) likewise; of "change" those before
@@ -57,7 +57,7 @@ class CurveResult:
 
 @dataclasses.dataclass(frozen=True)
 class StudyResults:
-    """All statistics of a report; every frame is long, `code` and `message` are "" where there is a value."""
+    """All statistics of a report; every frame is long, `code` and `message` are "" if there is a value."""
 
     plan: Plan  # what was compared
     table: pd.DataFrame  # `visit_table` of the study
@@ -71,7 +71,7 @@ class StudyResults:
 
 
 def study_results(study: StudyData, to_compare: Plan, permutations: int = 10_000) -> StudyResults:
-    """All statistics of a study. What the values do not support has the code STATS_INPUT in its row."""
+    """Compute all statistics of a study. Those that the values do not support have the code STATS_INPUT."""
     table = visit_table(study)
     return StudyResults(
         to_compare,
@@ -87,7 +87,7 @@ def study_results(study: StudyData, to_compare: Plan, permutations: int = 10_000
 
 
 def _tried(function: Callable[..., Any], *values: Any, **options: Any) -> tuple[Any, dict[str, str]]:
-    """What a function returns, with empty `code` and `message`; or None and those of its error."""
+    """Return the result of a function with empty `code` and `message`; or None and those of its error."""
     try:
         return function(*values, **options), {"code": "", "message": ""}
     except PblError as error:
@@ -95,18 +95,18 @@ def _tried(function: Callable[..., Any], *values: Any, **options: Any) -> tuple[
 
 
 def reason(error: PblError) -> str:
-    """Return why a statistic has no value; too few values, one per person, as the number of persons that it needs."""
+    """Return the reason of a missing statistic; for too few values, one per person, the number of persons needed."""
     least = re.fullmatch(r"at least (\d+)(?: subjects)?", error.expected)
     return f"at least {least[1]} persons needed" if least else f"{error.found}; expected {error.expected}"
 
 
 def _fields(found: object | None, *names: str) -> dict[str, Any]:
-    """Fields of what was found as columns of a row; none where nothing was: a frame has NaN there."""
+    """Fields of a result as columns of a row; empty without a result, so that the frame has NaN."""
     return {} if found is None else {name: getattr(found, name) for name in names}
 
 
 def flow_table(study: StudyData, to_compare: Plan) -> pd.DataFrame:
-    """Who is in and out, by group and role; `reasons` as "reason (n); ...". `persons` is that of the whole group."""
+    """Participant flow by group and role; `reasons` as "reason (n); ...". `persons` is that of the whole group."""
     visits: Any = study.visits
     roles = [*to_compare.roles, *(r for r in dict.fromkeys(visits["role"]) if r not in to_compare.roles)]
     names = [*to_compare.groups, *(g for g in sorted(set(visits["group"])) if g not in to_compare.groups)]
@@ -145,13 +145,12 @@ def visit_means(table: pd.DataFrame, to_compare: Plan) -> pd.DataFrame:
 
 
 def summary(values: np.ndarray) -> dict[str, float]:
-    """`mean, low, high` (Student's 95 % interval), `sd, median, niqr` of (N,) values; NaN where one value has none."""
-    n = len(values)
-    low, high = np.percentile(values, [25, 75])
+    """`mean, low, high` (Student's 95 % interval), `sd, median, niqr` of (N,) values; one value has only mean and
+    median, the others are NaN."""
+    n, mean = len(values), float(values.mean())
     sd = float(values.std(ddof=1)) if n > 1 else np.nan
     half = float(distributions.t.isf(0.025, n - 1)) * sd / np.sqrt(n) if n > 1 else np.nan
-    mean = float(values.mean())
-    # One person has neither an interval nor a spread.
+    low, high = np.percentile(values, [25, 75])
     spread = 0.7413 * (high - low) if n > 1 else np.nan
     return {
         "mean": mean,
@@ -193,8 +192,7 @@ def repeatability(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd
 
 def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
     """Correlation of each measure with each score at the visit `change_from`: all persons who have both, and the
-    changing group where it is not all of them. Spearman where the score is ordinal, else Pearson (the paper,
-    Statistics)."""
+    changing group if that is not all of them. Spearman for ordinal scores, else Pearson (the paper, Statistics)."""
     ordinal = {
         score_column(study, i): o
         for i, o in zip(study.instruments["instrument"], study.instruments["ordinal"], strict=True)
@@ -234,8 +232,8 @@ def change(to_compare: Plan, table: pd.DataFrame, resamples: int = 10_000) -> pd
 
 
 def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
-    """Each measure between groups, and between neighbouring classes of a score, at the visit `change_from`: the
-    paper's test (Statistics) and Hedges' g."""
+    """Compare each measure between groups, and between neighbouring classes of a score, at the visit `change_from`, by
+    the paper's test (Statistics) and Hedges' g."""
     at: Any = table[table["role"] == to_compare.change_from]
     kinds = {"group": at["group"]} | score_classes(study, to_compare, at)
     rows = []
@@ -263,7 +261,7 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
 
 
 def _corrected(tests: pd.DataFrame, family: str) -> pd.DataFrame:
-    """With `p_holm`: p corrected (Holm) for the tests that have the same value in the column `family`."""
+    """Add `p_holm`: p corrected (Holm) for the tests with the same value in the column `family`."""
     known: Any = tests[tests["p"].notna()]
     for _, of_family in known.groupby(family):
         tests.loc[of_family.index, "p_holm"] = adjust(of_family["p"])
@@ -282,7 +280,7 @@ def score_classes(study: StudyData, to_compare: Plan, table: Any) -> dict[str, A
 
 
 def curve_results(study: StudyData, to_compare: Plan, permutations: int = 10_000) -> list[CurveResult]:
-    """Curves of each angle: the changing group before and after (paired), and against every other group before."""
+    """Compare the curves of each angle: the changing group before and after (paired), and with other groups before."""
     found = []
     for angle in to_compare.angles:
         curves = mean_curves(study, angle)

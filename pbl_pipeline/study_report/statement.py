@@ -1,6 +1,5 @@
-"""Statement of measurement error of a study: what was measured, how, on whom, and how far it can be relied on, in the
-order in which COSMIN (Gagnier et al. 2021, Qual Life Res 30:2197-2218) and STARD (Bossuyt et al. 2015, BMJ 351:h5527)
-ask for it."""
+"""Statement of measurement error of a study: design, measurement, participants and reliability, in the order of COSMIN
+(Gagnier et al. 2021, Qual Life Res 30:2197-2218) and STARD (Bossuyt et al. 2015, BMJ 351:h5527)."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from .page_tables import PageTable, digits_of, number, short_of, title_of
 from .results import StudyResults
 from .visit_values import score_column
 
-#: Columns of visits that a slice states of the recordings (docs/study.md), and what the statement calls them.
+#: Columns of visits about the recordings (docs/study.md), and their names in the statement.
 FILMED = {
     "views": "Filmed from",
     "cameras": "Calibration of the camera",
@@ -28,13 +27,13 @@ FILMED = {
     "assistive_device": "Walking aid",
     "orthosis": "Orthosis",
 }
-#: Numbers of videos, and why some were left out, as "reason (n); ...".
+#: Columns of the numbers of videos, and of the reasons why some were left out, as "reason (n); ...".
 VIDEOS, LEFT_OUT, WHY_LEFT_OUT = "videos", "videos_left_out", "videos_left_out_why"
 _NOT_STATED = "not stated"
 
 
 def statement(study: StudyData, results: StudyResults) -> PageTable:
-    """The statement as rows of section, item and what is so in this study."""
+    """Make the statement, in rows of section, item and text."""
     rows = [
         *(("Design", item, text) for item, text in _design(study, results)),
         *(("Measurement", item, text) for item, text in _measurement(study)),

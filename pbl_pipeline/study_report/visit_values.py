@@ -1,4 +1,4 @@
-"""What a study's statistics are made of: one row per visit, and what is compared with what."""
+"""Values of a study for its statistics: one row per visit, and the plan of comparisons."""
 
 from __future__ import annotations
 
@@ -18,27 +18,23 @@ _KEY = ["subject", "visit"]
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What is compared."""
+    """Comparisons of a study."""
 
-    #: In order: by the days of the visits; the group that changes first, then by name.
-    roles: tuple[str, ...]
-    groups: tuple[str, ...]
-    #: Names of gait measures (the index first), clinical scores and joint angles.
-    measures: tuple[str, ...]
-    scores: tuple[str, ...]
-    angles: tuple[str, ...]
-    #: As `StudyDescription`, resolved. `change_to` is "" in a study of one role.
-    change_from: str
-    change_to: str
+    roles: tuple[str, ...]  # by the days of the visits
+    groups: tuple[str, ...]  # the changing group first, then by name
+    measures: tuple[str, ...]  # names of gait measures, the index first
+    scores: tuple[str, ...]  # names of clinical scores
+    angles: tuple[str, ...]  # names of joint angles
+    change_from: str  # this and the following as in `StudyDescription`, resolved
+    change_to: str  # "" in a study of one role
     change_group: str
 
 
 def visit_table(study: StudyData) -> pd.DataFrame:
-    """One row per visit that counts: `subject, visit, role, days, group`, then a column per measure and score.
+    """One row per included visit: `subject, visit, role, days, group`, then a column per measure and score.
 
-    A measure is that of both sides where the study has it, else the mean of left and right; the index is that of the
-    visits alone, whatever the measures say of its sides. What a visit lacks is NaN.
-    A score that is named like a measure has " (score)" behind its name.
+    A measure is that of both sides if the study has it, else the mean of left and right; the index is always that of
+    the visits. Missing values are NaN. The name of a score that is also a measure has the suffix " (score)".
     """
     visits: Any = study.visits[study.visits["included"]]
     table = visits[[*_KEY, "role", "days", "group", INDEX]]
@@ -47,7 +43,7 @@ def visit_table(study: StudyData) -> pd.DataFrame:
     measures: Any = study.measures[study.measures["measure"] != INDEX]
     sided = measures[measures["side"] != "both"].groupby([*_KEY, "measure"], sort=False)["value"]
     both = measures[measures["side"] == "both"].set_index([*_KEY, "measure"])["value"]
-    # Of one leg alone there is no mean of both.
+    # One leg alone has no mean of both.
     means = sided.mean()[sided.count() == 2]
     wide = both.combine_first(means).unstack()
     order = [m for m in (*MEASURES, *dict.fromkeys(measures["measure"])) if m in wide]
@@ -60,15 +56,15 @@ def visit_table(study: StudyData) -> pd.DataFrame:
 
 
 def score_column(study: StudyData, instrument: str) -> str:
-    """The column of a score in `visit_table`."""
+    """Column of a score in `visit_table`."""
     taken = {INDEX, *study.measures["measure"]}
     return f"{instrument} (score)" if instrument in taken else instrument
 
 
 def plan(study: StudyData, change_from: str = "", change_to: str = "", change_group: str = "") -> Plan:
-    """What is compared in a study; what is "" is that of its description, or follows from its visits.
+    """Plan the comparisons of a study; arguments of "" are taken from its description, or follow from its visits.
 
-    Raises `PblError` USAGE: a role or group that no visit that counts has. STUDY_INVALID: no visit counts.
+    Raises `PblError` USAGE: a role or group that no included visit has. STUDY_INVALID: no included visit.
     """
     table: Any = visit_table(study)
     if not len(table):
@@ -111,7 +107,7 @@ def _known(name: str, names: tuple[str, ...], what: str) -> str:
 
 
 def at_role(table: pd.DataFrame, role: str, column: str, group: str = "") -> pd.Series:
-    """Values of a column at the visit of a role, by subject; those that are known."""
+    """Known values of a column at the visit of a role, by subject."""
     frame: Any = table
     rows = frame[(frame["role"] == role) & ((frame["group"] == group) | (group == ""))]
     return rows.set_index("subject")[column].dropna()
@@ -125,21 +121,21 @@ def pairs(table: pd.DataFrame, to_compare: Plan, column: str) -> pd.DataFrame:
 
 
 def mean_curves(study: StudyData, angle: str) -> pd.DataFrame:
-    """(visits that count, 101) mean of the sides of a visit, by subject, role and group; NaN where one is unknown."""
+    """(included visits, 101) mean of the sides of a visit, by subject, role and group; NaN where one is unknown."""
     curves: Any = study.curves[study.curves["variable"] == angle]
     visits: Any = study.visits[study.visits["included"]]
     rows = visits[[*_KEY, "role", "group"]].merge(curves, on=_KEY, how="left")
     keys = [rows["subject"], rows["role"], rows["group"]]
     points = list(CURVE_POINTS)
     unknown = rows[points].isna().groupby(keys, sort=False).any()
-    # Tables hold only curves without unknown points; the curve of one leg alone is not the mean of both.
+    # The tables have only curves without unknown points; the curve of one leg alone is not the mean of both.
     one_sided = rows["side"].groupby(keys, sort=False).nunique() < curves["side"].nunique()
     return rows[points].groupby(keys, sort=False).mean().mask(unknown.apply(lambda c: c | one_sided))
 
 
 def cycle_values(study: StudyData, to_compare: Plan, measure: str) -> pd.DataFrame:
-    """`subject, value` of the cycles of one visit per person, in order: that of `change_from`, else the first that
-    counts."""
+    """`subject, value` of the cycles of one visit per person, in order: that of `change_from`, else the first included
+    one."""
     visits: Any = study.visits[study.visits["included"]]
     order = {r: i for i, r in enumerate([to_compare.change_from, *to_compare.roles])}
     cycles: Any = study.cycles[study.cycles["measure"] == measure]

@@ -9,7 +9,7 @@ trials of `pbl synth`: legs by published curves at any speed, feet that stand st
 from .camera import LEVEL_R_NC, PHONE_CAMERA, PHONE_SIZE_PX, VIEWS_DEG, PhoneSensor, picture_px
 from .impair import IMPAIRMENTS, Impairment
 from .noise import CORRELATED_NOISE, NO_NOISE, Disturbance, Noise, correlated
-from .observe import Seen, film, hide, pelvis_positions, seen_by, true_markers
+from .observe import Seen, film, pelvis_positions, seen_by, true_markers
 from .physique import physique
 from .plan import plain_walk
 from .solve import SOLE_POINTS, sole_points

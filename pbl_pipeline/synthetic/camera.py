@@ -1,4 +1,4 @@
-"""Cameras: a phone that stands or is held, where it stands or goes, its orientation log, and the picture of a point."""
+"""Cameras: a phone that stands or is held, its path, its orientation log, and the projection of points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import Camera
 
 from .plan import GRID_STEP_S, Plan, wander, within
@@ -34,16 +33,12 @@ FOLLOW_DELAY_S, FOLLOW_SMOOTH_S = 0.2, 0.25
 
 @dataclasses.dataclass(frozen=True)
 class PhoneSensor:
-    """The phone's orientation log.
-
-    rate_hz; white_deg per axis and sample; drift_deg: a slow error about the vertical, and a fifth of it about the two
-    level axes, which gravity holds; clock_offset_s: a frame at video time t bears the phone's time t + clock_offset_s.
-    """
+    """The phone's orientation log."""
 
     rate_hz: float = 100.0
-    white_deg: float = 0.3
-    drift_deg: float = 0.5
-    clock_offset_s: float = 0.040
+    white_deg: float = 0.3  # per axis and sample
+    drift_deg: float = 0.5  # a slow error about the vertical; a fifth of it about the level axes, which gravity limits
+    clock_offset_s: float = 0.040  # a frame at video time t has the phone's time t + clock_offset_s
 
 
 def camera_turn(yaw_rad: np.ndarray, pitch_rad: np.ndarray, roll_rad: np.ndarray) -> Float[np.ndarray, "T 3 3"]:
@@ -85,7 +80,7 @@ class HeldPhone:
 def phone_log(
     rng: np.random.Generator, sensor: PhoneSensor, R_nc_at, start_s: float, stop_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`phone_time_s` (P,) and `phone_quat_wxyz` (P, 4): what the phone measured, from 0.3 s before to 0.3 s after.
+    """`phone_time_s` (P,) and `phone_quat_wxyz` (P, 4) as measured by the phone, from 0.3 s before to 0.3 s after.
 
     `R_nc_at` maps video times (P,) to the true orientations (P, 3, 3).
     """
@@ -94,7 +89,7 @@ def phone_log(
     white = Rotation.from_rotvec(np.radians(sensor.white_deg) * rng.standard_normal((len(video_s), 3)))
     fraction = np.array([0.2, 0.2, 1.0]) * sensor.drift_deg
     drift = np.column_stack([wander(rng, video_s, deg, 0.005, 0.1) for deg in fraction])
-    # The drift turns the phone's idea of the world; the noise is the sensor's own.
+    # The drift turns the phone's world; the noise is that of the sensor.
     measured = Rotation.from_rotvec(np.radians(drift)) * true * white
     return video_s + sensor.clock_offset_s, measured.as_quat(scalar_first=True)
 
@@ -122,7 +117,7 @@ VIEWS_DEG = {
 CAMERAS = ("static", "panned", "handheld")
 #: Nearest point of a frontal walk, distance of the middle of all other motions, distance of a carried phone (m).
 NEAREST_M, MIDDLE_M, BEHIND_M = 2.5, 4.5, 3.2
-#: A person who carries the phone keeps the distance only over seconds, and bobs (m).
+#: Time over which a person who carries the phone keeps the distance (s), and the bobbing (m).
 CARRY_SMOOTH_S, BOB_SD_M = 0.8, 0.012
 #: Height of the phone above the floor (mean, standard deviation, m).
 PHONE_HEIGHT_M = (1.2, 0.06)
@@ -130,27 +125,18 @@ PHONE_HEIGHT_M = (1.2, 0.06)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A placed motion and its camera.
-
-    plan: the plan, placed; height_m: of the phone above the floor; carried: whether the phone goes along.
-    """
+    """A placed motion and its camera."""
 
     plan: Plan
-    height_m: float
-    carried: bool
+    height_m: float  # of the phone above the floor
+    carried: bool  # the phone follows the person
 
 
 def place(plan: Plan, view: str, seed: int, *, stays: bool = False) -> Scene:
-    """Turn and move a plan, so that the phone at the origin sees it from the view asked for.
+    """Turn and move a plan, so that the phone at the origin sees it from a view (`VIEWS_DEG`).
 
     `stays`: the person stays in the middle of the way (on a treadmill).
-
-    Raises `PblError` USAGE for an unknown view.
     """
-    if view not in VIEWS_DEG:
-        raise PblError(
-            "USAGE", found=f"view {view!r}", expected=f"one of {', '.join(VIEWS_DEG)}", next_step="pass one of these"
-        )
     rng = np.random.default_rng([seed, 21])
     height, slant = within(rng, *PHONE_HEIGHT_M), np.radians(within(rng, 0.0, 3.0))
     yaw = np.radians(VIEWS_DEG[view]) + slant
@@ -167,7 +153,7 @@ def place(plan: Plan, view: str, seed: int, *, stays: bool = False) -> Scene:
 
 
 def phone_path(scene: Scene, pelvis_m: Float[np.ndarray, "N 3"], seed: int) -> Float[np.ndarray, "N 3"]:
-    """Where the phone is at the times of the plan's grid (m, against its first place; the vertical is z).
+    """Position of the phone at the times of the plan's grid (m, relative to the first; the vertical is z).
 
     A carried phone keeps `BEHIND_M` behind the pelvis along the way, smoothly; every other one stays where it is.
     """
@@ -176,7 +162,7 @@ def phone_path(scene: Scene, pelvis_m: Float[np.ndarray, "N 3"], seed: int) -> F
         return np.zeros((len(t), 3))
     rng = np.random.default_rng([seed, 22])
     sigma = CARRY_SMOOTH_S / GRID_STEP_S
-    # Smoothed with its trend held beyond the ends, so that the distance does not change there.
+    # Smoothed with the trend continued beyond the ends, so that the distance does not change there.
     pad = int(4 * sigma)
     way = np.pad(pelvis_m[:, :2], [(pad, pad), (0, 0)], mode="reflect", reflect_type="odd")
     smooth = gaussian_filter1d(way, sigma, axis=0)[pad:-pad]
@@ -192,15 +178,10 @@ def phone_path(scene: Scene, pelvis_m: Float[np.ndarray, "N 3"], seed: int) -> F
 def orientation(
     camera: str, carried: bool, time_s: np.ndarray, pelvis_m: Float[np.ndarray, "T 3"], seed: int
 ) -> Callable[[np.ndarray], Float[np.ndarray, "P 3 3"]]:
-    """R_nc at any time: of a phone that stands (or is carried on a gimbal), that is turned, or that is held.
+    """R_nc at any time of a phone that stands (or is carried on a gimbal), is turned, or is held (`CAMERAS`).
 
-    `pelvis_m` is against the phone. A static phone looks level along the middle of what it sees. Raises `PblError`
-    USAGE for an unknown camera.
+    `pelvis_m` is relative to the phone. A static phone looks level along the middle of the motion.
     """
-    if camera not in CAMERAS:
-        raise PblError(
-            "USAGE", found=f"camera {camera!r}", expected=f"one of {', '.join(CAMERAS)}", next_step="pass one of these"
-        )
     if camera != "static":
         tremor = 1.0 if camera == "handheld" else 0.0
         return HeldPhone(np.random.default_rng([seed, 5]), time_s, pelvis_m, tremor=tremor).R_nc

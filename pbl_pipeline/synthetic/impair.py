@@ -1,4 +1,4 @@
-"""How a walk differs from normal: impairments and how severe they are."""
+"""Impairments of a walk, by name and severity."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Impairment:
 
     @classmethod
     def parse(cls, text: str) -> Impairment:
-        """From "crouch:0.7" or "stiff_knee:0.7:left". Raises `PblError` USAGE."""
+        """Parse "crouch:0.7" or "stiff_knee:0.7:left". Raises `PblError` USAGE."""
         name, _, rest = text.partition(":")
         severity, _, side = rest.partition(":")
         try:
@@ -42,7 +42,7 @@ class Impairment:
 
     @property
     def letters(self) -> str:
-        """Sides that it is on, as letters of the joints' names."""
+        """Affected sides, as letters of the joints' names."""
         return {"right": "r", "left": "l", "both": "rl", "": "r" if self.name in ONE_SIDE else "rl"}[self.side]
 
 
@@ -69,14 +69,14 @@ class Style:
     swing_hike: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     swing_ankle: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     forefoot: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
-    #: Fraction of the stride by which the foot comes down later: a shorter stance of this side.
+    #: Delay of the initial contact as a fraction of the stride: a shorter stance of this side.
     late_down: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
     arm_swing: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 1.0, "l": 1.0})
     elbow: dict[str, float] = dataclasses.field(default_factory=lambda: {"r": 0.0, "l": 0.0})
 
 
 def style_of(impairments: tuple[Impairment, ...]) -> Style:
-    """The style that some impairments make together, in their order."""
+    """Combine impairments into a style, in their order."""
     style = Style()
     for i in impairments:
         IMPAIRMENTS[i.name](style, i.severity, i.letters)

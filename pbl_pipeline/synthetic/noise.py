@@ -15,7 +15,7 @@ PICTURE_PX = 1920
 
 @dataclasses.dataclass(frozen=True)
 class Disturbance:
-    """What is added to the true points (T, J): `xyz_m` in the camera frame, `xy_px`; and which are wrong or missing."""
+    """Errors of the true points (T, J): `xyz_m` in the camera frame, `xy_px`; and outliers and missing points."""
 
     xyz_m: Float[np.ndarray, "T J 3"]
     xy_px: Float[np.ndarray, "T J 2"]
@@ -26,7 +26,7 @@ class Disturbance:
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Standard deviations per axis, in the camera frame. The defaults are those of the project's benchmark.
+    """Standard deviations per axis, in the camera frame. The defaults are those of our benchmark.
 
     across_m, along_m
         Per frame and marker, across the line of sight (each of two axes) and along it.
@@ -35,13 +35,13 @@ class Noise:
     constant_m, constant_along_m
         One error per marker and trial that does not change, across and along the line of sight (None: as across).
     xy_px
-        Of the pixels of a picture whose longer side has `PICTURE_PX` pixels, independent from frame to frame; in a
-        larger picture as much larger, as is `outlier_px`: a detector errs by a fraction of what it looks at.
+        Of the pixels of a picture whose longer side has `PICTURE_PX` pixels, independent from frame to frame; scaled
+        with the size of the picture, as is `outlier_px`: the error of a detector is a fraction of its region.
     xy_m, xy_correlation
         Of the pixels, as a length at the person's distance, and the correlation of that over 1/30 s.
     outlier_share, outlier_m, outlier_px
         Fraction of the points (marker and frame) that are far off, in 3D and in the picture at once: moved by a length
-        between these bounds in any direction. Their confidence does not tell.
+        between these bounds in any direction. Their confidence is not lower.
     drop_share
         Fraction of the points that are not found: NaN with confidence 0.
     confidence, confidence_sd
@@ -89,7 +89,7 @@ class Noise:
         picture_px: float,
         factor: float | Float[np.ndarray, "T J"] = 1.0,
     ) -> Disturbance:
-        """Draw all but `correlated_px`: errors of each point on its own. `factor`: of `across_m` and `along_m`."""
+        """Draw all errors but `correlated_px`, independent between points. `factor`: of `across_m` and `along_m`."""
         shape = x_cam.shape[:2]
         ray = x_cam / np.linalg.norm(x_cam, axis=-1, keepdims=True)
         unit = correlated(rng, self.correlation, self.correlation_step_s, time_s, x_cam.shape)

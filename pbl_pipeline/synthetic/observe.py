@@ -1,21 +1,19 @@
-"""The walker as one phone sees it: keypoints with noise, and the camera's true orientation."""
+"""Observation of the walker by one phone: keypoints with noise, and the camera's true orientation."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
 
-import mujoco  # pyright: ignore[reportMissingTypeStubs]
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body, marker_set
+from pbl_pipeline.body import SCALE_NAMES, MarkerSet, body_frames, load_body, marker_set
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import Camera
 
 from .camera import PhoneSensor, phone_log, picture_px
 from .noise import Noise
-from .physique import scaled_model
 
 
 def true_markers(
@@ -24,20 +22,13 @@ def true_markers(
     scale: Float[np.ndarray, " 8"] | None = None,
     site_offset_m: Float[np.ndarray, "J 3"] | None = None,
 ) -> Float[np.ndarray, "T J 3"]:
-    """Markers in the world (m), in double precision by C MuJoCo: not the kinematics that the fit uses."""
+    """Markers in the world (m), in double precision by C MuJoCo, which the fit does not use."""
     body, markers = load_body(), as_marker_set(markers)
     scale = np.ones(len(SCALE_NAMES)) if scale is None else np.asarray(scale, np.float64)
     offset = 0.0 if site_offset_m is None else np.asarray(site_offset_m, np.float64)
-    model = scaled_model(scale)
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    xpos, xmat = np.empty((len(qpos), len(body.body_names), 3)), np.empty((len(qpos), len(body.body_names), 9))
-    for t, q in enumerate(np.asarray(qpos, np.float64)):
-        data.qpos[:] = q
-        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        xpos[t], xmat[t] = data.xpos[1:], data.xmat[1:]
-    at = markers.body_index
+    frames, at = body_frames(body, qpos, scale), markers.body_index
     local = scale[body.scale_index[at]][:, None] * (markers.position_m + offset)
-    return xpos[:, at] + np.einsum("tjab,jb->tja", xmat.reshape(*xmat.shape[:2], 3, 3)[:, at], local)
+    return frames.position_m[:, at] + np.einsum("tjab,jb->tja", frames.rotation[:, at], local)
 
 
 def as_marker_set(markers: str | MarkerSet) -> MarkerSet:
@@ -47,19 +38,14 @@ def as_marker_set(markers: str | MarkerSet) -> MarkerSet:
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """Keypoints of a trial and what is true of it.
-
-    R_nc (T, 3, 3): camera to world at each frame; clock_offset_s: the phone's clock against the video's, NaN without a
-    log; markers_world_m (T, J, 3): the true points; outlier (T, J): which points were thrown far off; outside (T, J):
-    which were missing because they are not in the picture; qpos (T, 40): the motion where the phone saw it.
-    """
+    """Keypoints of a trial and its truth."""
 
     keypoints: Keypoints
-    R_nc: Float[np.ndarray, "T 3 3"]
-    clock_offset_s: float
-    markers_world_m: Float[np.ndarray, "T J 3"]
-    outlier: np.ndarray
-    outside: np.ndarray
+    R_nc: Float[np.ndarray, "T 3 3"]  # camera to world
+    clock_offset_s: float  # of the phone's clock to the video's, NaN without a log
+    markers_world_m: Float[np.ndarray, "T J 3"]  # the true points
+    outlier: np.ndarray  # (T, J) bool
+    outside: np.ndarray  # (T, J) bool: missing because they are not in the picture
     qpos: Float[np.ndarray, "T 40"]
 
 
@@ -80,10 +66,10 @@ def film(
     root_relative: bool,
     only_in_picture: bool,
 ) -> Seen:
-    """Keypoints of a motion as a phone at the world's origin sees it.
+    """Make the keypoints of a motion that is seen by a phone at the world's origin.
 
-    `R_nc_at` maps times (P,) to the phone's orientation; `sensor` None: no log; `only_in_picture`: points outside of
-    the picture are missing.
+    `R_nc_at` maps times (P,) to the phone's orientation; `sensor` None: no log; `only_in_picture`: points outside the
+    picture are missing.
     """
     R_nc = R_nc_at(time_s)
     x_world = true_markers(qpos, markers, scale, site_offset_m)
@@ -104,7 +90,7 @@ def film(
 def outside_picture(
     x_world: Float[np.ndarray, "T J 3"], R_nc: Float[np.ndarray, "T 3 3"], camera: Camera, size_px: tuple[int, int]
 ) -> np.ndarray:
-    """(T, J) which points are outside of the picture of a phone at the origin, or behind it."""
+    """(T, J) bool: points outside the picture of a phone at the origin, or behind it."""
     x_cam = np.einsum("tba,tjb->tja", R_nc, x_world)
     behind = x_cam[..., 2] < 0.2
     px = picture_px(np.where(behind[..., None], [0.0, 0.0, 1.0], x_cam), camera)
@@ -123,7 +109,7 @@ def seen_by(
     image_size_px: tuple[int, int],
     root_relative: bool,
 ) -> tuple[Keypoints, np.ndarray]:
-    """Keypoints of true points seen by a camera at `p_nc`, and which of them are outliers (T, J)."""
+    """Make the keypoints of true points seen by a camera at `p_nc`, and return the outliers (T, J)."""
     x_cam = np.einsum("tba,tjb->tja", R_nc, x_world - p_nc)
     d = noise.disturb(rng, time_s, x_cam, markers, float(camera.matrix[0, 0]), max(image_size_px))
     true_px = picture_px(x_cam, camera)
@@ -145,7 +131,7 @@ def seen_by(
 
 
 def hide(keypoints: Keypoints, hidden: np.ndarray) -> Keypoints:
-    """The keypoints with those of `hidden` (T, J) missing."""
+    """Remove the keypoints of `hidden` (T, J)."""
     gone = hidden[..., None]
     return dataclasses.replace(
         keypoints,

@@ -1,16 +1,11 @@
-"""A person for `pbl synth`: size, where the markers sit, and the body's kinematics at that size."""
+"""A person for `pbl synth`: size, positions of the markers, and length of the legs."""
 
 from __future__ import annotations
 
-import copy
-from typing import Any
-
-# MuJoCo is a compiled module without type stubs.
-import mujoco  # pyright: ignore[reportMissingTypeStubs]
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.body import SCALE_NAMES, MarkerSet, load_body
+from pbl_pipeline.body import SCALE_NAMES, MarkerSet, body_frames, load_body
 
 from .plan import within
 
@@ -36,23 +31,13 @@ def physique(seed: int, markers: MarkerSet) -> tuple[Float[np.ndarray, " 8"], Fl
     return scale, rng.normal(0, SITE_SD_M, (len(markers), 3))
 
 
-def scaled_model(scale: Float[np.ndarray, " 8"]) -> Any:
-    """The body as a C MuJoCo model with the origins of a person's size (for kinematics only)."""
-    body = load_body()
-    model = copy.copy(body.mj_model)
-    parent = body.parent_index
-    model.body_pos[1:] *= np.where(parent >= 0, np.asarray(scale)[body.scale_index[parent]], 1.0)[:, None]
-    return model
-
-
 def leg_length_m(scale: Float[np.ndarray, " 8"]) -> float:
-    """From the hip to the floor, standing upright, mean of both legs (m)."""
-    model = scaled_model(scale)
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-    names = load_body().body_names
-    at = {n: data.xpos[1 + names.index(n)] for n in ("femur_r", "calcn_r", "femur_l", "calcn_l")}
-    sole = [SOLE_M * scale[load_body().scale_index[names.index(f"calcn_{s}")]] for s in "rl"]
+    """Height of the hip above the floor, standing upright, mean of both legs (m)."""
+    body = load_body()
+    names = body.body_names
+    standing = body_frames(body, np.zeros((1, len(body.joint_names))), scale).position_m[0]
+    at = {n: standing[names.index(n)] for n in ("femur_r", "calcn_r", "femur_l", "calcn_l")}
+    sole = [SOLE_M * scale[body.scale_index[names.index(f"calcn_{s}")]] for s in "rl"]
     legs = [at[f"femur_{s}"][2] - at[f"calcn_{s}"][2] + h for s, h in zip("rl", sole, strict=True)]
     return float(np.mean(legs))
 

@@ -161,18 +161,18 @@ class Step:
 
     @property
     def heel_s(self) -> tuple[float, float]:
-        """When the heel is on the floor."""
+        """Time with the heel on the floor."""
         return self.down_s + 0.12 * self.forefoot * self.nominal_s, self.up_s - HEEL_OFF_BEFORE * self.nominal_s
 
     @property
     def ball_s(self) -> tuple[float, float]:
-        """When the ball of the foot is on the floor."""
+        """Time with the ball of the foot on the floor."""
         flat = 0.0 if self.forefoot > 0 else FLAT_AFTER
         return self.down_s + flat * self.nominal_s, self.up_s - BALL_OFF_BEFORE * self.nominal_s
 
     @property
     def toe_s(self) -> tuple[float, float]:
-        """When the toes are on the floor: they leave it last."""
+        """Time with the toes on the floor, which leave it last."""
         return self.ball_s[0], self.up_s
 
 
@@ -192,8 +192,8 @@ class Plan:
     on_path: Float[np.ndarray, " N"]
     speed_m_per_s: Float[np.ndarray, " N"]  # (N,) along the way, which sets how much of a walk the legs and arms do
     steps: tuple[Step, ...]  # all stances, in order of foot down
-    #: angle -> (N,) of both sides where nobody walks: hip_flexion, knee_flexion, ankle_angle, tilt, lumbar_extension,
-    #: arm_flex, elbow_flex; missing ones are those of standing.
+    #: angle -> (N,) of both sides while the person does not walk: hip_flexion, knee_flexion, ankle_angle, tilt,
+    #: lumbar_extension, arm_flex, elbow_flex; missing ones are those of standing.
     posture_deg: dict[str, np.ndarray]
 
     def moved(self, yaw_rad: float, to_m: tuple[float, float]) -> Plan:

@@ -36,7 +36,7 @@ STANDING_DEG = {
     "arm_flex": -5.0,
     "elbow_flex": 15.0,
 }
-#: A step where nobody walks at speed: how far knee and hip bend more in its swing (deg).
+#: Further flexion of knee and hip in the swing of a step without walking speed (deg).
 STEP_KNEE_DEG, STEP_HIP_DEG = 40.0, 22.0
 #: Hip rotation of a foot that points ahead, against the norm's mean (deg).
 HIP_ROTATION_DEG = 2.0
@@ -165,7 +165,7 @@ def reference(
 
 
 def _shape(rng) -> tuple[float, ...]:
-    """How a person's curve differs in shape: a harmonic sum without a mean, in standard deviations of the norm."""
+    """Difference of a person's curve in shape: a harmonic sum without a mean, in standard deviations of the norm."""
     return (0.0, *(within(rng, 0.0, SHAPE_SHARE) for _ in range(2 * SHAPE_HARMONICS)))
 
 

@@ -21,9 +21,9 @@ from jaxtyping import Float
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 
-from pbl_pipeline.body import SCALE_NAMES, load_body
+from pbl_pipeline.body import SCALE_NAMES, load_body, scaled_model
 
-from .physique import SOLE_M, scaled_model
+from .physique import SOLE_M
 from .plan import GRID_STEP_S, Plan, Step, pelvis_joints
 
 #: Points of the sole in the frames of their bodies (right side; m, unscaled): those that the contact holds.
@@ -64,7 +64,7 @@ _LEG = ("hip_flexion", "hip_adduction", "hip_rotation", "knee_angle", "ankle_ang
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where the sole's points belong: P points, N times. `weight` 1/m per axis of the world; `target` m;
+    """Targets of the sole's points: P points, N times. `weight` 1/m per axis of the world; `target` m;
     `floor` (N, P): the least height (m)."""
 
     names: tuple[str, ...]
@@ -218,7 +218,7 @@ class _Soles:
 
     def __init__(self, scale: Float[np.ndarray, " 8"]) -> None:
         body = load_body()
-        self._model = scaled_model(scale)
+        self._model = scaled_model(body, scale)
         self._data = mujoco.MjData(self._model)
         self.names, ids, local, size = [], [], [], []
         for side, sign in (("r", 1.0), ("l", -1.0)):
@@ -257,7 +257,7 @@ class _Soles:
         return x, np.moveaxis(by_joint * self._carried_by[:, free, None], -1, -2)
 
     def carried(self, q: np.ndarray, contacts: Contacts) -> np.ndarray:
-        """Where the pelvis (N, 3) is when the held points are where they belong in the mean, smoothly."""
+        """Positions of the pelvis (N, 3) at which the mean of the held points is on target, smoothed."""
         xpos, xmat = self._placed(q, "xpos", "xmat")
         weight = contacts.weight[:, :, 2, None] + 1e-9
         off = np.sum(weight * (contacts.target_m - self._points(xpos, xmat)), axis=1) / np.sum(weight, axis=1)
@@ -287,7 +287,7 @@ class _Soles:
         return np.array([step.xy_m[0] + c * x - s * y, step.xy_m[1] + s * x + c * y, z])
 
     def _placed(self, q: np.ndarray, *names: str) -> list[np.ndarray]:
-        """What MuJoCo's kinematics say of each pose, by name: (N, ...)."""
+        """Kinematics of each pose by MuJoCo, by name: (N, ...)."""
         out = [np.empty((len(q), *getattr(self._data, name).shape)) for name in names]
         for t, values in enumerate(q):
             self._data.qpos[:] = values

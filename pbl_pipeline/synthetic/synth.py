@@ -1,4 +1,4 @@
-"""`synthesise`: a walker with known joint angles, events, body and camera, and the keypoints a phone would give."""
+"""`synthesise`: a walker with known joint angles, events, body and camera, and the keypoints of a phone's video."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ TASKS: dict[str, Callable[[tasks.Walker, float | None], Plan]] = {
 DEFAULT_SECONDS = 5.0
 NOISES = {"benchmark": Noise(), "memory": CORRELATED_NOISE, "none": NO_NOISE}
 GROUNDS = ("overground", "treadmill")
-#: A picture that is wider than high, for a phone that stands and sees people from the side.
+#: Size of a landscape picture, for a phone that stands and sees people from the side.
 LANDSCAPE_PX = (1920, 1080)
-#: Fraction of the points that may be outside of the picture.
+#: Largest fraction of the points outside the picture.
 OUTSIDE_SHARE = 0.2
 
 
@@ -67,32 +67,25 @@ _usage = functools.partial(PblError, "USAGE", next_step="correct it; docs/synth.
 
 @dataclasses.dataclass(frozen=True)
 class SynthSpec:
-    """Options of a trial; the same options give the same result.
+    """Options of a trial; equal options have equal results.
 
-    task: one of `TASKS`; seed: of the person, the motion, the camera and the noise; impairments; view: one of
-    `VIEWS_DEG`; camera: "static", "panned" (turned after the person) or "handheld" (with a hand's tremor);
-    marker_set; seconds: None for the task's own time (walk, standing: 5 s); fps; speed_m_per_s: None for the person's
-    own; ground: "overground" or "treadmill" (walk only: the person stays in place and the belt runs back);
-    noise: "benchmark", "memory" (the same, but errors in the picture are correlated in time) or "none"; sensor: the
-    phone's orientation log, None for none with a static camera and the default one otherwise; root_relative: whether
-    the points' distance is lost, as with most detectors.
-
-    Raises `PblError` USAGE or MARKER_SET_UNKNOWN for values that cannot be.
+    Raises `PblError` USAGE or MARKER_SET_UNKNOWN for impossible values.
     """
 
-    task: str = "walk"
-    seed: int = 0
+    task: str = "walk"  # one of `TASKS`
+    seed: int = 0  # of the person, the motion, the camera and the noise
     impairments: tuple[Impairment, ...] = ()
-    view: str = "frontal"
-    camera: str = "static"
+    view: str = "frontal"  # one of `VIEWS_DEG`
+    camera: str = "static"  # "static", "panned" (turned after the person) or "handheld" (with a hand's tremor)
     marker_set: str = "bml_movi_87"
-    seconds: float | None = None
+    seconds: float | None = None  # None: the duration of the task (walk, standing: 5 s)
     fps: float = 30.0
-    speed_m_per_s: float | None = None
-    ground: str = "overground"
-    noise: str = "benchmark"
+    speed_m_per_s: float | None = None  # None: the person's
+    ground: str = "overground"  # or "treadmill" (walk only: the person stays in place and the belt runs back)
+    noise: str = "benchmark"  # or "memory" (the same, but errors in the picture are correlated in time) or "none"
+    #: The phone's orientation log; None: no log with a static camera, the default one otherwise.
     sensor: PhoneSensor | None = None
-    root_relative: bool = True
+    root_relative: bool = True  # the points' distance is lost, as with most detectors
 
     def __post_init__(self) -> None:
         for what, value, known in (
@@ -121,7 +114,7 @@ class SynthSpec:
 
     @property
     def name(self) -> str:
-        """Name of the files: task, impairments, view, camera, what else is not the default, seed."""
+        """Name of the files: task, impairments, view, camera, other options that are not the default, seed."""
         words = [self.task, *(f"{i.name}{round(100 * i.severity)}" for i in self.impairments), self.view, self.camera]
         fields = {f.name: f.default for f in dataclasses.fields(self)}
         for field, form in _IN_NAME.items():
@@ -133,33 +126,28 @@ class SynthSpec:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true of a synthetic trial. World: z up, metres, its origin at the phone, frame by frame."""
+    """Truth of a synthetic trial. World: z up, metres, its origin at the phone in each frame."""
 
-    #: (T,), (40,), (T, 40) joint values (m, rad). Where the phone is carried, the pelvis' place is against the phone of
-    #: that frame.
     time_s: Float[np.ndarray, " T"]
     joint_names: tuple[str, ...]
+    #: Joint values (m, rad). With a carried phone, the pelvis is relative to the phone of that frame.
     qpos: Float[np.ndarray, "T 40"]
-    events: tuple[GaitEvent, ...]  # all foot downs and foot ups within the time, with probability 1
-    #: (8,), (J, 3) the person.
-    scale: Float[np.ndarray, " 8"]
+    events: tuple[GaitEvent, ...]  # all initial contacts and toe-offs within the time, with probability 1
+    scale: Float[np.ndarray, " 8"]  # of the person
     site_offset_m: Float[np.ndarray, "J 3"]
-    R_nc: Float[np.ndarray, "T 3 3"]  # (T, 3, 3) camera to world
-    #: (T, 3) the phone's own way from its first place, in the axes of the world: add it to what is against the phone to
-    #: get the place in the room. Zeros but for view "follow". It is not observed.
+    R_nc: Float[np.ndarray, "T 3 3"]  # camera to world
+    #: Path of the phone from its first position, in the axes of the world: add it to positions relative to the phone
+    #: for those in the room. Zeros except in view "follow". It is not observed.
     phone_position_m: Float[np.ndarray, "T 3"]
-    #: (T, 3), (T, J, 3) against the phone, as `qpos`.
-    pelvis_m: Float[np.ndarray, "T 3"]
-    markers_world_m: Float[np.ndarray, "T J 3"]
-    floor_height_m: Float[np.ndarray, " T"]  # (T,) of the floor against the phone
-    #: (T, 2) whether heel and ball of the foot are on the floor, [left, right].
-    heel_on_floor: Bool[np.ndarray, "T 2"]
+    pelvis_m: Float[np.ndarray, "T 3"]  # relative to the phone, as `qpos`
+    markers_world_m: Float[np.ndarray, "T J 3"]  # likewise
+    floor_height_m: Float[np.ndarray, " T"]  # of the floor relative to the phone
+    heel_on_floor: Bool[np.ndarray, "T 2"]  # [left, right]
     ball_on_floor: Bool[np.ndarray, "T 2"]
-    #: (2,) velocity of the floor, zeros but on a treadmill: feet in stance move with it.
-    belt_m_per_s: Float[np.ndarray, " 2"]
-    clock_offset_s: float  # the phone's clock against the video's, NaN without a log
-    outlier: np.ndarray  # (T, J) points that were thrown far off
-    spec: SynthSpec  # options that the trial was made with
+    belt_m_per_s: Float[np.ndarray, " 2"]  # velocity of the floor, zero except on a treadmill: feet in stance have it
+    clock_offset_s: float  # of the phone's clock to the video's, NaN without a log
+    outlier: np.ndarray  # (T, J) bool
+    spec: SynthSpec  # options of the trial
 
     def save(self, path: str | Path) -> None:
         """Write `truth.npz` (docs/files.md)."""
@@ -238,7 +226,7 @@ class Synthetic:
     truth: Truth
 
     def save(self, folder: str | Path, name: str | None = None) -> tuple[Path, ...]:
-        """Write `<name>.keypoints.npz`, `<name>.truth.npz` and `<name>.events.csv`; their paths.
+        """Write `<name>.keypoints.npz`, `<name>.truth.npz` and `<name>.events.csv`, and return their paths.
 
         Raises `PblError` FILE_UNWRITABLE.
         """
@@ -253,10 +241,10 @@ class Synthetic:
 
 
 def synthesise(spec: SynthSpec) -> Synthetic:
-    """Make the trial that is asked for.
+    """Make the trial of these options.
 
-    Normal curves by speed (Schwartz et al. 2008) and impairments give the angles that the motion aims at; footprints
-    and the pelvis' way are planned; the least-squares solution keeps the standing feet where they stand.
+    Normal curves by speed (Schwartz et al. 2008) and impairments determine the target angles; footprints and the path
+    of the pelvis are planned; the least-squares solution keeps the standing feet in place.
 
     Raises `PblError` USAGE: more seconds than the task lasts, or a walk that leaves the picture of a static camera.
     """

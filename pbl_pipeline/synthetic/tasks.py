@@ -297,5 +297,5 @@ def _cut(plan: Plan, seconds: float | None, end_s: float) -> Plan:
 
 
 def duration_s(plan: Plan, margin_s: float = 0.6) -> float:
-    """How long the motion of a plan is (s), without the margins of its grid."""
+    """Duration of the motion of a plan (s), without the margins of its grid."""
     return float(plan.grid_s[-1] - margin_s)

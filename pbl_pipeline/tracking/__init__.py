@@ -1,4 +1,4 @@
-"""People in a video: detection, tracks, choice of the subject."""
+"""People in a video: detection, tracks and choice of the subject."""
 
 from .appearance import appearance_of, appearance_similarity
 from .associate import AssociationParams

@@ -1,8 +1,8 @@
-"""How a person looks: colours of the trunk and of the legs, to tell people apart who were out of sight or close.
+"""Appearance of a person: colours of the trunk and of the legs, to distinguish people who were out of sight or close.
 
-An appearance is a histogram, not a network: it costs a tenth of a millisecond, needs no model and no licence, and is
-compared within one video, in the same light. It says "other clothes" surely and "the same clothes" weakly; so it may
-forbid to join two tracks, and may join them only where nobody else in the video could be meant.
+An appearance is a histogram, not a network: it takes a tenth of a millisecond, needs no model and no licence, and is
+compared within one video, in the same light. Other clothes are certain evidence, similar clothes weak evidence: so it
+may forbid joining two tracks, but joins them only if no other person in the video is a candidate.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ _PATCH_SIZE = (12, 24)
 #: Bins of lightness, and of each of the two colour axes (CIE Lab as 8 bit).
 _LIGHT_BINS, _COLOUR_BINS = 6, 8
 _SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)
-#: Range of the colour axes: clothes hardly leave it.
+#: Range of the colour axes; few clothes are outside it.
 _COLOUR_RANGE = (88.0, 168.0)
 
 
 def appearance_of(scene: Scene, state: np.ndarray, turn_rad: float) -> np.ndarray:
-    """Look (2 * (6 + 64),) of the body whose circle has centre x, centre y (px) and log side `state`, turned by
-    `turn_rad` clockwise.
+    """Appearance (2 * (6 + 64),) of the body whose region of interest has the `state` centre x, centre y (px) and log
+    side, turned by `turn_rad` clockwise.
 
-    Two histograms a patch, of lightness and of colour, each of sum 1. NaN where the body lies outside the picture.
+    Two histograms for each patch, of lightness and of colour, each of sum 1. NaN if the body is outside the picture.
     """
     x, y, radius = float(state[0]), float(state[1]), 0.5 * float(np.exp(state[2]))
     width, height = size_of(scene)
@@ -56,16 +56,16 @@ def appearance_of(scene: Scene, state: np.ndarray, turn_rad: float) -> np.ndarra
 
 
 def with_appearance(detection: Detection, scene: Scene) -> Detection:
-    """The detection with `appearance_of` the person whom it found in `scene`."""
+    """Return the detection with `appearance_of` its person in `scene`."""
     return dataclasses.replace(detection, appearance=appearance_of(scene, measure(detection), detection.roi_px[3]))
 
 
 def _patch(scene: Scene, to_picture: np.ndarray) -> np.ndarray:
-    """Pixels (1, N, 3) of a patch: those in the picture, or all, those beyond it as at its edge."""
+    """Pixels (1, N, 3) of a patch: of a `Frame` those in the picture, of an array all, repeated beyond its edge."""
     if not isinstance(scene, Frame):
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        all_of_it = cv2.warpAffine(scene, to_picture, _PATCH_SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return all_of_it.reshape(1, -1, 3)
+        patch = cv2.warpAffine(scene, to_picture, _PATCH_SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return patch.reshape(1, -1, 3)
     row, column = np.indices(_PATCH_SIZE[::-1]).reshape(2, -1)
     at = to_picture @ np.stack([column, row, np.ones(len(row))])
     inside = ((at >= 0) & (at <= np.array(scene.size_px)[:, None] - 1)).all(axis=0)
@@ -73,28 +73,23 @@ def _patch(scene: Scene, to_picture: np.ndarray) -> np.ndarray:
 
 
 def appearance_similarity(a: np.ndarray, b: np.ndarray) -> float:
-    """How alike two appearances are: 1 the same, 0 nothing in common; NaN where one is not known.
+    """Similarity of two appearances: 1 the same, 0 nothing in common; NaN if one is not known.
 
-    The least of the patches' Bhattacharyya coefficients (Bhattacharyya 1943): another pair of trousers is enough to be
-    somebody else.
+    The least of the patches' Bhattacharyya coefficients (Bhattacharyya 1943): other trousers are enough for another
+    person.
     """
-    size = len(a) // 2
-    shared = np.sqrt(a * b)
-    return float(min((shared[:_LIGHT_BINS].sum() + shared[_LIGHT_BINS:size].sum()) / 2, _second(shared, size)))
+    patches = np.sqrt(a * b).reshape(len(_PATCHES), -1)
+    return float(min(p[:_LIGHT_BINS].sum() + p[_LIGHT_BINS:].sum() for p in patches)) / 2
 
 
 def mean_appearance(appearances: Sequence[np.ndarray | None], least: int = 1) -> np.ndarray:
-    """The mean of the appearances that are known; NaN where those are fewer than `least`."""
+    """Mean of the known appearances; NaN if those are fewer than `least`."""
     known = [k for k in appearances if k is not None and np.isfinite(k).all()]
     return np.mean(known, axis=0) if len(known) >= max(least, 1) else np.full(_SIZE, np.nan)
 
 
-def _second(shared: np.ndarray, size: int) -> float:
-    return float(shared[size : size + _LIGHT_BINS].sum() + shared[size + _LIGHT_BINS :].sum()) / 2
-
-
 def _light(values: np.ndarray) -> np.ndarray:
-    """Soft histogram: each value is shared between the two nearest bins, so that a little more light moves little."""
+    """Soft histogram: each value is shared between the two nearest bins, so that a little more light changes little."""
     place = np.clip(values / 255.0 * (_LIGHT_BINS - 1), 0, _LIGHT_BINS - 1)
     low = np.minimum(place.astype(int), _LIGHT_BINS - 2)
     part = place - low

@@ -1,16 +1,16 @@
-"""Association of detections over time: who in this frame is who in the last.
+"""Association of detections over time into tracks.
 
-Each live track predicts where its body box will be (constant velocity); detections are assigned to predictions at least
-total cost (Hungarian algorithm, Kuhn 1955, scipy's `linear_sum_assignment`). Everything is measured in body sizes, so
-near and far people are treated alike.
+Each live track predicts the position of its body (constant velocity); detections are assigned to predictions at the
+least total cost (Hungarian algorithm, Kuhn 1955, scipy's `linear_sum_assignment`). All distances are in body sizes, so
+that near and far people are treated alike.
 
-Why no tracker library, as of November 2026. They take a box in every frame at one rate; here a person is looked at when
-it is worth it (`Watch`), by the container's own time stamps, and both directions of time may be used afterwards
-(`undo_swaps`, `join_trails`). Of those on the package index `trackers` 2.6 (Apache-2.0) is well kept, but brings 25
-packages, among them `opencv-python`, which overwrites the files of the headless OpenCV; `norfair` 2.3 asks for numpy
-below 2; `motpy` stands at 0.0.10. On 240 made crossings at 15 frames a second (tests/unit/crossings.py: eight pairs of
-speeds, three degrees of hiding, ten seeds) identities were exchanged in 7 (SORT, ByteTrack), 5 (OC-SORT) and 3 (C-BIoU)
-with `trackers`, in none with this module and `undo_swaps`; one person hidden for about a second all kept.
+No tracker library is used, as of November 2026: they expect a box in every frame at one rate; here a person is detected
+when needed (`Watch`), by the container's time stamps, and both directions of time are used afterwards (`undo_swaps`,
+`join_trails`). Of those on the package index `trackers` 2.6 (Apache-2.0) is well maintained, but brings 25 packages,
+among them `opencv-python`, which overwrites the files of the headless OpenCV; `norfair` 2.3 requires numpy below 2;
+`motpy` is at 0.0.10. On 240 simulated crossings at 15 frames a second (tests/unit/crossings.py: eight pairs of speeds,
+three degrees of occlusion, ten seeds) identities were exchanged in 7 (SORT, ByteTrack), 5 (OC-SORT) and 3 (C-BIoU) with
+`trackers`, in none with this module and `undo_swaps`; all kept one person who was hidden for about a second.
 """
 
 from __future__ import annotations
@@ -26,41 +26,37 @@ from .types import Detection
 
 @dataclasses.dataclass(frozen=True)
 class AssociationParams:
-    """gate: largest accepted cost at once, in body heights; gate_per_s: how much it widens per second unseen.
+    """Parameters of `Associator`."""
 
-    size_weight: cost of a size ratio of e (the natural logarithm of the ratio times this). turn_weight: cost of a body
-    axis turned by 90 degrees, twice that for one upside down: where two people are close, the network at times puts
-    one's head on the other's legs. sure_score: detections below it continue a track only within the unwidened gate
-    and after the sure ones had their choice, and never begin one. max_gap_s: a person unseen for longer is lost, and
-    starts a new track when seen again; one who was seen fewer than `min_hits` times is lost after `doubt_gap_s`.
-    memory_s: the velocity is that of a straight line through so much of the past.
-    """
-
-    gate: float = 0.35
-    gate_per_s: float = 1.0
-    size_weight: float = 0.5
+    gate: float = 0.35  # largest accepted cost, in body heights
+    gate_per_s: float = 1.0  # widening of the gate per second unseen
+    size_weight: float = 0.5  # cost of a size ratio of e (times the natural logarithm of the ratio)
+    # Cost of a body axis turned by 90 degrees, twice that for one upside down: of two people who are close, the network
+    # at times puts the head of one on the legs of the other.
     turn_weight: float = 0.25
+    # Detections below it continue a track only within the unwidened gate and after the sure ones were assigned, and
+    # never begin one.
     sure_score: float = 0.8
-    max_gap_s: float = 1.0
-    min_hits: int = 3
+    max_gap_s: float = 1.0  # a person unseen for longer is lost, and starts a new track when seen again
+    min_hits: int = 3  # a person seen fewer times is lost after `doubt_gap_s`
     doubt_gap_s: float = 0.35
-    memory_s: float = 0.5
+    memory_s: float = 0.5  # the velocity is the slope of a straight line through this much of the past
 
 
 @dataclasses.dataclass(eq=False)
 class Trail:
-    """A track while it grows: the frames in which a detector saw the person."""
+    """A growing track: the frames in which a detector saw the person."""
 
     frames: list[int]
     times: list[float]
     detections: list[Detection]
     velocity: np.ndarray  # of (x, y) in body heights per s and of log size per s
-    surprise: float = 0.0  # how far the last sighting lay from where it was expected, in body heights
-    due_s: float = 0.0  # when to look at the person again
+    surprise: float = 0.0  # distance of the last sighting from its prediction, in body heights
+    due_s: float = 0.0  # time of the next detection of the person
 
     @classmethod
     def of(cls, frame: int, time_s: float, detection: Detection) -> Trail:
-        """A trail that begins, at rest."""
+        """Begin a trail, at rest."""
         return cls([frame], [time_s], [detection], np.zeros(3))
 
     @property
@@ -70,6 +66,13 @@ class Trail:
     def state(self) -> np.ndarray:
         """Centre x, centre y in px and the natural logarithm of the height in px, when last seen."""
         return measure(self.detections[-1])
+
+    def states(self, time_s: np.ndarray) -> np.ndarray:
+        """(T, 3) states at times (T,) from the first sighting to the last, interpolated linearly in between."""
+        first = int(np.searchsorted(self.times, time_s[0], "right")) - 1 if len(time_s) else 0
+        last = int(np.searchsorted(self.times, time_s[-1])) + 1 if len(time_s) else 1
+        seen = np.array([measure(d) for d in self.detections[max(first, 0) : last]])
+        return interpolate(time_s, self.times[max(first, 0) : last], seen)
 
     def predict(self, time_s: float) -> np.ndarray:
         """The state at `time_s`. The velocity is trusted for a quarter of a second, then fades out."""
@@ -89,7 +92,7 @@ class Trail:
         self.velocity = self._velocity(memory_s)
 
     def _velocity(self, memory_s: float) -> np.ndarray:
-        """Slope of a straight line through the last `memory_s` (two sightings at least, whenever they were).
+        """Slope of a straight line through the last `memory_s` (at least the last two sightings).
 
         Sizes jitter by a tenth from frame to frame: their rate is noise, so only the position is extrapolated.
         """
@@ -100,8 +103,13 @@ class Trail:
         return np.array([*np.clip(slope, -5.0, 5.0), 0.0])
 
 
+def interpolate(at_s: np.ndarray, time_s: Sequence[float], values: np.ndarray) -> np.ndarray:
+    """(T, K) values at times (T,), linear between those (N, K) at times (N,)."""
+    return np.stack([np.interp(at_s, time_s, v) for v in values.T], axis=-1)
+
+
 def measure(detection: Detection) -> np.ndarray:
-    """Centre x, centre y (px) and log height of a detection: of its region of interest where known, else of its box."""
+    """Centre x, centre y (px) and log height of a detection: of its region of interest if known, else of its box."""
     x, y, side, _ = detection.roi_px
     if np.isfinite(side) and side > 0:
         return np.array([x, y, np.log(side)])
@@ -110,7 +118,7 @@ def measure(detection: Detection) -> np.ndarray:
 
 
 class Associator:
-    """Feeds on frames in order; `trails()` gives every track, the lost ones included."""
+    """Assigns the detections of frames in order to tracks; `trails()` returns all, including the lost ones."""
 
     def __init__(self, params: AssociationParams) -> None:
         self._params = params
@@ -122,7 +130,7 @@ class Associator:
         return self._live
 
     def forget(self, time_s: float) -> None:
-        """Give up those who have been unseen for too long at `time_s`."""
+        """End the tracks of people who have been unseen for too long at `time_s`."""
         p = self._params
         gone = [
             time_s - t.last_time > (p.max_gap_s if len(t.frames) >= p.min_hits else p.doubt_gap_s) for t in self._live
@@ -131,13 +139,13 @@ class Associator:
         self._live = [t for t, g in zip(self._live, gone, strict=True) if not g]
 
     def begin(self, trail: Trail) -> None:
-        """Take up a trail that was not known."""
+        """Add a new trail."""
         self._live.append(trail)
 
     def step(
         self, frame: int, time_s: float, detections: list[Detection], among: Sequence[Trail] | None = None
     ) -> list[Detection]:
-        """Assign the detections of one frame to the live tracks (of `among`); returns the sure ones that fit none."""
+        """Assign the detections of one frame to the live tracks (of `among`); return the sure ones that fit none."""
         p = self._params
         self.forget(time_s)
         live = [t for t in self._live if among is None or t in among]
@@ -151,12 +159,12 @@ class Associator:
     def _assign(
         self, trails: list[Trail], detections: list[Detection], frame: int, time_s: float, gate_per_s: float
     ) -> list[Detection]:
-        """Add detections to the trails at least total cost; returns those that fit nobody."""
+        """Add detections to the trails at the least total cost; return those that fit none."""
         if not trails or not detections:
             return detections
         cost = np.array([[pair_cost(t, time_s, d, self._params) for d in detections] for t in trails])
         gate = np.array([self._params.gate + gate_per_s * (time_s - t.last_time) for t in trails])
-        # An impossible pair costs more than any number of possible ones, so it is chosen only where nothing else is.
+        # An impossible pair costs more than any number of possible ones, so it is chosen only if no other is left.
         # A detection near another track's predicted position does not extend a missed track.
         expected = cost <= self._params.gate
         absent = [t for t in self._live if t not in trails]
@@ -178,7 +186,7 @@ class Associator:
 
 
 def pair_cost(trail: Trail, time_s: float, detection: Detection, params: AssociationParams) -> float:
-    """How badly a detection at `time_s` continues a trail, in body heights."""
+    """Cost of continuing a trail with a detection at `time_s`, in body heights."""
     predicted, seen = trail.predict(time_s), measure(detection)
     size = np.exp((predicted[2] + seen[2]) / 2)
     distance = float(np.hypot(*(seen[:2] - predicted[:2]))) / size

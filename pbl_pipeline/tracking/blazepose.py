@@ -1,9 +1,9 @@
 """BlazePose's person detector in one picture.
 
 Source of the layout: Bazarevsky et al. 2020, "BlazePose: On-device Real-time Body Pose tracking", and the graph
-configuration beside the model in the mediapipe 0.10.21 wheel (modules/pose_detection). The detector looks for a face
-and upper body; what makes it useful here are two of its keypoints: the middle of the hips and a point on the
-circle around the whole body, straight above the hips in the body's own direction.
+configuration next to the model in the mediapipe 0.10.21 wheel (modules/pose_detection). The detector finds a face and
+upper body; two of its keypoints are used here: the middle of the hips and a point on the circle around the whole body,
+above the hips along the body's axis.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def circle_roi(centre: np.ndarray, on_circle: np.ndarray) -> np.ndarray:
 
 
 def body_box(roi: np.ndarray) -> np.ndarray:
-    """Corner box (..., 4) around the body that stands in the circle `roi` (..., 4).
+    """Corner box (..., 4) around the body in the circle `roi` (..., 4).
 
     The body is taken as a rectangle as long as the circle's diameter and `BODY_HALF_WIDTH` radii wide to each side,
     along the rotation; the box is its upright hull. An estimate for overlap and drawing, not a segmentation.
@@ -59,7 +59,7 @@ class BlazePoseDetector:
         self.model_sha256 = self._model.sha256
 
     def detect(self, image: np.ndarray) -> list[Detection]:
-        """People in `image` (H, W, 3) uint8 BGR, best first. Boxes may reach beyond the picture."""
+        """Find people in `image` (H, W, 3) uint8 BGR, best first. Boxes may reach beyond the picture."""
         detections = []
         # After the corners of the box: the middle of the hips and the point on the circle.
         for points, score in zip(*self._model.find(image), strict=True):

@@ -1,9 +1,9 @@
-"""Where to detect in which frame: around known people as often as their movement asks for, elsewhere in turn.
+"""Windows of detection in each frame: around known people as often as their movement requires, elsewhere in turn.
 
-One call of a detector costs as much as decoding three frames, so pictures are not searched throughout. A person who
-moves evenly is looked at ten times a second and interpolated between, one who keeps still more rarely; one who
-surprises, was missed or comes close to another is looked at more often. The whole frame and its tiles are visited by
-turns: nobody new is overlooked for longer than a turn, and `backtrack` then finds the frames between.
+One call of a detector takes as long as decoding three frames, so not every picture is searched everywhere. A person who
+moves evenly is detected ten times a second and interpolated in between, one who keeps still less often; one who moves
+unexpectedly, was missed or comes close to another is detected more often. The whole frame and its tiles are searched in
+turn: a new person is found within one turn, and `backtrack` then adds the frames before.
 """
 
 from __future__ import annotations
@@ -19,33 +19,27 @@ from .tiling import Window, tiles
 
 @dataclasses.dataclass(frozen=True)
 class WatchParams:
-    """tile_fraction, tile_overlap: tiles are squares of this fraction of the shorter side, overlapping by that or more.
-    search_interval_s, search_windows: how often how many of the whole frame and the tiles are searched, by turns.
-    follow_interval_s: how often a window around each known person is searched. rest_interval_s: the same for one who
-    keeps still (slower than `still` body heights per second). close_interval_s: the same where the person was seen
-    fewer than `known_hits` times, was missed, surprised by more than `surprise` body heights, or is nearer to another
-    than `near` body heights.
-    window_sizes: side of the window, in sides of the region of interest. covered: tiles of which such windows cover
-    this fraction are left out.
-    """
+    """Parameters of `Watch`."""
 
-    tile_fraction: float = 0.7
-    tile_overlap: float = 0.3
-    search_interval_s: float = 0.2
-    search_windows: int = 1
-    follow_interval_s: float = 0.1
-    rest_interval_s: float = 0.2
+    tile_fraction: float = 0.7  # side of the square tiles over the shorter side of the picture
+    tile_overlap: float = 0.3  # least overlap of neighbouring tiles, in sides
+    search_interval_s: float = 0.2  # interval at which new people are searched for
+    search_windows: int = 1  # windows (the whole frame and the tiles, in turn) in each search
+    follow_interval_s: float = 0.1  # interval at which each known person is detected
+    rest_interval_s: float = 0.2  # the same for one who moves less than `still` body heights per second
+    # The same for one who was seen fewer than `known_hits` times, was missed, was farther from the prediction than
+    # `surprise` body heights, or is nearer to another person than `near` body heights.
     close_interval_s: float = 0.06
     still: float = 0.1
     surprise: float = 0.15
     known_hits: int = 4
     near: float = 0.6
-    window_sizes: float = 1.6
-    covered: float = 0.8
+    window_sizes: float = 1.6  # side of the window around a person, in sides of the region of interest
+    covered: float = 0.8  # tiles covered by such windows to this fraction are not searched
 
 
 class Watch:
-    """The windows of each frame in order. `slack_s` is half a frame: it avoids beating between frames and intervals."""
+    """Windows of the frames in order. `slack_s` is half a frame: it avoids beating between frames and intervals."""
 
     def __init__(self, size_px: tuple[int, int], params: WatchParams, slack_s: float) -> None:
         self._params, self._slack = params, slack_s
@@ -56,22 +50,22 @@ class Watch:
 
     @property
     def n_turn(self) -> int:
-        """Searches until every place was searched."""
+        """Number of searches until the whole picture was searched."""
         return -(-len(self._ring) // self._params.search_windows)
 
     def due(self, time_s: float, live: Sequence[Trail], last: bool) -> list[Trail]:
-        """Who is to be looked at in this frame, and who is so close to one of them that her window shows both."""
+        """Trails that are to be detected in this frame, and those that lie in the window of one of them."""
         now = time_s + self._slack
         due = [t for t in live if last or now >= t.due_s]
         windows = [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
         return [t for t in live if t in due or any(_inside(t.predict(time_s), w) for w in windows)]
 
     def around(self, time_s: float, due: Sequence[Trail]) -> list[Window]:
-        """A window around each of these people."""
+        """Windows around these people."""
         return [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
 
     def elsewhere(self, time_s: float, live: Sequence[Trail]) -> list[Window]:
-        """Windows in which somebody new is searched in this frame; the first time all of them."""
+        """Windows in which new people are searched for in this frame; the first time all of them."""
         if time_s + self._slack < self._next_search:
             return []
         self._next_search = time_s + self._params.search_interval_s
@@ -89,7 +83,7 @@ class Watch:
         return out
 
     def detected(self, time_s: float, due: Sequence[Trail], live: Sequence[Trail]) -> None:
-        """After detection around those who were due, or were found: when they are due again."""
+        """Set the time of the next detection of those who were due, or were found."""
         p = self._params
         for trail in live:
             if trail not in due and trail.due_s > time_s:
@@ -103,7 +97,7 @@ class Watch:
 
 
 def window_around(state: np.ndarray, sizes: float) -> Window:
-    """The square of `sizes` region of interest around a body with this state (`measure`)."""
+    """Square of `sizes` regions of interest around a body with this state (`measure`)."""
     half = 0.5 * sizes * float(np.exp(state[2]))
     return round(state[0] - half), round(state[1] - half), round(state[0] + half), round(state[1] + half)
 
@@ -126,7 +120,7 @@ def _inside(state: np.ndarray, window: Window) -> bool:
 
 
 def _share(window: Window, cover: Window) -> float:
-    """Fraction of `window` that `cover` covers."""
+    """Fraction of `window` that lies in `cover`."""
     width = min(window[2], cover[2]) - max(window[0], cover[0])
     height = min(window[3], cover[3]) - max(window[1], cover[1])
     return max(width, 0) * max(height, 0) / ((window[2] - window[0]) * (window[3] - window[1]))

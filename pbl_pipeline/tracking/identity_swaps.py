@@ -1,8 +1,8 @@
-"""Two people who were close: which of them came out of it as whom, judged from before and after.
+"""Correction of identities that were exchanged when two people were close, from before and after the encounter.
 
-While two bodies overlap, a detector sees one of them or a mixture, and an association that only knows the past may go
-on with the wrong one. Here both sides of the encounter are known: where each was going, where each came from, how large
-and how dressed. The two ends are exchanged where that fits clearly better.
+While two bodies overlap, a detector sees one of them or a mixture, and an association that only knows the past may
+continue with the wrong one. Here both sides of the encounter are known: velocity, size and clothes of each person. The
+two ends are exchanged if that fits clearly better.
 """
 
 from __future__ import annotations
@@ -17,10 +17,8 @@ from .associate import Trail, measure
 
 
 def line_near(trail: Trail, at_s: float, length_s: float) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Place (2,) px at `at_s`, velocity (2,) px/s and height in px, of the sightings within `length_s` of it.
-
-    None where there are fewer than three.
-    """
+    """Position (2,) px at `at_s`, velocity (2,) px/s and height in px, from the sightings within `length_s` of it; None
+    if those are fewer than three."""
     near = [i for i, t in enumerate(trail.times) if abs(t - at_s) <= length_s]
     if len(near) < 3:
         return None
@@ -32,32 +30,27 @@ def line_near(trail: Trail, at_s: float, length_s: float) -> tuple[np.ndarray, n
 
 @dataclasses.dataclass(frozen=True)
 class UncrossParams:
-    """near: closer than this many body heights two people are in an encounter; it lasts through `pause_s` apart.
-    velocity_s: the straight line through this much of a track on either side says where it was going to and came from.
-    gate, gate_per_s: what a miss of that line is measured by, in body heights at once and per second of the encounter.
-    size_gate: the same for the natural logarithm of the ratio of sizes, look_gate for one minus the similarity.
-    worst: largest cost of each of the three. margin: an exchange must be better by so much, summed over both people.
-    """
+    """Parameters of `undo_swaps`."""
 
-    near: float = 0.5
-    pause_s: float = 0.3
-    velocity_s: float = 0.6
-    gate: float = 0.3
-    gate_per_s: float = 0.4
-    size_gate: float = 0.25
-    look_gate: float = 0.1
-    worst: float = 3.0
-    margin: float = 0.3
+    near: float = 0.5  # distance below which two people are in an encounter, in body heights
+    pause_s: float = 0.3  # longest time apart within one encounter
+    velocity_s: float = 0.6  # length of the straight line through a track before and after the encounter
+    gate: float = 0.3  # distance between that line and the other track that costs 1, in body heights,
+    gate_per_s: float = 0.4  # and its increase per second of the encounter
+    size_gate: float = 0.25  # natural logarithm of the ratio of sizes that costs 1
+    look_gate: float = 0.1  # one minus the similarity that costs 1
+    worst: float = 3.0  # largest cost of each of the three
+    margin: float = 0.3  # least reduction of the cost by an exchange, summed over both people
 
 
 def undo_swaps(trails: Sequence[Trail], params: UncrossParams) -> list[Trail]:
-    """The trails, with their ends exchanged after encounters where that fits better."""
+    """Return the trails, with their ends exchanged after encounters if that fits better."""
     out = list(trails)
     for i in range(len(out)):
         for j in range(i + 1, len(out)):
             if max(out[i].times[0], out[j].times[0]) > min(out[i].times[-1], out[j].times[-1]):
-                continue  # never seen at one time
-            # Each encounter is judged on the trails as the earlier ones left them.
+                continue  # never in view together
+            # Each encounter is judged on the trails as corrected at the earlier ones.
             n = 0
             while (spans := list(_encounters(out[i], out[j], params)))[n:]:
                 begin, end = spans[n]
@@ -77,15 +70,10 @@ def _encounters(a: Trail, b: Trail, params: UncrossParams) -> Iterator[tuple[flo
 
 
 def _apart(a: Trail, b: Trail) -> tuple[np.ndarray, np.ndarray]:
-    """Times in which both are followed (10 Hz), and their distance there in body heights."""
+    """Times at which both are followed (10 Hz), and their distance in body heights."""
     time = np.arange(max(a.times[0], b.times[0]), min(a.times[-1], b.times[-1]) + 1e-9, 0.1)
-    here, there = (_states(t, time) for t in (a, b))
+    here, there = a.states(time), b.states(time)
     return time, np.hypot(*(here - there)[:, :2].T) / np.exp((here[:, 2] + there[:, 2]) / 2)
-
-
-def _states(trail: Trail, time: np.ndarray) -> np.ndarray:
-    seen = np.array([measure(d) for d in trail.detections])
-    return np.stack([np.interp(time, trail.times, v) for v in seen.T], axis=1)
 
 
 def _closest(a: Trail, b: Trail, begin: float, end: float) -> float:
@@ -109,7 +97,7 @@ def _part(trail: Trail, low: float, high: float) -> Trail:
 
 
 def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
-    """How badly one trail continues another across an encounter."""
+    """Cost of continuing one trail with another across an encounter."""
     gap = after.times[0] - before.times[-1]
     one = line_near(before, before.times[-1], params.velocity_s)
     two = line_near(after, after.times[0], params.velocity_s)
@@ -120,14 +108,14 @@ def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
         miss = max(np.hypot(*(place + going * gap - next_place)), np.hypot(*(next_place - coming * gap - place))) / unit
         cost += min(miss / (params.gate + params.gate_per_s * gap), params.worst)
         cost += min(abs(np.log(next_height / height)) / params.size_gate, params.worst)
-    alike = appearance_similarity(appearance_near(before, before.times[-1]), appearance_near(after, after.times[0]))
+    alike = appearance_similarity(_appearance_near(before, before.times[-1]), _appearance_near(after, after.times[0]))
     return cost + (min((1 - alike) / params.look_gate, params.worst) if np.isfinite(alike) else 0.0)
 
 
-def appearance_near(trail: Trail, at_s: float, length_s: float = 1.5) -> np.ndarray:
-    """The mean appearance of the sightings within `length_s` of `at_s`; NaN where it is not known."""
+def _appearance_near(trail: Trail, at_s: float) -> np.ndarray:
+    """Mean appearance of the sightings within 1.5 s of `at_s`; NaN if not known."""
     return mean_appearance(
-        [d.appearance for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= length_s]
+        [d.appearance for d, t in zip(trail.detections, trail.times, strict=True) if abs(t - at_s) <= 1.5]
     )
 
 

@@ -14,7 +14,7 @@ from .yolox import yolox
 
 
 class RegisteredDetectors:
-    """`Provider` of the tracking methods: each registered person detector is one, under its own name."""
+    """`Provider` of the tracking methods: each registered person detector is a method with its name."""
 
     def names(self) -> list[str]:
         return [m.name for m in models.registered() if m.spec is not None and m.spec.kind == "person_detector"]
@@ -24,7 +24,7 @@ class RegisteredDetectors:
 
 
 def detector_params(name: str) -> TrackingParams:
-    """The parameters of tracking with a registered person detector (YOLOX) as it is now.
+    """Return the parameters of tracking with a registered person detector (YOLOX) as it is now.
 
     Raises `PblError` MODEL_MISSING, and MODEL_INVALID for a model of another kind.
     """

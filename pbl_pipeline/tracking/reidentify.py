@@ -1,8 +1,9 @@
-"""Joining what became two tracks because somebody was hidden, or left the picture and came back.
+"""Joining of two tracks of a person who was hidden, or who left the picture and came back.
 
-Behind a pillar a walker goes on walking: the movement before and after tells that it is one person. Who leaves the
-picture may come back from anywhere, and so may anybody else: there only the clothes tell, and only where they are the
-same and nobody else's are alike. Not to join costs a choice by hand; to join wrongly measures somebody else.
+A walker goes on walking behind a pillar: the movement before and after shows that it is one person. A person who left
+the picture may come back from anywhere, and so may another person: then only the clothes decide, if they are the same
+and no other person's are similar. Two tracks not joined cost a choice by hand; two joined wrongly measure another
+person.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from .identity_swaps import line_near
 from .tiling import detect_in
 from .types import PersonDetector, Scene
 
-#: A person may be missed in so many of the kept frames on the way back.
+#: Most kept frames in a row in which a person may be missed on the way back.
 MAX_MISSES = 1
 
 
@@ -35,9 +36,9 @@ def backtrack(
     window_sizes: float,
     params: AssociationParams,
 ) -> Trail:
-    """The trail with sightings put before it, from frames `kept` (index, time_s, picture) in order of time.
+    """Extend a trail to earlier frames, `kept` (index, time_s, picture) in order of time.
 
-    Ends where the person is not found any more, or where it would become one of `others`, who were seen there.
+    Ends when the person is no longer found, or would be one of the `others` that were seen there.
     """
 
     def taken(index: int, _: float) -> list[np.ndarray]:
@@ -56,14 +57,14 @@ def with_exact_ends(
     window_sizes: float,
     params: AssociationParams,
 ) -> list[Trail]:
-    """The trails from the first frame in which the person is found to the last, up to `within_s` beyond both ends.
+    """Extend the trails to the first and the last frame in which the person is found, up to `within_s` at either end.
 
     Parameters
     ----------
     time_s
         Stamps of all frames.
     frames
-        Those from one number until before another.
+        Function that returns the frames from one number up to, but not including, another.
     """
     out, wanted = list(trails), defaultdict(list)
     for i, t in enumerate(trails):
@@ -79,21 +80,14 @@ def with_exact_ends(
             if frame.index == part[-1]:
                 shown, others = scenes.pop((i, part)), [*out[:i], *out[i + 1 :]]
                 shown = shown if frame.index > out[i].frames[0] else shown[::-1]
-                taken = functools.partial(_between, others)
+                taken = functools.partial(_between_sightings, others)
                 out[i] = _with_sightings(out[i], shown, taken, detector, window_sizes, params)
     return out
 
 
-def _between(trails: Sequence[Trail], _: int, at_s: float) -> list[np.ndarray]:
-    """Where (`measure`) those are at a time who were seen before and after it."""
-    out = []
-    for t in trails:
-        if t.times[0] <= at_s <= t.times[-1]:
-            k = min(int(np.searchsorted(t.times, at_s, side="right")), len(t.times) - 1)
-            a, b = (measure(t.detections[j]) for j in (max(k - 1, 0), k))
-            part = (at_s - t.times[max(k - 1, 0)]) / max(t.times[k] - t.times[max(k - 1, 0)], 1e-9)
-            out.append(a + min(part, 1.0) * (b - a))
-    return out
+def _between_sightings(trails: Sequence[Trail], _: int, at_s: float) -> list[np.ndarray]:
+    """States (`measure`) at a time of those who were seen before and after it."""
+    return [t.states(np.array([at_s]))[0] for t in trails if t.times[0] <= at_s <= t.times[-1]]
 
 
 def _with_sightings(
@@ -104,8 +98,8 @@ def _with_sightings(
     window_sizes: float,
     params: AssociationParams,
 ) -> Trail:
-    """The trail with sightings in frames (index, time_s, picture): those before it, backwards, or those after it.
-    `taken`: where others are in a frame, by its number and time."""
+    """Extend a trail with sightings in frames (index, time_s, picture), which are before it in reverse order, or after
+    it. `taken`: function from number and time of a frame to the states of others."""
     if not shown:
         return trail
     sign, end = (-1.0, 0) if shown[0][1] < trail.times[0] else (1.0, -1)
@@ -115,7 +109,7 @@ def _with_sightings(
         found = detect_in(detector, scene, [window_around(more.predict(at), window_sizes)])
         others = taken(index, time_s)
         free = [d for d in found if not any(_same(measure(d), o) for o in others)]
-        # As forwards: the gate widens with time, but not for detections that are not sure.
+        # As in `Associator`: the gate widens with time, but not for detections that are not sure.
         wider = params.gate_per_s * (at - more.last_time)
         gates = [params.gate + (wider if d.score >= params.sure_score else 0.0) for d in free]
         excess = [pair_cost(more, at, d, params) - g for d, g in zip(free, gates, strict=True)]
@@ -142,42 +136,37 @@ def _at(trail: Trail, index: int) -> slice:
 
 
 def _same(here: np.ndarray, there: np.ndarray) -> bool:
-    """Whether two detections of one frame (`measure`) are of one person: nearer than a quarter of a body."""
+    """True if two states (`measure`) of one frame are of one person: nearer than a quarter of a body."""
     return bool(np.hypot(*(here[:2] - there[:2])) < 0.25 * np.exp((here[2] + there[2]) / 2))
 
 
 @dataclasses.dataclass(frozen=True)
 class JoinParams:
-    """max_gap_s: longest time out of sight. velocity_s: the straight line through this much of a track before and after
-    the gap says where the person was going to and coming from. gate, gate_per_s: how far these two may miss the other
-    track's end, in body heights at once and per second of the gap. max_growth: largest ratio of sizes across the gap.
-    other_clothes: similarity (`appearance_similarity`) below which two are never joined.
-    same_clothes, clothes_lead: similarity from which somebody out of sight for up to `return_gap_s` is the same,
-    and by how much it must exceed that to everybody else. min_looks: sightings that a similarity needs on either side.
-    return_growth: largest ratio of sizes, who comes back may be nearer.
-    Likeness on seven recordings of four people: the same person in two halves of a recording 0.96 to 0.998, but 0.88 of
-    a man who jumps on a wall; two people 0.39 to 0.90.
+    """Parameters of `join_trails`.
+
+    `appearance_similarity` on seven recordings of four people: the same person in two halves of a recording 0.96 to
+    0.998, but 0.88 of a man who jumps on a wall; two people 0.39 to 0.90.
     """
 
-    max_gap_s: float = 2.5
-    velocity_s: float = 0.6
-    gate: float = 0.3
-    gate_per_s: float = 0.2
-    max_growth: float = 1.25
-    other_clothes: float = 0.5
-    same_clothes: float = 0.92
-    clothes_lead: float = 0.03
-    min_looks: int = 5
+    max_gap_s: float = 2.5  # longest time out of sight for a join by movement
+    velocity_s: float = 0.6  # length of the straight line through a track before and after the gap
+    gate: float = 0.3  # largest distance between that line and the other track's end, in body heights,
+    gate_per_s: float = 0.2  # and its increase per second of the gap
+    max_growth: float = 1.25  # largest ratio of sizes across the gap
+    other_clothes: float = 0.5  # similarity below which two are never joined
+    same_clothes: float = 0.92  # similarity from which a person out of sight for up to `return_gap_s` is the same
+    clothes_lead: float = 0.03  # least excess over the similarity to all others
+    min_looks: int = 5  # least number of sightings on either side for a similarity
     return_gap_s: float = 120.0
-    return_growth: float = 2.5
+    return_growth: float = 2.5  # largest ratio of sizes for a join by clothes: the person may come back nearer
 
 
 def join_trails(trails: Sequence[Trail], size_px: tuple[int, int], params: JoinParams) -> list[Trail]:
-    """The trails in order of appearance, those of one person put together.
+    """Join the trails of one person; returned in order of appearance.
 
-    Two are one person where the first ends before the second begins, at most `max_gap_s` apart, with like sizes, where
-    each, going on at its velocity, meets the other, and the way between lies in the picture. Where more than one would
-    fit, none is joined. After that, two are one where the clothes say so.
+    Two trails are joined if the first ends before the second begins, at most `max_gap_s` apart, with similar sizes, if
+    each, extrapolated at its velocity, meets the other, and if the way in between lies in the picture. If more than one
+    fits, none is joined. After that, trails are joined by clothes.
     """
     return _join_by_clothes(_join_by_movement(trails, size_px, params), params)
 
@@ -194,9 +183,9 @@ def _join_by_movement(trails: Sequence[Trail], size_px: tuple[int, int], params:
 
 
 def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]:
-    """In order of time each trail becomes part of a person who was seen before, or a new person."""
+    """Assign each trail, in order of time, to a person who was seen before, or to a new person."""
     people: list[list[Trail]] = []
-    known: dict[tuple[int, ...], np.ndarray] = {}  # a corridor sees hundreds, each compared with all others
+    known: dict[tuple[int, ...], np.ndarray] = {}  # in a corridor hundreds of trails are compared with all others
 
     def appearance(*parts: Trail) -> np.ndarray:
         key = tuple(map(id, parts))
@@ -214,8 +203,9 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
             people.append([trail])
             continue
         alike, best = ranked[0]
-        # Others who left before, and those who are surely somebody else, being there at the same time.
-        present = [t for t in trails if t not in best and any(_together(t, mine) for mine in (trail, *best))]
+        # Others who left before, and those who are in view at the same time and so certainly another person.
+        spans = [(mine.times[0], mine.times[-1]) for mine in (trail, *best)]
+        present = [t for t in trails if t not in best and any(t.times[0] <= b and a <= t.times[-1] for a, b in spans)]
         rivals = [a for a, _ in ranked[1:]] + [
             appearance_similarity(appearance(t), appearance(trail)) for t in present if t is not trail
         ]
@@ -227,12 +217,8 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
     return [_whole(*p) for p in people]
 
 
-def _together(a: Trail, b: Trail) -> bool:
-    return a.times[0] <= b.times[-1] and b.times[0] <= a.times[-1]
-
-
 def _appearance(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:
-    """Mean appearance of a person's trails; NaN where too few sightings know it."""
+    """Mean appearance of a person's trails; NaN if too few sightings have one."""
     return mean_appearance([d.appearance for t in parts for d in t.detections], params.min_looks)
 
 
@@ -269,6 +255,6 @@ def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> 
     unit = np.sqrt(height * next_height)
     miss = [np.hypot(*(end + going * gap - begin)), np.hypot(*(begin - coming * gap - end))]
     inside = np.all((end > 0) & (end < size_px)) and np.all((begin > 0) & (begin < size_px))
-    # Both ends lie in the picture; so must half a body around them, or the person may just have left it.
+    # Both ends lie in the picture, with some room around them: otherwise the person may just have left it.
     room = min(end[0], begin[0], size_px[0] - end[0], size_px[0] - begin[0]) > 0.2 * unit
     return bool(inside and room and max(miss) / unit <= p.gate + p.gate_per_s * gap)

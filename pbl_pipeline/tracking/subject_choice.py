@@ -1,4 +1,4 @@
-"""The person to measure: by a method, by a person with contact sheets, or as decided about another tracking."""
+"""Choice of the person to measure: by a method, by hand with contact sheets, or as decided for another tracking."""
 
 from __future__ import annotations
 
@@ -21,20 +21,19 @@ from .methods import SUBJECT_METHODS
 from .types import PersonTrack, SubjectChoice, Tracking
 from .walker_score import MOST_LISTED, SubjectParams
 
-#: Width of one moment in the sheet (px), moments at least and at most, moments side by side.
+#: Width of one picture in the sheet (px), least and largest number of pictures, pictures side by side.
 _WIDTH, _LEAST, _MOST, _COLUMNS = 640, 4, 9, 3
 _JPEG_QUALITY = 85
 _COLOURS = ((80, 220, 80), (60, 120, 255), (255, 160, 40), (220, 80, 220), (60, 220, 255), (200, 200, 200))
 
 
 def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int] | None = None) -> np.ndarray:
-    """A picture (H, W, 3) uint8 BGR of a few moments in order of time, all of `persons` boxed and numbered.
+    """Draw a few frames in order of time (H, W, 3) uint8 BGR, all of `persons` boxed and numbered.
 
-    `persons` (default: all people) in order of interest: of as many as there is room for, the moment is shown in which
-    the person is seen best, then moments spread over the video in which most of them are in view. A person without a
-    moment is still boxed in those of the others.
+    `persons` (default: all people) in order of interest: the frame that shows each best, for as many as there is room,
+    then frames spread over the video in which most of them are in view.
 
-    Raises `ValueError` when no one was tracked, and the `PblError`s of `video.read_frames`.
+    Raises `ValueError` if no one was tracked, and the `PblError`s of `video.read_frames`.
     """
     wanted = list(persons) if persons is not None else [p.person_id for p in tracking.persons]
     people = [p for k in wanted for p in tracking.persons if p.person_id == k]
@@ -52,7 +51,7 @@ def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[
 
 
 def contact_sheet_jpeg(video_path: str | Path, tracking: Tracking, choice: SubjectChoice) -> bytes:
-    """The `contact_sheet` of all people, those with the best scores first, as the bytes of a JPEG. Raises as it."""
+    """Encode the `contact_sheet` of all people, those with the best scores first, as JPEG. Raises as it."""
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
     return _encoded(contact_sheet(video_path, tracking, ranked), ".jpg")
 
@@ -62,7 +61,7 @@ def save_contact_sheet(
 ) -> Path:
     """Write the `contact_sheet` as PNG or JPEG, by the suffix of `out_path`.
 
-    Raises as `contact_sheet`, and OSError when the file cannot be written.
+    Raises as `contact_sheet`, and OSError if the file cannot be written.
     """
     path = Path(out_path)
     suffix = ".png" if path.suffix.lower() == ".png" else ".jpg"
@@ -79,7 +78,7 @@ def _encoded(sheet: np.ndarray, suffix: str) -> bytes:
 
 
 def _moments(people: Sequence[PersonTrack], tracking: Tracking) -> set[int]:
-    """Frame numbers: the best of each person, then those in the middle of the longest stretches without one."""
+    """Frame numbers: the best of each person, then some in the middle of the longest stretches without one."""
     chosen = {_best_frame(p, tracking.image_size_px) for p in people[:_MOST]}
     in_view = np.sum([np.isfinite(p.box_px[:, 0]) for p in people], axis=0)
     n = len(tracking.time_s)
@@ -94,7 +93,7 @@ def _moments(people: Sequence[PersonTrack], tracking: Tracking) -> set[int]:
 
 
 def _best_frame(person: PersonTrack, size: tuple[int, int]) -> int:
-    """The frame in which the person is seen best: surely, and not cut by the picture's edge."""
+    """Frame that shows the person best: with a high score, and not cut by the picture's edge."""
     box = person.box_px
     inside = np.all((box > 1) & (box < np.array([*size, *size]) - 1), axis=1)
     return int(np.argmax(np.where(np.isfinite(box[:, 0]), person.score + inside, -1.0)))
@@ -123,21 +122,21 @@ def _label(cell: np.ndarray, text: str, corner: tuple[int, int], size: float, co
     cv2.putText(cell, text, (x + 4, y + height + 4), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 2, cv2.LINE_AA)
 
 
-#: With fewer frames no one can be followed, whoever is in the picture.
+#: Least number of frames in which a person can be followed.
 LEAST_FRAMES = 10
-#: What to do where no person was found: she may be too small in the picture or too near.
+#: Advice if no person was found: one may be too small in the picture or too near.
 FILM_THE_WHOLE_BODY = "film in light, from where the whole body is in the picture and fills much of its height"
 
 
 def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str | Path, sheet: Path) -> int:
-    """The chosen person's number. Where a person has to choose, the numbered people are drawn into `sheet` (PNG).
+    """Return the chosen person's number. If a person has to choose, the numbered people are drawn into `sheet` (PNG).
 
     Raises `PblError` TRACK_NO_PERSON or SUBJECT_NEEDS_CHOICE.
     """
     if choice.person_id is not None:
         return choice.person_id
     if choice.status == "NO_PERSON":
-        raise _nobody(tracking, video_path)
+        raise _no_person(tracking, video_path)
     sheet.parent.mkdir(parents=True, exist_ok=True)
     ranked = sorted(choice.scores, key=lambda k: -choice.scores[k])
     save_contact_sheet(video_path, tracking, sheet, ranked)
@@ -152,7 +151,7 @@ def require_subject(choice: SubjectChoice, tracking: Tracking, video_path: str |
     )
 
 
-def _nobody(tracking: Tracking, video_path: str | Path) -> PblError:
+def _no_person(tracking: Tracking, video_path: str | Path) -> PblError:
     n = len(tracking.time_s)
     if n < LEAST_FRAMES:
         return PblError(
@@ -176,24 +175,24 @@ def choose_subject(
     params: Method[SubjectParams] | Paramset | SubjectParams | str | None = None,
     override: int | None = None,
 ) -> SubjectChoice:
-    """Choose the person to measure. `params` is what `SUBJECT_METHODS.find` takes; `override` is a person's number that
-    a human chose: it wins (status MANUAL).
+    """Choose the person to measure. `params` as for `SUBJECT_METHODS.find`; `override` is the person's number chosen by
+    hand, which takes precedence (status MANUAL).
 
-    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the override is not among the persons, SOLVER_UNKNOWN.
+    Raises `PblError` SUBJECT_UNKNOWN_PERSON if the override is not among the persons, SOLVER_UNKNOWN.
     """
     method = SUBJECT_METHODS.find(params)
     return method.function(tracking, method.params, override)
 
 
-#: Mean overlap (intersection over union) of the body boxes, over the frames in which either is in view, from which two
-#: tracks may be of one person.
+#: Least mean overlap (intersection over union) of the body boxes of one person in two trackings, over the frames in
+#: which either is in view.
 SAME_OVERLAP = 0.4
 
 
 def same_person(decided: Tracking, person_id: int, tracking: Tracking) -> int | None:
     """Number in `tracking` of the person `person_id` of `decided`, both of the same video; None if no match is certain.
 
-    Each must be the other's best match: where she was not found, the one beside her is not taken for her.
+    Each must be the other's best match: if the person was not found, the one next to her must not be taken for her.
     """
     if len(decided.time_s) != len(tracking.time_s) or not tracking.persons:
         return None
@@ -210,10 +209,10 @@ def carried_choice(
     tracking: Tracking,
     params: Method[SubjectParams] | Paramset | SubjectParams | str | None = None,
 ) -> SubjectChoice:
-    """The choice in `tracking` after a person chose `person_id` by hand in `decided`, another tracking (by `method`).
+    """Carry a choice by hand, `person_id` in `decided` (a tracking by `method`), over to another `tracking`.
 
-    It is the same person (status CHOSEN). If no match is certain, a person has to choose again: what the automatic
-    choice would say is not what a person decided. `params` as for `choose_subject`.
+    The same person is chosen (status CHOSEN). If no match is certain, a person has to choose again, as the automatic
+    choice may differ from the decision. `params` as for `choose_subject`.
     """
     found = same_person(decided, person_id, tracking)
     if found is not None:
@@ -230,8 +229,8 @@ def carried_choice(
 
 
 def _overlap(a: PersonTrack, b: PersonTrack) -> float:
-    """Mean intersection over union of the boxes over the frames in which one of the two is in view, 0 where one only
-    is."""
+    """Mean intersection over union of the boxes over the frames in which at least one of the two is in view; 0 in
+    frames with only one."""
     here, there = a.box_px.astype(np.float64), b.box_px.astype(np.float64)
     in_here, in_there = np.isfinite(here).all(axis=1), np.isfinite(there).all(axis=1)
     both, n = in_here & in_there, int((in_here | in_there).sum())

@@ -1,4 +1,4 @@
-"""Detection on a whole frame plus overlapping tiles, merged: finds people who are small in the frame."""
+"""Detection on a whole frame plus overlapping tiles, merged, to find people who are small in the frame."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from .types import Detection, PersonDetector, Scene, WindowDetector
 
 #: A box that ends within this fraction of the window's width from its edge is taken as cut by it.
 CUT_SHARE = 0.02
+#: `merge`: overlap (intersection over union) above which two detections agree, and fraction of the smaller box above
+#: which two that do not agree are of one person.
+_MIN_IOU, _MIN_COVER = 0.4, 0.6
 #: x0, y0, x1, y1 in px; it may reach beyond the picture.
 Window = tuple[int, int, int, int]
 
 
 def tile_starts(length: int, tile: int, overlap: float) -> list[int]:
-    """Where tiles of `tile` pixels start to cover `length`: evenly spread, overlapping by `overlap` or more."""
+    """First pixels of tiles of `tile` pixels that cover `length`: evenly spread, overlapping by `overlap` or more."""
     if tile >= length:
         return [0]
     n = 1 + math.ceil((length - tile) / (tile * (1.0 - overlap)) - 1e-9)
@@ -42,10 +45,10 @@ def tiles(width: int, height: int, fraction: float, overlap: float) -> list[Wind
 def detect_in(
     detector: PersonDetector, scene: Scene, windows: Sequence[Window], passing: Sequence[Window] = ()
 ) -> list[Detection]:
-    """Run the detector in each window and merge what it found, in pixels of the picture.
+    """Run the detector in each window and merge the detections, in pixels of the picture.
 
-    `windows` are laid around people and see them in the right size; `passing` are laid anywhere, are trusted half as
-    much, and so only confirm whom another window saw.
+    `windows` are around people, who have the right size in them; `passing` windows are anywhere, are trusted half as
+    much, and so only confirm detections in another window.
     """
     width, height = size_of(scene)
     found: list[tuple[float, Detection]] = []
@@ -59,7 +62,7 @@ def detect_in(
                 continue
             whole = _area(np.clip(box, 0, [width, height, width, height]))
             inside = _area(np.clip(box, [x0, y0, x0, y0], [x1, y1, x1, y1]))
-            # A person cut by the window's edge is measured worse than in the neighbouring window that holds her whole.
+            # A person cut by the window's edge is measured worse than in a neighbouring window that shows her whole.
             trust = weight * d.score * (inside / whole if whole > 0 else 0.0)
             found.append((trust, Detection(box_px=box, score=d.score, roi_px=roi)))
     return merge(found)
@@ -77,7 +80,7 @@ def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window
     if isinstance(scene, Frame) and isinstance(detector, WindowDetector):
         n, side = detector.window_px, max(window[2] - window[0], window[3] - window[1])
         scale = side / n
-        # Of the first pixel's centre.
+        # Position of the first pixel's centre.
         x, y = ((window[i] + window[i + 2] - side + scale - 1) / 2 for i in (0, 1))
         shown = scene.cut(np.array([[scale, 0.0, x], [0.0, scale, y]]), (n, n))
     else:
@@ -92,13 +95,13 @@ def _seen(detector: PersonDetector, scene: Scene, window: Window, inside: Window
     ]
 
 
-def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover: float = 0.6) -> list[Detection]:
-    """One detection per person from pairs (trust, detection): what overlaps the most trusted one is the same person.
+def merge(found: list[tuple[float, Detection]]) -> list[Detection]:
+    """Merge pairs (trust, detection) into one detection per person: those that overlap the most trusted one.
 
-    Overlap is judged on body boxes. Above `min_iou` two findings agree and are averaged by trust (those trusted less
-    than half as much as the best only confirm). Otherwise, where one covers the other by more than `min_cover` of the
-    smaller box, they disagree about the size of one person: a picture in which a person is too small to be measured
-    still makes the network answer, with a circle of the wrong size. The less trusted one is dropped.
+    Overlap is that of the body boxes. Above `_MIN_IOU` two detections agree and are averaged by trust (those trusted
+    less than half as much as the best only confirm). Otherwise, if more than `_MIN_COVER` of the smaller box is
+    covered, they disagree about the size of one person (of a person who is too small in the window the network returns
+    a circle of the wrong size), and the less trusted one is dropped.
     """
     left = sorted((f for f in found if f[0] > 0), key=lambda f: -f[0])
     people = []
@@ -107,8 +110,8 @@ def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover:
         box = left[0][1].box_px
         boxes = np.array([d.box_px for _, d in left])
         iou, cover = box_iou(box, boxes), _cover(box, boxes)
-        used = [(t, d) for (t, d), o in zip(left, iou, strict=True) if o > min_iou and t >= 0.5 * best]
-        left = [f for f, o, c in zip(left, iou, cover, strict=True) if o <= min_iou and c <= min_cover]
+        used = [(t, d) for (t, d), o in zip(left, iou, strict=True) if o > _MIN_IOU and t >= 0.5 * best]
+        left = [f for f, o, c in zip(left, iou, cover, strict=True) if o <= _MIN_IOU and c <= _MIN_COVER]
         weight = np.array([t for t, _ in used])
         weight /= weight.sum()
         roi = weight @ np.array([d.roi_px for _, d in used])
@@ -121,10 +124,8 @@ def merge(found: list[tuple[float, Detection]], min_iou: float = 0.4, min_cover:
 
 
 def _cut(box: np.ndarray, window: Window, size: tuple[int, int]) -> bool:
-    """Whether a bare box reaches an edge of its window that is no edge of the picture: the person goes on beyond it.
-
-    Body circles need no such rule: they reach beyond the window, and `detect_in` trusts them the less.
-    """
+    """True if a box without a region of interest ends at an edge of its window inside the picture, so that the person
+    extends beyond it. Regions of interest need no such rule: they reach beyond the window, and are trusted less."""
     near = CUT_SHARE * (window[2] - window[0])
     inner = np.array([window[0] > 0, window[1] > 0, window[2] < size[0], window[3] < size[1]])
     beyond = np.array([1, 1, -1, -1]) * (box - np.array(window)) < near

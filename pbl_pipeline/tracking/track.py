@@ -1,4 +1,4 @@
-"""People over a whole video: detection where `Watch` says, association, and what both directions of time tell."""
+"""People over a whole video: detection in the windows of `Watch`, association, and corrections in both directions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from .appearance import with_appearance
-from .associate import Associator, Trail, measure
+from .associate import Associator, Trail, interpolate, measure
 from .blazepose import body_box
 from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
@@ -28,12 +28,12 @@ from .reidentify import backtrack, join_trails, with_exact_ends
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking, WindowDetector
 
-#: A second look must find a new person with at least this overlap of the boxes; nearer to where somebody known is
-#: expected than so many body heights, it is a poor view of that one.
+#: Least overlap of the boxes in a second detection of a new person, and distance (body heights) from a known person's
+#: predicted position below which it is a poor view of that person.
 CONFIRM_IOU, SAME_BODY = 0.3, 0.25
-#: A body's axis is upside down beyond this turn (rad), a video where it is in more of the sightings than this fraction.
+#: Rotation (rad) beyond which a body is upside down, and the fraction of such sightings beyond which a video is.
 UPSIDE_DOWN_RAD, UPSIDE_DOWN_SHARE = 0.75 * np.pi, 0.5
-#: Decoding goes on while a detector looks at a frame, which takes as long as decoding some.
+#: Frames decoded ahead while the detector runs, which takes as long as decoding some.
 FRAMES_AHEAD = 8
 
 
@@ -43,13 +43,13 @@ def track_people(
     detector: PersonDetector | None = None,
     info: VideoInfo | None = None,
 ) -> Tracking:
-    """Find everybody in a video and follow them. Frames stream: memory does not grow with the video.
+    """Find and follow all people in a video. Memory does not grow with the length of the video.
 
-    `params` is what `METHODS.find` takes; `detector` replaces the method's. `info` is what `video.probe` said of this
-    file; without it the video is probed, which decodes it once more. Where nobody is found, the `Tracking` has no
-    persons.
+    `params` as for `METHODS.find`; `detector` replaces the method's. `info` is the result of `video.probe`; without it
+    the video is probed, which decodes it once more. A `Tracking` may have no persons.
+
     Raises the `PblError`s of `video.probe` and `assets.fetch`, VIDEO_UPSIDE_DOWN, SOLVER_UNKNOWN for an unknown method
-    or detector, and VIDEO_CHANGED when `info` is of another number of frames; for a registered model MODEL_MISSING,
+    or detector, and VIDEO_CHANGED if `info` has another number of frames; for a registered model MODEL_MISSING,
     MODEL_INVALID, MODEL_CHECKSUM, DEVICE_UNAVAILABLE.
     """
     method = METHODS.find(params)
@@ -71,7 +71,7 @@ def track_people(
 
 
 def _check_upright(persons: Sequence[PersonTrack], video_path: str | Path) -> None:
-    """Raise `PblError` VIDEO_UPSIDE_DOWN by the axes of the bodies, where the detector knows them."""
+    """Raise `PblError` VIDEO_UPSIDE_DOWN by the axes of the bodies, if the detector returns them."""
     turn = np.concatenate([np.empty(0), *(p.roi_px[p.observed, 3] for p in persons)])
     turn = np.abs(np.angle(np.exp(1j * turn[np.isfinite(turn)])))
     share = float(np.mean(turn > UPSIDE_DOWN_RAD)) if len(turn) else 0.0
@@ -86,18 +86,18 @@ def _check_upright(persons: Sequence[PersonTrack], video_path: str | Path) -> No
 
 
 def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:
-    """One pass over the frames: every trail, the false ones included."""
+    """Return all trails of one pass over the frames, including false ones."""
     associator = Associator(params.association)
     slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
     watch = Watch((info.width_px, info.height_px), params.watch, slack)
-    # The frames of the last searches, to follow new people back in: as long as a turn of all windows takes.
+    # The frames of the last searches, to follow new people backwards: as long as a turn of all windows takes.
     kept: deque[tuple[int, float, Scene]] = deque(maxlen=watch.n_turn)
     n_frames = 0
     frames = prefetched(read_frames(video_path), FRAMES_AHEAD)
     for frame in progress.track(frames, "people", total=info.n_frames):
         n_frames, now = n_frames + 1, frame.time_s
         associator.forget(now)
-        # The last frame too, so that tracks do not end before the video does.
+        # Also in the last frame, so that tracks do not end before the video does.
         due = watch.due(now, associator.live, last=frame.index == info.n_frames - 1)
         elsewhere = watch.elsewhere(now, associator.live)
         if not (due or elsewhere):
@@ -133,10 +133,10 @@ def _confirmed(
     live: Sequence[Trail],
     params: TrackingParams,
 ) -> Detection | None:
-    """Who is seen in a window around a detection that fits nobody known, or None.
+    """Detect a new person again, in a window around a detection that fits no known person; None if that fails.
 
-    A lone window that was laid anywhere cannot tell a new person from a poor view of a known one: it may cut her or
-    show her too small. Laid around her, it must find her again, in about the same place, where nobody known is.
+    A single window anywhere cannot distinguish a new person from a poor view of a known one, who may be cut or small in
+    it. A window around the person must find her again, at about the same position, away from known people.
     """
     known = [t.predict(time_s) for t in live]
     if any(_near(measure(new), k) for k in known):
@@ -153,7 +153,7 @@ def _confirmed(
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two region of interest lie so close, and are so alike in size, that both are of one person."""
+    """True if two states (`measure`) are so close that both are of one person."""
     apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
     return bool(apart < SAME_BODY)
 
@@ -164,8 +164,8 @@ def _is_real(trail: Trail, params: TrackingParams) -> bool:
 
 
 def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int, int], max_gap_s: float) -> PersonTrack:
-    """Rows for every frame; between sightings up to `max_gap_s` apart, centre, size and score are interpolated linearly
-    in time."""
+    """Track with rows for every frame; between sightings up to `max_gap_s` apart, centre, size and score are
+    interpolated linearly in time."""
     n = len(time_s)
     first, last = trail.frames[0], trail.frames[-1]
     inside = slice(first, last + 1)
@@ -178,20 +178,16 @@ def _to_track(person_id: int, trail: Trail, time_s: np.ndarray, size: tuple[int,
     seen_roi = np.array([d.roi_px for d in trail.detections])
     if np.all(np.isfinite(seen_roi)):
         seen_roi[:, 3] = np.unwrap(seen_roi[:, 3])
-        roi[inside] = _interpolate(time_s[inside], trail.times, seen_roi)
+        roi[inside] = interpolate(time_s[inside], trail.times, seen_roi)
         roi[:, 3] = np.arctan2(np.sin(roi[:, 3]), np.cos(roi[:, 3]))
         box[inside] = body_box(roi[inside])
     else:
-        box[inside] = _interpolate(time_s[inside], trail.times, np.array([d.box_px for d in trail.detections]))
+        box[inside] = interpolate(time_s[inside], trail.times, np.array([d.box_px for d in trail.detections]))
     for a, b in zip(trail.frames, trail.frames[1:], strict=False):
         if time_s[b] - time_s[a] > max_gap_s + 1e-9:
             roi[a + 1 : b], box[a + 1 : b], score[a + 1 : b] = np.nan, np.nan, 0.0
     width, height = size
     box = np.clip(box, 0.0, [width, height, width, height])
-    # As they are stored; in a long video with many passers-by the arrays are what takes memory.
+    # As they are stored; in a long video with many passers-by these arrays take most of the memory.
     box, roi, score = (a.astype(np.float32) for a in (box, roi, score))
     return PersonTrack(person_id, box, roi, score, observed)
-
-
-def _interpolate(at: np.ndarray, times: list[float], values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, times, v) for v in values.T], axis=-1)

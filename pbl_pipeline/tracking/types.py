@@ -12,20 +12,17 @@ from pbl_pipeline.video import Frame
 
 @dataclasses.dataclass(frozen=True)
 class Detection:
-    """One person in one frame. `box_px` is x0, y0, x1, y1 in pixels of the upright frame; score in 0..1.
+    """One person in one frame."""
 
-    `roi_px` is what the keypoint crop needs where the detector knows it: centre x, centre y, side length in
-    pixels and rotation in radians (clockwise in the picture, 0 = upright); NaN where it does not. `appearance` is
-    `appearance_of` of the clothes, None where nobody asked.
-    """
-
-    box_px: np.ndarray
-    score: float
+    box_px: np.ndarray  # (4,) x0, y0, x1, y1 in pixels of the upright frame
+    score: float  # 0 to 1
+    # (4,) region of interest for keypoints: centre x, centre y and side in px, and rotation in rad (clockwise in the
+    # picture, 0 for upright); NaN if the detector does not return it.
     roi_px: np.ndarray
-    appearance: np.ndarray | None = None
+    appearance: np.ndarray | None = None  # `appearance_of`, None if not computed
 
 
-#: A frame as tracking looks at it: regions of its planes, or the whole picture (H, W, 3) uint8 BGR.
+#: A frame in tracking: regions of its planes, or the whole picture (H, W, 3) uint8 BGR.
 Scene = Frame | np.ndarray
 
 
@@ -40,31 +37,26 @@ class PersonDetector(Protocol):
 
 @runtime_checkable
 class WindowDetector(PersonDetector, Protocol):
-    """A `PersonDetector` that is shown each window of the frame as a square of `window_px` pixels a side, cut from the
-    decoder's planes; others are shown the window's own pixels of the converted picture."""
+    """A `PersonDetector` whose windows are squares of `window_px` pixels a side, cut from the decoder's planes; those
+    of others are parts of the converted picture."""
 
     window_px: int
 
 
 @dataclasses.dataclass(frozen=True)
 class PersonTrack:
-    """One person over the video. Rows of frames without the person are NaN (score 0).
-
-    box_px (T, 4) x0 y0 x1 y1; roi_px (T, 4) centre x, centre y, side, rotation (rad); score (T,);
-    observed (T,) bool: True where a detector saw the person in that very frame, False where the box is carried over
-    a short gap.
-    """
+    """One person over the video. Rows of frames without the person are NaN (score 0)."""
 
     person_id: int
-    box_px: np.ndarray
-    roi_px: np.ndarray
-    score: np.ndarray
-    observed: np.ndarray
+    box_px: np.ndarray  # (T, 4) x0, y0, x1, y1
+    roi_px: np.ndarray  # (T, 4) centre x, centre y, side, rotation (rad)
+    score: np.ndarray  # (T,)
+    observed: np.ndarray  # (T,) bool: detected in this frame; False where the box is interpolated over a short gap
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracking:
-    """Everybody in the video: `time_s` (T,), persons numbered from 1 in order of appearance."""
+    """All people in the video: `time_s` (T,), persons numbered from 1 in order of appearance."""
 
     time_s: np.ndarray
     image_size_px: tuple[int, int]
@@ -75,16 +67,12 @@ class Tracking:
 
 @dataclasses.dataclass(frozen=True)
 class SubjectChoice:
-    """Who is measured. status: "CHOSEN" (automatic), "MANUAL", "NEEDS_CHOICE" or "NO_PERSON".
+    """Choice of the person to measure."""
 
-    `person_id` is None unless CHOSEN or MANUAL; `scores` maps person_id to the score in 0..1; `reason` is a sentence
-    a clinician can read.
-    """
-
-    status: str
-    person_id: int | None
+    status: str  # "CHOSEN" (automatic), "MANUAL", "NEEDS_CHOICE" or "NO_PERSON"
+    person_id: int | None  # None unless CHOSEN or MANUAL
     score: float
     runner_up_id: int | None
     runner_up_score: float
-    scores: dict[int, float]
-    reason: str
+    scores: dict[int, float]  # 0 to 1, by person_id
+    reason: str  # a sentence for clinicians

@@ -1,21 +1,20 @@
-"""Who of the people in a video is to be measured, with a score and a reason in words.
+"""Choice of the person to measure by a score, with a reason in words.
 
-The score of a person is a weighted mean of five shares in 0..1:
+The score of a person is a weighted mean of five parts from 0 to 1:
 
 - *in view*: fraction of the video's time in which she is tracked;
-- *walks*: time in which she moves over the ground, upright, at a walking speed, over a time that is enough to measure;
-- *size*: her median height in the picture over that of the tallest candidate, or over a height that is enough;
+- *walks*: time in which she moves over the ground, upright, at a walking speed, over a time that suffices to measure;
+- *size*: her median height in the picture over that of the tallest candidate, or over a height that suffices;
 - *upright*: fraction of her frames with the body axis within 30 degrees of the vertical;
 - *central*: 1 in the middle of the picture, 0 at its edge (median over her frames).
 
 Walking is judged without a camera calibration: a person of height h px at (x, y) px stands, in units of her own
 height, at (x, y, f) / h from the camera, f being the focal length in px. Only the ratio of f to the picture size
-enters, and only for walking towards or away from the camera, so a usual value serves. Which way somebody walks, and so
-whether she faces the camera, is said in the reason; it adds nothing to the score, as a walk is filmed from every side.
+enters, and only for walking towards or away from the camera, so a usual value serves. The direction of walking is
+stated in the reason; it does not enter the score, as a walk is filmed from every side.
 
-The usual second person is a therapist beside the patient: nearer, larger, walking as far. That one of two who both walk
-is larger therefore decides nothing between them; what is left (time in view, the middle of the picture) often is too
-little, and a person chooses.
+The usual second person is a therapist beside the patient: nearer, larger, walking as far. So of two people who both
+walk, size does not decide; the other parts (time in view, position) often differ too little, and a person chooses.
 """
 
 from __future__ import annotations
@@ -29,43 +28,37 @@ from pbl_pipeline.errors import PblError
 from .associate import measure
 from .types import Detection, PersonTrack, SubjectChoice, Tracking
 
-#: Of people who are too alike to choose between, so many are described, the best first.
+#: Largest number of people who are described if they are too similar to choose between, the best first.
 MOST_LISTED = 6
 
 
 @dataclasses.dataclass(frozen=True)
 class SubjectParams:
-    """Weights of the shares (they are normalised), and when the automatic choice is trusted.
-
-    margin: the best person is chosen when her score exceeds every other by this much, else a person must choose.
-    walk_enough_s: longer walking brings no more. size_enough: nor does a height above this fraction of the picture's.
-    beside: of two the smaller of whom walks, and is tall, at least this fraction of the other, size decides nothing.
-    min_time_s: who is in view for less is no candidate while somebody else is.
-    walk_windows_s: movement is judged over these times, the longer one for the slow and for those who walk towards or
-    away from the camera. walk_distance: what counts as walking, in body heights: more than one step within a window.
-    walk_steadiness: fraction of the variance of the position that steady movement explains (0.75 for one sudden step).
-    walk_speed_max: in body heights per second (a runner has 1.8). size_slack: natural logarithm of the change of the
-    apparent size that is not taken for approach: bending, sitting and raising the arms change the size by a third.
-    focal_share: focal length over the longer side of the picture (the median phone's, as in `video.guess_camera`).
-    """
+    """Weights of the parts of the score (they are normalised), and limits of the automatic choice."""
 
     weight_in_view: float = 0.25
     weight_walks: float = 0.35
     weight_size: float = 0.20
     weight_upright: float = 0.10
     weight_central: float = 0.10
-    margin: float = 0.10
-    walk_enough_s: float = 4.0
-    size_enough: float = 0.35
+    margin: float = 0.10  # least lead of the best person over every other; otherwise a person has to choose
+    walk_enough_s: float = 4.0  # longer walking does not raise the score
+    size_enough: float = 0.35  # nor does a greater height, as a fraction of the picture's
+    # Size is ignored between two people if the walking time and the height of one are at least this fraction of the
+    # other's.
     beside: float = 0.5
-    min_time_s: float = 1.0
+    min_time_s: float = 1.0  # people in view for less are candidates only if all are
+    # Movement is judged over these times, the longer one for slow people and those who walk towards or away from the
+    # camera.
     walk_windows_s: tuple[float, ...] = (2.0, 5.0)
-    walk_distance: float = 0.4
-    walk_steadiness: float = 0.85
-    walk_speed_max: float = 1.8
+    walk_distance: float = 0.4  # least movement within a window, in body heights: more than one step
+    walk_steadiness: float = 0.85  # least variance of the position explained by steady movement (one sudden step: 0.75)
+    walk_speed_max: float = 1.8  # body heights per second, the speed of a runner
+    # Natural logarithm of a change of apparent size that is not taken for approach: bending, sitting and raising the
+    # arms change the size by a third.
     size_slack: float = 0.3
     max_lean_rad: float = 0.52
-    focal_share: float = 0.72
+    focal_share: float = 0.72  # focal length over the longer side of the picture (of the median phone)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,10 +76,10 @@ class _Person:
 
 
 def choose_walker(tracking: Tracking, params: SubjectParams, override: int | None = None) -> SubjectChoice:
-    """Choose by a weighted score who walks, is tall, upright, central and long in view. `override` is a person's number
-    that a human chose: it wins (status MANUAL).
+    """Choose the person who walks, is tall, upright, central and long in view, by a weighted score. `override` is the
+    person's number chosen by hand, which takes precedence (status MANUAL).
 
-    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the override is not among the persons.
+    Raises `PblError` SUBJECT_UNKNOWN_PERSON if the override is not among the persons.
     """
     people = [_describe(p, tracking, params) for p in tracking.persons]
     scores = _scores(people, tracking, params)
@@ -105,8 +98,8 @@ def choose_walker(tracking: Tracking, params: SubjectParams, override: int | Non
         reason = f"Person {override} was chosen by hand."
         return SubjectChoice("MANUAL", override, scores[override], second, second_score, scores, reason)
     if not people:
-        nobody = "No person was found in the video."
-        return SubjectChoice("NO_PERSON", None, float("nan"), None, float("nan"), {}, nobody)
+        reason = "No person was found in the video."
+        return SubjectChoice("NO_PERSON", None, float("nan"), None, float("nan"), {}, reason)
     by_id = {p.person_id: p for p in people}
     long_enough = [p.person_id for p in people if p.time_s >= params.min_time_s]
     candidates = sorted(long_enough or scores, key=lambda k: -scores[k])
@@ -120,7 +113,7 @@ def choose_walker(tracking: Tracking, params: SubjectParams, override: int | Non
     tallest = max(p.height_px for p in people)
 
     def lead(other: int) -> float:
-        """Of the best over another; without what size brings between two who walk beside each other."""
+        """Lead of the best over another; without that by size between two who walk beside each other."""
         a, b = by_id[best], by_id[other]
         walk, tall = sorted((a.walks, b.walks)), sorted((a.height_px, b.height_px))
         beside = walk[0] > 0 and walk[0] >= params.beside * walk[1] and tall[0] >= params.beside * tall[1]
@@ -182,14 +175,14 @@ def _walking(
     state: np.ndarray, time: np.ndarray, upright: np.ndarray, focal: float, params: SubjectParams
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) bool: frames around which the person moves steadily over the ground, upright, at a walking speed; and (n,)
-    the fraction of that movement that leads to the camera (1 straight to it, -1 straight away, 0 across the picture).
+    the fraction of that movement towards the camera (1 straight to it, -1 straight away, 0 across the picture).
 
-    In each window a straight line is fitted to the position in body heights; what a step in place, a jump or a
-    jitter of the box does has no lasting slope.
+    In each window a straight line is fitted to the position in body heights: a step in place, a jump or a jitter of the
+    box has no lasting slope.
     """
     size = np.exp(state[:, 2])
     unit = np.median(size)
-    # Ten places a second are judged, and the frames around each are as it is.
+    # Ten frames a second are judged, and the others as the nearest of them.
     step = max(round(0.1 / step_s(time)), 1) if len(time) > 1 else 1
     walking, towards = np.zeros(len(time), bool), np.zeros(len(time))
     for window in params.walk_windows_s:
@@ -208,7 +201,7 @@ def _walking(
             # The larger part of the movement must be steady.
             part = state[near, 0] if abs(across / unit) >= depth else state[near, 2]
             steady = np.corrcoef(tau, part)[0, 1] ** 2 >= params.walk_steadiness if np.ptp(part) > 0 else False
-            # Somebody who jumps off a wall also moves sideways, but more up or down than a walker on any slope.
+            # A person who jumps off a wall also moves sideways, but more up or down than a walker on any slope.
             climbs = abs(up / unit) > 0.5 * moved
             at_speed = params.walk_distance <= moved <= params.walk_speed_max * span
             if at_speed and steady and not climbs and upright[near].mean() > 0.5:
@@ -218,7 +211,7 @@ def _walking(
 
 
 def _direction(towards: np.ndarray) -> str:
-    """Which way most of the walking leads; who walks to the camera faces it."""
+    """Direction of most of the walking, in words."""
     if not len(towards):
         return ""
     to, away = float((towards > 0.7).mean()), float((towards < -0.7).mean())

@@ -1,8 +1,8 @@
 """YOLOX as a person detector: a registered ONNX model of the kind `person_detector` (docs/models.md).
 
 Source of the layout: Ge et al. 2021, "YOLOX: Exceeding YOLO Series in 2021", arXiv:2107.08430. One row for each cell of
-three grids (strides 8, 16, 32): centre and logarithm of the size in units of the stride relative to the cell, how
-surely there is an object, and how surely it is of each class; class 0 is a person. The picture lies in the upper left
+three grids (strides 8, 16, 32): centre and logarithm of the size in units of the stride relative to the cell, the
+confidence that there is an object, and that it is of each class; class 0 is a person. The picture is in the upper left
 corner of the input, the rest is grey (114).
 """
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 STRIDES = (8, 16, 32)
 GREY = 114
+#: Of two boxes that overlap more (intersection over union), OpenCV's non-maximum suppression drops the less sure one.
+_MIN_IOU = 0.5
 #: Box, objectness, and at least the class of people.
 _LEAST_COLUMNS = 6
 
@@ -51,16 +53,13 @@ def decode(rows: np.ndarray, width: int, height: int, min_score: float) -> tuple
 
 
 class YoloxDetector:
-    """`PersonDetector` for one picture. Gives boxes and no region of interest: `roi_px` is NaN.
+    """`PersonDetector` for one picture. Returns boxes without a region of interest: `roi_px` is NaN.
 
-    `min_iou`: of two boxes that overlap more, the less sure one is dropped (OpenCV's non-maximum suppression).
-
-    Raises what `OnnxModel` raises; MODEL_INVALID when the model is of another kind, or its output has
-    another shape.
+    Raises as `OnnxModel`; `PblError` MODEL_INVALID if the model is of another kind, or its output has another shape.
     """
 
-    def __init__(self, model: OnnxModel, min_score: float = 0.3, min_iou: float = 0.5) -> None:
-        self._model, self._min_score, self._min_iou = model, min_score, min_iou
+    def __init__(self, model: OnnxModel, min_score: float = 0.3) -> None:
+        self._model, self._min_score = model, min_score
         self.name, self.model_sha256 = model.spec.name, model.spec.sha256
         if model.spec.kind != "person_detector":
             raise self._invalid(f"a model of the kind {model.spec.kind}", "kind person_detector")
@@ -72,7 +71,7 @@ class YoloxDetector:
             raise self._invalid(f"an output of shape {shape}", f"(1, {n}, 5 + classes), one row for each grid cell")
 
     def detect(self, image: np.ndarray) -> list[Detection]:
-        """People in `image` (H, W, 3) uint8 BGR, best first."""
+        """Find people in `image` (H, W, 3) uint8 BGR, best first."""
         height, width = image.shape[:2]
         scale = min(self._size[0] / width, self._size[1] / height)
         w, h = max(round(width * scale), 1), max(round(height * scale), 1)
@@ -83,7 +82,7 @@ class YoloxDetector:
             return []
         # OpenCV wants corner and size.
         corners = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
-        kept = cv2.dnn.NMSBoxes(corners.tolist(), scores.tolist(), self._min_score, self._min_iou)
+        kept = cv2.dnn.NMSBoxes(corners.tolist(), scores.tolist(), self._min_score, _MIN_IOU)
         # Half a pixel less: the network counts from the picture's edge, pixel coordinates from the first centre.
         boxes = boxes * [width / w, height / h, width / w, height / h] - 0.5
         unknown = np.full(4, np.nan)
@@ -96,10 +95,9 @@ class YoloxDetector:
 
 
 def yolox(params: TrackingParams) -> YoloxDetector:
-    """The detector of the method.
+    """Return the detector of the method.
 
-    Raises `PblError` MODEL_CHECKSUM where the registered model is not the one that the parameters name; what
-    `YoloxDetector` raises.
+    Raises `PblError` MODEL_CHECKSUM if the registered model is not that of the parameters, and as `YoloxDetector`.
     """
     model = OnnxModel(find(params.model))
     check_frozen(model.spec, params.model_sha256, params.spec_sha256)

@@ -1,6 +1,6 @@
-"""How far a fit is from a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
+"""Comparison of a fit with a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
 
-from .align import align_path, best_lag
+from .align import align_path
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
 from .compare import (
     CURVE_COLUMNS,
@@ -10,21 +10,10 @@ from .compare import (
     compare_angles,
     cycle_curves,
     median_niqr,
-    niqr,
     save_curves,
 )
 from .paper_tables import COLUMNS, TrialErrors, error_frame, paper_tables
-from .reference import (
-    BODY_ROTATIONS,
-    CONVENTIONS,
-    JOINTS_CLIP,
-    JOINTS_OPENCAP,
-    JOINTS_PAPER,
-    QPOS,
-    Reference,
-    body_rotation_angles,
-    view_classes,
-)
+from .reference import BODY_ROTATIONS, JOINTS_CLIP, JOINTS_OPENCAP, JOINTS_PAPER, QPOS, Reference, view_classes
 from .sources import (
     fit_angles,
     fit_angles_sd,

@@ -72,7 +72,7 @@ def _free_of_offset(difference_deg: np.ndarray) -> float:
 
 
 def _cheapest(costs: dict[int, float]) -> int | None:
-    """The lag of least cost, of equals (but for rounding) the smallest; None where all are infinite."""
+    """The lag of least cost, of equals (but for rounding) the smallest; None if all are infinite."""
     least = min(costs.values())
     if not np.isfinite(least):
         return None

@@ -125,7 +125,7 @@ class KinematicErrors:
 
     @property
     def lag_at_limit(self) -> bool:
-        """Whether the best lag is the largest that was tried: the true one may be larger."""
+        """True if the best lag is the largest that was tried: the true one may be larger."""
         return self.max_lag_s > 0 and abs(self.lag_s) >= self.max_lag_s - 1e-9
 
     def joint(self, name: str) -> JointError:
@@ -329,12 +329,12 @@ CURVE_COLUMNS = ("trial", "cycle", "side", "joint", "percent", "fit_deg", "refer
 def cycle_curves(
     fit: TrialFit, reference: Reference, cycles: Iterable[GaitCycle], errors: KinematicErrors | None = None
 ) -> pd.DataFrame:
-    """Each joint of fit and reference at 0, 1, ..., 100 % of each gait cycle, side by side, in degrees.
+    """Each joint of fit and reference at 0, 1, ..., 100 % of each gait cycle, in degrees.
 
-    One row per cycle, joint and phase (`CURVE_COLUMNS`). Both are read at the same moments: those of the cycle in the
-    video, less the lag for the reference. A cycle holds the joints of its own side and those of the middle; `joint` is
+    One row per cycle, joint and phase (`CURVE_COLUMNS`). Both are taken at the same times: those of the cycle in the
+    video, minus the lag for the reference. A cycle has the joints of its side and those of the middle; `joint` is
     without side. Cubic splines through the samples; a cycle in which fit or reference lacks a joint for longer than
-    0.1 s has no pair for that joint. Angles of the pelvis against the world are left out: the worlds differ.
+    0.1 s has no pair for that joint. Angles of the pelvis in the world are omitted: the worlds differ.
 
     Raises `PblError` REFERENCE_INPUT, GAIT_INPUT as `compare`.
 
@@ -383,7 +383,7 @@ def save_curves(frame: pd.DataFrame, path: str | Path) -> Path:
 
 
 def _curve(time_s: np.ndarray, angle_deg: np.ndarray, at_s: np.ndarray) -> np.ndarray | None:
-    """(101,) degrees at `at_s`, or None where samples are missing for longer than `MAX_GAP_S` or at an end."""
+    """(101,) degrees at `at_s`, or None if samples are missing for longer than `MAX_GAP_S` or at an end."""
     known = np.isfinite(angle_deg)
     time, angle = np.asarray(time_s, float)[known], np.asarray(angle_deg, float)[known]
     first, last = np.searchsorted(time, at_s[0], side="right") - 1, np.searchsorted(time, at_s[-1], side="left")

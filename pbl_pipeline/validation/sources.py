@@ -75,7 +75,7 @@ def reference_of_fit(fit: TrialFit, source: str, convention: str = QPOS) -> Refe
     return Reference(fit.name, source, convention, fit.time_s, fit_angles(fit, convention, poses), pelvis)
 
 
-def reference_of_bodies(path: str | Path, source: str = "optical markers") -> Reference:
+def reference_of_bodies(path: str | Path) -> Reference:
     """Read a `.json.gz` (or `.json`) of body rotations and positions: `time` (T,) in s, `bodies` -> name ->
     `rotation` (T, 3), body-fixed XYZ Euler angles in rad, and `translation` (T, 3) in m, in a y-up ground.
 
@@ -87,13 +87,14 @@ def reference_of_bodies(path: str | Path, source: str = "optical markers") -> Re
         angles = body_rotation_angles(bodies.rotation)
     except (KeyError, ValueError) as error:
         raise _unreadable(Path(path), error, _BODIES) from error
-    return Reference(Path(path).name.split(".")[0], source, BODY_ROTATIONS, bodies.time_s, angles, pelvis)
+    name = Path(path).name.split(".")[0]
+    return Reference(name, "optical markers", BODY_ROTATIONS, bodies.time_s, angles, pelvis)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bodies:
     """Moving bodies of a model: `time_s` (T,); by body `rotation` (T), `position_m` (T, 3) in the y-up ground of the
-    file, and `scale` (3,) of the body's own axes (ones where the file has none)."""
+    file, and `scale` (3,) of the body's axes (1 if the file has none)."""
 
     time_s: np.ndarray
     rotation: dict[str, Rotation]
@@ -123,8 +124,8 @@ def load_bodies(path: str | Path) -> Bodies:
 def reference_of_mot(path: str | Path, source: str = "optical markers", convention: str = QPOS) -> Reference:
     """Read an OpenSim motion (.mot): columns by OpenSim's names, degrees or radians as its header says (`inDegrees`).
 
-    `knee_angle_r/_l` is positive in flexion in some models and negative in others, and the file does not say which:
-    the larger excursion over both knees counts as flexion. pelvis_tx, ty, tz are metres in a y-up ground.
+    `knee_angle_r/_l` is positive in flexion in some models and negative in others, which the file does not state: the
+    larger excursion over both knees is taken as flexion. pelvis_tx, ty, tz are metres in a y-up ground.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """

@@ -38,7 +38,7 @@ def paper_cells(table: str) -> dict[str, dict[str, str]]:
 
 
 def paper_where(table: str) -> str:
-    """Where in the paper a table's figures stand; empty where it has none."""
+    """Place of a table's figures in the paper; "" if it has none."""
     return paper_figures().get(table, {}).get("where", "")
 
 
@@ -77,7 +77,7 @@ class Table:
 
     @property
     def where(self) -> str:
-        """Where in the paper the figures beside ours stand; empty where there are none."""
+        """Place of the compared figures in the paper; "" if there are none."""
         return paper_where(self.name)
 
     def cell(self, row: str, column: str) -> Cell:
@@ -121,14 +121,14 @@ _ROW = "GDI of one camera against several"
 
 
 def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
-    """Visits that have an index of one camera and one of several, each against a norm of its own kind, as pairs.
+    """Visits that have an index of one camera and one of several, each with a norm of the same kind, as pairs.
 
     Raises `PblError` USAGE: a visit has several such indices of one kind, by several methods or norms.
 
     Parameters
     ----------
     indices
-        Rows with `INDEX_COLUMNS`. An index against a norm of another kind, or against one that ships, does not count.
+        Rows with `INDEX_COLUMNS`. An index with a norm of another kind, or with an included norm, does not count.
     """
     own: Any = indices[(indices["kind"] == indices["norm_kind"]) & indices["index"].notna()]
     twice = own[own.duplicated(["session_id", "kind"], keep=False)]
@@ -168,7 +168,7 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
     norms = [", ".join(sorted(set(pairs[f"{k}_norm"]))) for k in ("single", "rig")]
     return Table(
         "index_agreement",
-        "Index of one camera against several, each with a norm of its own kind",
+        "Index of one camera against several, each with a norm of the same kind",
         {(_ROW, column): cell for column, cell in values.items()},
         f"{n} visits of {persons} persons. Norms: {norms[0]} (one camera), {norms[1]} (several). Bias: one camera "
         "minus several; limits of agreement hold 95 % of the visits. r with its 95 % interval, which is too narrow "

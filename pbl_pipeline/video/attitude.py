@@ -1,4 +1,4 @@
-"""Which way the phone looked while it filmed: the orientation log of `--attitude`.
+"""Orientation of the phone while it filmed: the log of `--attitude`.
 
 Frames. World: z up, heading free. Camera: OpenCV's (x right, y down, z forward) of the upright picture. Device: what
 Android and iOS call the device's axes, x to the right and y to the top of the screen in portrait, z out of the screen.
@@ -25,9 +25,9 @@ from pbl_pipeline.errors import PblError
 from .types import VideoInfo
 
 CAMERA, DEVICE = "camera", "device"
-#: Shorter than this, four numbers tell no direction.
+#: Four numbers of a smaller norm define no rotation.
 _SHORTEST_NORM = 1e-3
-#: Phones turn the recording upright, so a picture that lies by more is a wrong log; a person's hand does not tilt so.
+#: Phones turn the recording upright: a log by which the picture is tilted more is wrong; no hand tilts a phone so far.
 _MOST_ROLL_DEG = 60.0
 #: Closer to the vertical than this, a viewing direction has no roll to judge.
 _VERTICAL_DEG = 30.0
@@ -45,7 +45,7 @@ class Attitude:
     #: (P, 4) R_nc, camera to world, as unit quaternions (w, x, y, z); neighbours have the same sign.
     quat_wxyz: np.ndarray
     source: str = ""  # where it comes from, and how its clock was brought to the video's
-    clock_sd_s: float = math.nan  # standard deviation of the offset between the clocks that is left; NaN: not known
+    clock_sd_s: float = math.nan  # standard deviation of the remaining offset between the clocks; NaN: not known
 
     def __post_init__(self) -> None:
         time_s, quat_wxyz = check_attitude(self.time_s, self.quat_wxyz, self.source or None)
@@ -85,7 +85,7 @@ def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tup
         found = f"{int(np.sum(~(norm > _SHORTEST_NORM)))} quaternions of length near zero"
         raise log_error(found, "quaternions of length 1; leave such samples out", key=key)
     quat = quat / norm
-    # q and -q are one rotation, but what lies half way between them is none.
+    # q and -q are the same rotation, but their mean is not a rotation.
     turned = np.cumsum(np.sum(quat[1:] * quat[:-1], axis=1) < 0) % 2 == 1
     quat[1:][turned] *= -1
     return time, quat
@@ -97,12 +97,12 @@ def camera_in_device(rotation_deg: float = 0.0) -> Rotation:
 
 
 def held_deg(video: VideoInfo, quat_wxyz: np.ndarray) -> float:
-    """How far the phone was turned clockwise from portrait (0, 90, 180, 270) while it recorded `video`.
+    """Clockwise turn of the phone from portrait (0, 90, 180 or 270 deg) while it recorded `video`.
 
     The sensor of a back camera lies such that the stored picture has to be turned clockwise by 90 degrees when the
     phone stands in portrait, and by as much more as the phone is turned: the flag of the file minus 90. A file without
-    a flag (0) may be a landscape recording, or a converted one whose pictures were turned or cut. There the log's
-    quaternions (P, 4), device to world, decide: the picture stands upright, as phones record it.
+    a flag (0) may be a landscape recording, or a converted one whose pictures were turned or cropped. Then the log's
+    quaternions (P, 4), device to world, decide: phones record an upright picture.
     """
     if video.rotation_deg:
         return float((video.rotation_deg - 90) % 360)
@@ -113,8 +113,8 @@ def held_deg(video: VideoInfo, quat_wxyz: np.ndarray) -> float:
 
 
 def typical_roll_deg(quat_wxyz: np.ndarray) -> float | None:
-    """By how much (deg) the picture is turned against gravity by camera-to-world quaternions (P, 4), for most of the
-    time; None for a camera that looks up or down."""
+    """Median roll (deg) of the picture against gravity by camera-to-world quaternions (P, 4); None for a camera that
+    looks up or down."""
     up_cam = Rotation.from_quat(quat_wxyz, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
     clear = np.hypot(up_cam[:, 0], up_cam[:, 1]) > math.sin(math.radians(_VERTICAL_DEG))
     if not clear.any():
@@ -129,11 +129,10 @@ def check_roll(path: Path, quat_wxyz: np.ndarray, frame: str) -> None:
     roll = typical_roll_deg(quat_wxyz)
     if roll is None or abs(roll) <= _MOST_ROLL_DEG:
         return
-    raise PblError(
-        "PHONE_LOG",
-        found=f"by this log (frame {frame}) the upright picture is turned by {roll:.0f} deg against gravity",
-        expected="a picture that stands upright, within what a hand tilts",
+    raise log_error(
+        f"by this log (frame {frame}) the upright picture is turned by {roll:.0f} deg against gravity",
+        "a picture that stands upright, within what a hand tilts",
         next_step="check `frame` (device: the phone's own axes) and `rotation_deg` (0 portrait, 90 top to the right, "
         "270 top to the left), and that the quaternions turn the phone's vectors into the world and not back",
-        key=str(path),
+        key=path,
     )

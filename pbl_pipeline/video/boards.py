@@ -1,4 +1,4 @@
-"""Boards for calibrating a camera: a chessboard, or a ChArUco board, whose white squares hold markers."""
+"""Boards for calibrating a camera: chessboards, and ChArUco boards, whose white squares hold markers."""
 
 from __future__ import annotations
 
@@ -15,28 +15,25 @@ from pbl_pipeline.errors import PblError
 CHECKERBOARD, CHARUCO = "checkerboard", "charuco"
 KINDS = (CHECKERBOARD, CHARUCO)
 DEFAULT_DICTIONARY = "DICT_5X5_100"
-#: Corners of a ChArUco board that must be seen in one picture: fewer say little.
+#: Corners of a ChArUco board that must be seen in one picture: fewer constrain the lens too little.
 _FEWEST_CORNERS = 8
 _usage = functools.partial(PblError, "USAGE", next_step="measure the printed board and pass its figures")
 
 
 @dataclasses.dataclass(frozen=True)
 class Board:
-    """A flat board. `squares`: how many along and across, counted by squares (their inner corners are one less).
-
-    square_mm is measured on the print. Of a ChArUco board only: marker_mm is the side of a marker (default: three
-    quarters of a square), dictionary the markers' family by OpenCV's name, legacy the pattern that OpenCV before 4.6
-    printed for an even number of rows.
+    """A flat board.
 
     Raises `PblError` USAGE: an unknown kind or dictionary, a board too small, sizes that are not positive.
     """
 
     kind: str
-    squares: tuple[int, int]
-    square_mm: float
-    marker_mm: float | None = None
-    dictionary: str = DEFAULT_DICTIONARY
-    legacy: bool = False
+    squares: tuple[int, int]  # along and across; there is one inner corner less
+    square_mm: float  # measured on the print
+    # Of a ChArUco board only:
+    marker_mm: float | None = None  # side of a marker, by default three quarters of a square
+    dictionary: str = DEFAULT_DICTIONARY  # family of the markers, OpenCV's name
+    legacy: bool = False  # the pattern that OpenCV before 4.6 printed for an even number of rows
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -68,26 +65,26 @@ class Board:
         return np.column_stack([grid, np.zeros(len(grid))]) * self.square_mm / 1000
 
     def find(self, grey: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Numbers (K,) of the corners seen in a picture (H, W) uint8 and their places (K, 2) in px; None without board.
+        """Find the board in a picture (H, W) uint8: numbers (K,) and positions (K, 2) px of the corners seen, or None.
 
-        A chessboard is seen whole or not at all; of a ChArUco board a part does.
+        A chessboard is found whole or not at all; of a ChArUco board a part is enough.
         """
         if self.kind == CHECKERBOARD:
             size = (self.squares[0] - 1, self.squares[1] - 1)
             found, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
             return (np.arange(size[0] * size[1]), corners.reshape(-1, 2).astype(np.float64)) if found else None
-        corners, ids, _, _ = self._detector().detectBoard(grey)
+        corners, ids, _, _ = _detector(self).detectBoard(grey)
         if ids is None or len(ids) < _FEWEST_CORNERS:
             return None
         ids = np.asarray(ids).ravel().astype(int)
         rows, columns = np.divmod(ids, self.squares[0] - 1)
-        # Points on one line see a plane of any tilt.
+        # Points on one line do not determine the tilt of the plane.
         if min(np.ptp(rows), np.ptp(columns)) == 0:
             return None
         return ids, np.asarray(corners, np.float64).reshape(-1, 2)
 
     def by_corners(self) -> Board | None:
-        """The chessboard that somebody means who counted its inner corners instead of the squares."""
+        """The chessboard with this many inner corners, in case those were counted instead of the squares."""
         if self.kind != CHECKERBOARD:
             return None
         return dataclasses.replace(self, squares=(self.squares[0] + 1, self.squares[1] + 1))
@@ -107,9 +104,6 @@ class Board:
         board = cv2.aruco.CharucoBoard(self.squares, self.square_mm, self.marker, self._dictionary())
         board.setLegacyPattern(self.legacy)
         return board
-
-    def _detector(self) -> Any:
-        return _detector(self)
 
 
 @functools.lru_cache(maxsize=4)

@@ -1,8 +1,8 @@
 """Intrinsics from a video of a board: sharp and different views, the lens by least squares, and a picture of both.
 
-The formal standard deviation of a least-squares fit takes every corner for an independent measurement. They are not: a
-bent board or a lens that refocuses shifts all corners of a view together. So the views are also left out in groups and
-the lens is fitted again (delete-a-group jackknife); the larger of the two deviations is stated.
+The formal standard deviation of a least-squares fit treats every corner as an independent measurement. They are not: a
+bent board or a lens that refocuses shifts all corners of a view together. So the lens is also fitted without one group
+of views at a time (delete-a-group jackknife); the larger of the two deviations is reported.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from .file_facts import probe
 from .frames import read_frames
 from .types import Camera, VideoInfo
 
-#: One candidate, the sharpest frame, is taken from each of at most so many equal parts of the video, none shorter (s).
+#: The sharpest frame of each part of the video is a candidate: largest number of parts, and their least length (s).
 MOST_CANDIDATES, SHORTEST_PART_S = 160, 0.2
-#: Views that are used: more add time and no knowledge.
+#: Views that are used: more take time and improve nothing.
 MOST_VIEWS, FEWEST_VIEWS = 40, 8
-#: The picture is cut into so many cells; corners must lie in this fraction of them, or the lens is known in part.
+#: Cells of the picture, and the fraction of them in which a corner must lie: elsewhere the lens is not known.
 CELLS, LEAST_COVERAGE = (6, 6), 0.5
 #: Views must differ by this much in tilt (deg), or focal length and distance cannot be told apart.
 LEAST_TILT_DEG = 15.0
@@ -46,7 +46,7 @@ _poor = functools.partial(PblError, "CALIBRATION_POOR")
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """One picture of the board: frame number, numbers of the corners (K,), their places (K, 2) in px."""
+    """One picture of the board: frame number, numbers of the corners (K,), their positions (K, 2) in px."""
 
     frame: int
     ids: np.ndarray
@@ -55,21 +55,16 @@ class View:
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A fitted lens.
-
-    sd: standard deviations of fx, fy, cx, cy (px) and of k1, k2, p1, p2, k3. rms_px: of all corners of the used views;
-    residual_px: (K, 2) of each view, seen minus fitted. coverage: fraction of the picture's cells with a corner.
-    tilt_deg: largest angle between two views of the board.
-    """
+    """A fitted lens."""
 
     camera: Camera
     image_size_px: tuple[int, int]
-    sd: np.ndarray
-    rms_px: float
+    sd: np.ndarray  # (9,) standard deviations of fx, fy, cx, cy (px) and of k1, k2, p1, p2, k3
+    rms_px: float  # of all corners of the used views
     views: tuple[View, ...]
-    residual_px: tuple[np.ndarray, ...]
-    coverage: float
-    tilt_deg: float
+    residual_px: tuple[np.ndarray, ...]  # (K, 2) of each view, seen minus fitted
+    coverage: float  # fraction of the picture's cells with a corner
+    tilt_deg: float  # largest angle between two views of the board
     n_found: int
     n_tried: int
 
@@ -97,7 +92,7 @@ class Calibration:
 
 
 def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = None) -> Calibration:
-    """The lens of the camera that filmed `board`. Reads the video twice; memory does not grow with its length.
+    """Calibrate the camera that filmed `board`. Reads the video twice; memory does not grow with its length.
 
     Raises `PblError` of the VIDEO_ codes; CALIBRATION_NO_BOARD, CALIBRATION_FEW_VIEWS, CALIBRATION_POOR.
     """
@@ -115,7 +110,7 @@ def calibrate_video(path: str | Path, board: Board, info: VideoInfo | None = Non
         elif other is not None and not is_other and tried % 4 == 0:
             is_other = other.find(grey) is not None
         tried += 1
-    # Of a larger board, too, a part is found here and there.
+    # A part of a larger board is also found now and then.
     if not views or (is_other and len(views) < FEWEST_VIEWS):
         raise _no_board(path, board, tried, other if is_other else None)
     return calibrate(views, board, (info.width_px, info.height_px), tried, key=path)
@@ -138,7 +133,7 @@ def sharpest_frames(path: str | Path, info: VideoInfo) -> list[int]:
 def calibrate(
     views: Sequence[View], board: Board, image_size_px: tuple[int, int], n_tried: int | None = None, key: object = None
 ) -> Calibration:
-    """The lens from views of the board in upright pictures of one size (width, height).
+    """Fit the lens to views of the board in upright pictures of one size (width, height).
 
     Raises `PblError` CALIBRATION_FEW_VIEWS, CALIBRATION_POOR (coverage, tilt, residual, uncertainty).
     """
@@ -149,7 +144,7 @@ def calibrate(
     if coverage < LEAST_COVERAGE:
         raise _poor(
             f"corners in {coverage:.0%} of the picture's {CELLS[0] * CELLS[1]} cells",
-            f"{LEAST_COVERAGE:.0%} or more: what lies outside is not known",
+            f"{LEAST_COVERAGE:.0%} or more: the lens is not known elsewhere",
             "bring the board into the corners and to the edges of the picture, and close enough to fill it",
             key,
         )
@@ -166,7 +161,7 @@ def calibrate(
     if tilt < LEAST_TILT_DEG:
         raise _poor(
             f"views of the board that differ by at most {tilt:.0f} deg in tilt",
-            f"{LEAST_TILT_DEG:.0f} deg or more: facing the camera, a long lens from afar looks as a short one near",
+            f"{LEAST_TILT_DEG:.0f} deg or more: from the front, a long lens far away looks like a short one near by",
             "tilt the board (or walk around it) to all four sides by 20 to 45 deg while filming",
             key,
         )
@@ -175,7 +170,7 @@ def calibrate(
             f"corners {fit.rms:.2f} px (rms) off the fitted lens",
             f"{limit:.2f} px or less in a picture of this size",
             "check --squares, glue the board onto something flat and stiff, film slowly in good light with the focus "
-            "locked; a fisheye or ultra-wide lens cannot be described so",
+            "locked; this model does not describe a fisheye or ultra-wide lens",
             key,
         )
     if not rel_sd <= MOST_REL_SD:
@@ -197,7 +192,7 @@ def calibrate(
 
 
 def different_views(views: Sequence[View], image_size_px: tuple[int, int], most: int) -> list[View]:
-    """At most `most` views, each chosen to differ most from those before in place, size and slant of the board."""
+    """Choose at most `most` views, each to differ most from the previous ones in position, size and slant."""
     features = np.array([_features(v, image_size_px) for v in views])
     order = [int(np.argmax([len(v.ids) for v in views]))]
     distance = np.full(len(views), np.inf)
@@ -229,7 +224,7 @@ class _Fit:
 
 
 def _fit(views: Sequence[View], board: Board, size: tuple[int, int]) -> _Fit:
-    """k3 only where the lens with it holds up to the corners: few corners there let it run wild."""
+    """Fit with k3 only if the model then holds up to the picture's corners: few board corners there leave k3 free."""
     fit = _fit_with(views, board, size, 0)
     if not reaches_corners(fit.matrix, fit.distortion, size):
         fit = _fit_with(views, board, size, cv2.CALIB_FIX_K3)
@@ -261,8 +256,8 @@ def _fit_with(
 
 
 def _jackknife(views: Sequence[View], board: Board, size: tuple[int, int], fit: _Fit) -> np.ndarray:
-    """Standard deviations (9,) from leaving out one stretch of the video after the other: what changes slowly, such as
-    the focus, is in few of them."""
+    """Standard deviations (9,) from leaving out one stretch of the video after the other, so that slow changes, such as
+    of the focus, count."""
     groups = min(_GROUPS, len(views))
     values = []
     for left_out in progress.track(np.array_split(np.arange(len(views)), groups), "uncertainty", total=groups):
@@ -281,12 +276,12 @@ def _largest_tilt(rvecs: Sequence[np.ndarray]) -> float:
 
 
 def _features(view: View, size: tuple[int, int]) -> np.ndarray:
-    """(5,) of the corners, in picture sides: the middle, the spread along both axes, its correlation."""
+    """(5,) centre of the corners, their spread along both axes (all in picture sides), and its correlation."""
     xy = view.xy_px / max(size)
     middle = xy.mean(axis=0)
     off = xy - middle
     (xx, xy_), (_, yy) = np.cov(off.T)
-    # The spread says how large the board is, its covariance how it is turned and slanted.
+    # The spread is the size of the board, its covariance shows turn and slant.
     return np.array([*middle, 2 * math.sqrt(xx), 2 * math.sqrt(yy), xy_ / max(math.sqrt(xx * yy), 1e-9)])
 
 
@@ -297,8 +292,8 @@ def _check_number(n: int, tried: int, key: object) -> None:
             "CALIBRATION_FEW_VIEWS",
             found=f"{n} usable views of the board in {tried} sharp pictures",
             expected=f"{FEWEST_VIEWS} or more",
-            next_step="film for 30 to 60 s, slowly, the whole board in the picture (of a ChArUco board a part does), "
-            "without glare",
+            next_step="film for 30 to 60 s, slowly, the whole board in the picture (of a ChArUco board a part is "
+            "enough), without glare",
             key=key,
         )
 
@@ -316,7 +311,7 @@ def _no_board(path: str | Path, board: Board, tried: int, other: Board | None) -
     )
 
 
-#: Longer side of the picture (px) and by how much residuals are drawn larger.
+#: Longer side of the picture (px), and magnification of the residuals.
 _SIDE_PX, _ENLARGED = 900, 50.0
 _INK, _GRID, _SEEN, _OFF = (60, 60, 60), (225, 225, 225), (170, 120, 40), (40, 60, 200)
 

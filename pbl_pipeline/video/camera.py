@@ -21,12 +21,12 @@ from pbl_pipeline.errors import PblError
 
 from .types import Camera, VideoInfo
 
-#: How far R R^T may be from 1: float32 poses pass, a scaled or mistyped matrix does not.
+#: Largest deviation of R R^T from 1: float32 poses pass, a scaled or mistyped matrix does not.
 _ORTHONORMAL_TOL = 1e-4
 _invalid_pose = functools.partial(
     PblError,
     "CAMERA_INVALID",
-    next_step="write the calibration again; docs/files.md, section several cameras, says what is read",
+    next_step="write the calibration again; docs/files.md, section several cameras, describes the format",
 )
 
 
@@ -106,7 +106,7 @@ def _pose(path: Path, name: str, table: Mapping[str, Any]) -> CameraPose:
 PHONE_FOCAL_OVER_LONG_SIDE = 0.7169
 PHONE_FOCAL_RANGE = (0.6655, 0.8452)
 #: Root mean square distance of the 25 distinct values from that median, as a fraction of it (0.067). Other phones,
-#: lenses and zooms may lie further off; nothing measured says how far.
+#: lenses and zooms may differ more; by how much was not measured.
 PHONE_FOCAL_REL_SD = 0.07
 
 #: Focal lengths over the longer side of the picture: a view of 175 to one of 0.06 degrees.
@@ -114,10 +114,10 @@ _FOCAL_RANGE = (0.02, 1000.0)
 #: A principal point that lies off the middle of the picture by one factor on both axes, alike within the second number
 #: and more than the first, is that of a picture of another size. (A cropped picture is off on one axis, or unlike.)
 _OTHER_SIZE, _ALIKE = 0.2, 0.05
-#: How far the distortion of a lens may move a corner outwards.
+#: Largest factor by which the distortion of a lens may move a corner outwards.
 _MOST_STRETCH = 2.0
 
-_NEXT = "correct the file, or leave it out: then a phone's field of view is guessed and the result says so"
+_NEXT = "correct the file, or leave it out: then a phone's field of view is assumed, and the result states that"
 
 
 def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
@@ -146,14 +146,14 @@ def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
 def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | None = None) -> Camera:
     """Intrinsics from a calibration file, for the upright picture of `image_size_px` (width, height).
 
-    Two forms are read: the TOML of Pose2Sim and Sports2D, a table per camera with `size` [width, height], `matrix` and
-    `distortions`; and JSON with `camera_matrix`, `distortion` and `image_size_px` [width, height]. Distortion is
-    OpenCV's k1 k2 p1 p2 [k3]. When the recording is larger or smaller than the calibrated picture by one factor for
+    Two formats are read: the TOML of Pose2Sim and Sports2D, a table per camera with `size` [width, height], `matrix`
+    and `distortions`; and JSON with `camera_matrix`, `distortion` and `image_size_px` [width, height]. Distortion is
+    OpenCV's k1 k2 p1 p2 [k3]. If the recording is larger or smaller than the calibrated picture by one factor for
     both sides, the matrix is scaled. `name` chooses the camera of a TOML that holds several. The JSON may state the
     standard deviation of the focal length, `focal_sd_px` (`pbl calibrate` does).
 
     Raises `PblError` CAMERA_INVALID: the file cannot be read, a field is missing or not usable, the model is a fisheye,
-    several cameras and none chosen, or the shape of the picture differs (a crop or a turn, which no factor describes).
+    several cameras and none chosen, or a picture of another shape (cropped or turned, which no factor describes).
     """
     path = Path(path)
     label, fields = _read(path, name)
@@ -254,11 +254,11 @@ def turning_radius2(camera: Camera) -> float:
 
 
 def check_lens(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float], key: object = None) -> None:
-    """Refuse a lens that no camera has: `matrix` (3, 3) px and `distortion` (5,) of an upright picture (width, height).
+    """Refuse an impossible lens: `matrix` (3, 3) px and `distortion` (5,) of an upright picture (width, height).
 
-    Raises `PblError` CAMERA_INVALID: not finite, a skew, a focal length that is no plausible part of the picture's
-    longer side (`_FOCAL_RANGE`), a principal point outside of the picture or of a picture of another size, or a
-    distortion that folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
+    Raises `PblError` CAMERA_INVALID: not finite, a skew, an implausible ratio of focal length to the picture's longer
+    side (`_FOCAL_RANGE`), a principal point outside the picture or of a picture of another size, or a distortion that
+    folds back before the corners of the picture or moves them by more than `_MOST_STRETCH`.
     """
     m, d = np.asarray(matrix, np.float64), np.asarray(distortion, np.float64)
     plain = m[0, 1] == m[1, 0] == m[2, 0] == m[2, 1] == 0 and m[2, 2] == 1
@@ -304,7 +304,7 @@ def _check_centre(m: np.ndarray, size_px: tuple[float, float], key: object) -> N
 
 
 def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]) -> bool:
-    """Whether the radial model reaches the corners before it turns back: beyond that, undistorting has no answer."""
+    """True if the radial model reaches the corners before it turns back, beyond which points cannot be undistorted."""
     corner, _, distorted = _to_corner(matrix, distortion, size_px)
     return bool(distorted[-1] >= corner)
 
@@ -312,8 +312,8 @@ def reaches_corners(matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[f
 def _to_corner(
     matrix: np.ndarray, distortion: np.ndarray, size_px: tuple[float, float]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Distance of the farthest corner from the axis (focal lengths), distances (N,) of an ideal camera, and where the
-    radial model puts them, up to where it turns back."""
+    """Distance of the farthest corner from the axis (focal lengths), distances (N,) of an ideal camera, and those of
+    the radial model, up to where it turns back."""
     k1, k2, _, _, k3 = distortion
     width, height = size_px
     x = (np.array([0, width - 1, 0, width - 1]) - matrix[0, 2]) / matrix[0, 0]
@@ -327,7 +327,7 @@ def _to_corner(
 
 
 def _shown(value: object) -> str:
-    """A field's value as it stands in the file, its beginning where it is long."""
+    """The first 200 characters of a field's value as it stands in the file."""
     return repr(value)[:200]
 
 
@@ -338,7 +338,7 @@ def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:
     """(N, 3) rays x/z, y/z, 1 of the picture points (N, 2), distortion removed."""
     points = np.asarray(xy_px, np.float64).reshape(-1, 1, 2)
     matrix, distortion = np.asarray(camera.matrix, np.float64), np.asarray(camera.distortion, np.float64)
-    # OpenCV's five iterations leave some tenths of a pixel with a wide lens.
+    # OpenCV's five iterations leave an error of some tenths of a pixel with a wide lens.
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
     flat = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
     return np.column_stack([flat.reshape(-1, 2), np.ones(len(points))])

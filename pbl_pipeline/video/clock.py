@@ -1,9 +1,9 @@
-"""The clock of a phone's log against its video's, from how the picture moves.
+"""Offset between the clocks of a phone's log and of its video, from the movement of the picture.
 
-A log that counts in UTC meets the time of recording in the video's file, which is rounded to seconds, and which some
-phones write for the beginning and others for the end. That is too coarse for a hand that shakes at 3 Hz, and the fit
-looks for half a second only. So the pictures decide where they can: a camera that turns moves the whole picture, and
-the movement of the picture must be that of the log at one shift of the clocks only.
+A log in UTC can be compared with the time of recording in the video's file, but that is rounded to seconds, and some
+phones write the beginning, others the end. This is too coarse for a hand that shakes at 3 Hz, and the fit searches
+half a second only. So the pictures decide if they can: a camera that turns moves the whole picture, and the movement of
+the picture matches that of the log at only one shift of the clocks.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from .phone_log import PICTURES_CLOCK, UTC_CLOCK, VIDEO_CLOCK, PhoneLog
 from .sensor_logger import read_phone_log
 from .types import VideoInfo
 
-#: Longer side (px) of the reduced picture, and the longest stretch of a video that is looked at (s): a shift of two
-#: clocks shows within some seconds.
+#: Longer side (px) of the reduced picture, and the longest stretch of a video that is used (s): some seconds suffice.
 _SIDE_PX, LONGEST_S = 256, 90.0
 #: Parts of the picture along its shorter and its longer side.
 _PARTS = (2, 3)
@@ -38,9 +37,9 @@ _PARTS = (2, 3)
 def picture_motion(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Times (T,) of the frames and shifts (T - 1, 2) between neighbours, to the right and down, in longer sides.
 
-    The median over six parts of the reduced grey picture, each by phase correlation: a person who walks through one or
-    two of them does not count. (On a rendered film with such a person the correlation with the true turns is 0.97; of
-    the whole picture at once it is 0.62.)
+    The median over six parts of the reduced grey picture, each by phase correlation, so that a person who walks through
+    one or two of them does not matter. (On a rendered film with such a person the correlation with the true turns is
+    0.97; with the whole picture at once it is 0.62.)
     """
     times, shifts = [], []
     last: list[np.ndarray] = []
@@ -73,19 +72,20 @@ def _window(width: int, height: int) -> np.ndarray:
     return cv2.createHanningWindow((width, height), cv2.CV_32F)
 
 
-#: How far the stated time of recording may be off (s): rounded to seconds, and a recording takes time to start.
+#: Largest error of the stated time of recording (s): it is rounded to seconds, and a recording takes time to start.
 STATED_WITHIN_S = 2.0
 #: Fraction of the video that a log must cover at a shift.
 LEAST_COVER = 0.9
-#: The pictures decide where their movement correlates with the log's by so much, and by so much better than at any
-#: shift farther off than `_PEAK_S`.
+#: The pictures decide if their movement and the log's have at least this correlation, and one higher by this lead than
+#: at any shift farther off than `_PEAK_S`.
 LEAST_CORRELATION, LEAST_LEAD, _PEAK_S = 0.5, 0.15, 0.3
-#: Against the time of recording in the file the pictures must speak more clearly. Of 80 logs of other hands, a minute
-#: each against 3 and 6 s of rendered film, the best place correlates by 0.64 at most and leads by 0.12 at most; the
-#: right log by 0.97 and by 0.26.
+#: To overrule the time of recording in the file, the pictures need a higher correlation. Of 80 logs of other hands, a
+#: minute each against 3 and 6 s of rendered film, the best shift has a correlation of 0.64 and a lead of 0.12 at most;
+#: the right log has 0.97 and 0.26.
 CERTAIN_CORRELATION = 0.75
-#: How far a log that is nearly on the video's clock may be off it (s), as in the fit, and standard deviation of what is
-#: left where the pictures tell: on rendered films 2 ms at most; the fit's own estimate has 7 (docs/phone_capture.md).
+#: Largest offset of a log that is nearly on the video's clock (s), as in the fit, and standard deviation of the
+#: remaining offset after matching the pictures: on rendered films 2 ms at most; the fit's own estimate has 7
+#: (docs/phone_capture.md).
 NEARLY_S, PICTURES_SD_S = 0.5, 0.005
 #: Steps (s) of the search, coarse and fine, and of the log's rate of turn.
 _COARSE_S, _FINE_S, _STEP_S = 0.02, 0.002, 0.005
@@ -96,7 +96,7 @@ _ZONE_S, _LARGEST_ZONES = 900.0, 56
 
 @dataclasses.dataclass(frozen=True)
 class Match:
-    """Best shift (s) to add to the log's times, its correlation, and the best one of other places."""
+    """Best shift (s) to add to the log's times, its correlation, and the highest correlation at other shifts."""
 
     shift_s: float
     correlation: float
@@ -108,8 +108,8 @@ class Match:
 
 
 class Aligned(NamedTuple):
-    """Seconds to add to a log's times so that 0 is the first frame of its video, in words how they were found, and
-    their standard deviation (s), NaN where the fit looks for what is left."""
+    """Seconds to add to a log's times so that 0 is the first frame of its video, the source of this shift in words, and
+    its standard deviation (s), NaN if the fit estimates the remaining offset."""
 
     shift_s: float
     how: str
@@ -121,13 +121,19 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
 
     quat_wxyz (P, 4): the log's orientation, camera to world.
 
-    Raises `PblError` PHONE_LOG: the log and the video are of other times (a time zone is named where it explains that),
-    or nothing tells which part of the log is the video's.
+    Raises `PblError` PHONE_LOG: the log and the video are of different times (a time zone that explains it is named),
+    or the part of the log that belongs to the video cannot be found.
     """
-    duration = _duration(video)
+    duration = float(max(video.time_s[-1] - video.time_s[0], 1e-3)) if len(video.time_s) else 1e-3
     if log.clock in (VIDEO_CLOCK, PICTURES_CLOCK):
         if _cover(log, 0.0, duration, 0.0) == 0.0:
-            raise _not_from_zero(log, duration, path)
+            raise log_error(
+                f"a log from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s, without start_utc",
+                f"seconds from the first frame of the video, which lasts {duration:.1f} s",
+                next_step="subtract the time at which the recording began, and write seconds; or add start_utc "
+                "(docs/phone_capture.md)",
+                key=path,
+            )
         if log.clock == PICTURES_CLOCK and not _still(quat_wxyz):
             match = match_pictures(log.time_s, quat_wxyz, video, [(-NEARLY_S, NEARLY_S)])
             if match.decides and match.correlation >= CERTAIN_CORRELATION:
@@ -151,21 +157,20 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
     if stated and max(shifts) - min(shifts) <= STATED_WITHIN_S:
         how = "clock by the time of recording in the file, within 1 s: the pictures do not tell it better"
         return Aligned(shifts[0], how)
-    raise PblError(
-        "PHONE_LOG",
-        found="a log of which nothing tells what part belongs to the video (the movement of the pictures correlates by "
+    raise log_error(
+        "a log whose part that belongs to the video cannot be found (correlation with the movement of the pictures "
         f"{match.correlation:.2f} at best, {match.rival:.2f} elsewhere)",
-        expected="one place at which the log moves as the pictures do, or a log that begins with the video",
+        "one shift at which the log moves as the pictures do, or a log that begins with the video",
         next_step="write time_s on the video's clock (docs/phone_capture.md), or leave the log out",
-        key=str(path),
+        key=path,
     )
 
 
 def _against_the_file(
     log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, shift: float, duration: float, path: Path
 ) -> Aligned:
-    """By the file's time of recording the log is of another time (`shift`), which the pictures may disprove: files lose
-    that time when they are converted, and clocks are set to other zones."""
+    """Match the pictures although the log and the file's time of recording disagree by `shift`: files lose that time
+    when they are converted, and clocks are set to other zones. Raises `PblError` PHONE_LOG if they do not match."""
     if not _still(quat_wxyz) and _cover(log, -float(log.time_s[0]), duration, 0.0) >= LEAST_COVER:
         match = match_pictures(log.time_s, quat_wxyz, video, [_anywhere(log, duration, path)])
         if match.decides and match.correlation >= CERTAIN_CORRELATION:
@@ -180,17 +185,22 @@ def _by_pictures(match: Match) -> str:
 
 
 def _anywhere(log: PhoneLog, duration: float, path: Path) -> tuple[float, float]:
-    """The shifts at which some part of the log covers the video. Raises `PblError` PHONE_LOG where it is too short."""
+    """Range of shifts at which some part of the log covers the video. Raises `PblError` PHONE_LOG: too short a log."""
     last = float(log.time_s[-1]) - duration * LEAST_COVER
     if last < log.time_s[0]:
-        raise _too_short(log, duration, path)
+        raise log_error(
+            f"a log of {log.time_s[-1] - log.time_s[0]:.1f} s",
+            f"at least {LEAST_COVER:.0%} of the video's {duration:.1f} s",
+            next_step="take the log of this recording, or leave it out",
+            key=path,
+        )
     return -last, -float(log.time_s[0]) + (1 - LEAST_COVER) * duration
 
 
 def match_pictures(
     time_s: np.ndarray, quat_wxyz: np.ndarray, video: VideoInfo, ranges: list[tuple[float, float]]
 ) -> Match:
-    """The shift in these ranges at which the log (P,), (P, 4) turns as the pictures move."""
+    """Find the shift in these ranges at which the log (P,), (P, 4) turns as the pictures move."""
     at, moved = picture_motion(video.path)
     grid = np.arange(time_s[0], time_s[-1], _STEP_S)
     turns = Slerp(time_s, Rotation.from_quat(quat_wxyz, scalar_first=True))(grid)
@@ -219,7 +229,7 @@ def match_pictures(
 
 
 def _stated(log: PhoneLog, video: VideoInfo, duration: float) -> list[float]:
-    """Shifts by which the video's time of recording is its beginning, or its end; none where either is not known."""
+    """Shifts for a time of recording that is the video's beginning, or its end; empty if a time is not known."""
     if log.clock != UTC_CLOCK or log.start_utc_s is None or video.recorded_utc is None:
         return []
     recorded = datetime.datetime.fromisoformat(video.recorded_utc).timestamp() + 0.5  # seconds are cut off
@@ -231,10 +241,6 @@ def _cover(log: PhoneLog, shift: float, duration: float, slack: float) -> float:
     """Fraction of the video that the log covers, `slack` seconds allowed at either end."""
     first, last = log.time_s[0] + shift - slack, log.time_s[-1] + shift + slack
     return float(np.clip(min(last, duration) - max(first, 0.0), 0, None) / duration)
-
-
-def _duration(video: VideoInfo) -> float:
-    return float(max(video.time_s[-1] - video.time_s[0], 1e-3)) if len(video.time_s) else 1e-3
 
 
 def _still(quat_wxyz: np.ndarray) -> bool:
@@ -252,46 +258,24 @@ def _other_time(log: PhoneLog, video: VideoInfo, shift: float, duration: float, 
     begin = datetime.datetime.fromtimestamp((log.start_utc_s or 0.0) + log.time_s[0], datetime.UTC)
     end = datetime.datetime.fromtimestamp((log.start_utc_s or 0.0) + log.time_s[-1], datetime.UTC)
     zone = (
-        f"the clocks are {abs(hours):g} h apart: one of them counts in another time zone; write UTC into the log"
+        f"the clocks are {abs(hours):g} h apart: one of them is in another time zone; write UTC into the log"
         if hours is not None
         else "take the log of this recording"
     )
-    return PblError(
-        "PHONE_LOG",
-        found=f"a log from {begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC",
-        expected=f"the time of the video, {duration:.1f} s around {video.recorded_utc}",
+    return log_error(
+        f"a log from {begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC",
+        f"the time of the video, {duration:.1f} s around {video.recorded_utc}",
         next_step=f"{zone}, or time_s on the video's clock (docs/phone_capture.md)",
-        key=str(path),
-    )
-
-
-def _not_from_zero(log: PhoneLog, duration: float, path: Path) -> PblError:
-    return PblError(
-        "PHONE_LOG",
-        found=f"a log from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s, without start_utc",
-        expected=f"seconds from the first frame of the video, which lasts {duration:.1f} s",
-        next_step="subtract the time at which the recording began, and write seconds; or add start_utc "
-        "(docs/phone_capture.md)",
-        key=str(path),
-    )
-
-
-def _too_short(log: PhoneLog, duration: float, path: Path) -> PblError:
-    return PblError(
-        "PHONE_LOG",
-        found=f"a log of {log.time_s[-1] - log.time_s[0]:.1f} s",
-        expected=f"at least {LEAST_COVER:.0%} of the video's {duration:.1f} s",
-        next_step="take the log of this recording, or leave it out",
-        key=str(path),
+        key=path,
     )
 
 
 def load_attitude(path: str | Path, video: VideoInfo | None = None) -> Attitude:
     """Read a phone's sensor log (docs/phone_capture.md): R_nc of the camera on the video's clock.
 
-    With the probed `video`, how the phone was held is taken from it where the log does not say, and a log on another
-    clock is brought to the video's (`align_clock`, which may read the pictures). Without it, the phone was held in
-    portrait, and time 0 of the log is the first frame.
+    With the probed `video`, the phone's turn is taken from it if the log does not state one, and a log on another clock
+    is brought to the video's (`align_clock`, which may read the pictures). Without it, the phone is assumed to have
+    been held in portrait, and time 0 of the log is the first frame.
 
     Raises `PblError` FILE_MISSING, PHONE_LOG: see `read_phone_log`; a log by which the upright picture would lie on its
     side or stand on its head (a wrong `frame` or `rotation_deg`, or quaternions that turn the other way); a log of

@@ -1,14 +1,12 @@
-"""What a phone wrote into a MOV or MP4 beside the pictures, read from the boxes themselves.
+"""Tags that a phone wrote into a MOV or MP4, and missing ends of containers, read from the boxes without a decoder.
 
-FFmpeg hands on the metadata of the whole file. The lens stands in the metadata of the video track, which it leaves out,
-and of an edit list it applies the cuts and ignores the speed. Layout: ISO/IEC 14496-12 (boxes, edit list 8.6.6) and
-Apple's QuickTime File Format (`meta` with `keys` and `ilst`, well-known types of `data`).
+FFmpeg returns the metadata of the whole file, but not those of the video track, which name the lens, and of an edit
+list it applies the cuts and ignores the speed. Layout: ISO/IEC 14496-12 (boxes, edit list 8.6.6) and Apple's QuickTime
+File Format (`meta` with `keys` and `ilst`, well-known types of `data`).
 
-What a container's own lengths say about its end, read from the file's bytes without a decoder.
-
-A copy that broke off leaves the lengths at the front of the file pointing beyond its end. That holds for the boxes of
-MP4/MOV (ISO/IEC 14496-12, 4.2), the Segment element of Matroska/WebM (RFC 9559, 5.1; sizes RFC 8794, 4) and the RIFF
-chunk of AVI. It says nothing about a file whose writer never knew its length (a live WebM, MPEG-TS).
+In an incomplete copy the lengths at the front of the file point beyond its end: those of the boxes of MP4/MOV (ISO/IEC
+14496-12, 4.2), the Segment element of Matroska/WebM (RFC 9559, 5.1; sizes RFC 8794, 4) and the RIFF chunk of AVI. Files
+whose writer never knew the length (a live WebM, MPEG-TS) cannot be checked.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from typing import BinaryIO
 
 #: Boxes that may be the first of an MP4 or MOV file.
 _FIRST_BOXES = {b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp"}
-#: Boxes of a file that are looked at: an hour in fragments of one picture has some hundred thousand.
+#: Most boxes that are read of a file: an hour in fragments of one picture has some hundred thousand.
 _MOST_BOXES = 1_000_000
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 
@@ -45,7 +43,7 @@ _PHOTO_BRANDS = {b"heic": "HEIC", b"heix": "HEIC", b"heim": "HEIC", b"heis": "HE
 
 
 def photo_format(path: Path) -> str | None:
-    """Return the format of a photo ("HEIC", "JPEG", ...) by the first bytes of a file, None for what is not a photo."""
+    """Return the format of a photo ("HEIC", "JPEG", ...) by the first bytes of a file, None for other files."""
     with path.open("rb") as file:
         head = file.read(12)
     if head[4:8] == b"ftyp":
@@ -56,7 +54,7 @@ def photo_format(path: Path) -> str | None:
 
 
 def missing_end(path: Path) -> str | None:
-    """One sentence on what the file lacks at its end, or None when its lengths add up (or it has none)."""
+    """Describe in one sentence what is missing at the end; None if the lengths add up (or the file states none)."""
     size = path.stat().st_size
     kind = family(path)
     with path.open("rb") as file:
@@ -70,8 +68,8 @@ def missing_end(path: Path) -> str | None:
 
 
 def top_boxes(file: BinaryIO, size: int) -> Iterator[tuple[bytes, int, int, int]]:
-    """Name, place, length and head of the boxes of an MP4 of `size` bytes; ends where a length makes no sense, and
-    after `_MOST_BOXES`."""
+    """Name, offset, length and length of the header of each box of an MP4 of `size` bytes; ends at an impossible length
+    and after `_MOST_BOXES`."""
     at = 0
     for _ in range(_MOST_BOXES):
         if at + 8 > size:
@@ -137,22 +135,21 @@ def _avi(file: BinaryIO, size: int) -> str | None:
 
 #: An index larger than this is not read: hours of video have some MB.
 _LARGEST_MOOV = 64 << 20
-#: Items of a file, edits of a track, and boxes in each other, that are read; phones write some dozens.
+#: Most items of a file and edits of a track, and deepest nesting of boxes, that are read; phones write some dozens.
 _MOST_ITEMS, _DEEPEST = 1000, 8
 _CONTAINERS = (b"moov", b"trak", b"udta", b"edts", b"mdia")
 
 
 @dataclasses.dataclass(frozen=True)
 class Tags:
-    """`items`: names in lower case and texts of the file and of its video track (whose own go first). `speeds`: those
-    of the video track's edits, 1 where they play as stored; empty edits do not count."""
+    """Metadata of a file and of its video track."""
 
-    items: dict[str, str] = dataclasses.field(default_factory=dict)
-    speeds: tuple[float, ...] = ()
+    items: dict[str, str] = dataclasses.field(default_factory=dict)  # by name in lower case; the track's come first
+    speeds: tuple[float, ...] = ()  # of the video track's edits, 1 as stored; without empty edits
 
 
 def read_tags(path: Path) -> Tags:
-    """The tags of a file; nothing where it is no MOV or MP4, or its boxes make no sense from some place on."""
+    """Read the tags of a file; empty if it is not a MOV or MP4, or after the first box with an impossible length."""
     if family(path) != "mp4":
         return Tags()
     moov = _moov(path)
@@ -161,7 +158,7 @@ def read_tags(path: Path) -> Tags:
     speeds: tuple[float, ...] = ()
     for name, box in _boxes(moov):
         if name == b"trak":
-            if not speeds and not tracks and _is_video(box):
+            if not speeds and not tracks and _find(box, b"mdia", b"hdlr")[8:12] == b"vide":
                 tracks, speeds = _items(box), _speeds(box)
         elif name == b"meta":
             items |= _meta(box)
@@ -180,7 +177,7 @@ def _moov(path: Path) -> memoryview:
 
 
 def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
-    """Names and contents of the boxes in `data`; ends where a length makes no sense."""
+    """Names and contents of the boxes in `data`; ends at an impossible length."""
     at = 0
     while at + 8 <= len(data):
         length, name = struct.unpack_from(">I4s", data, at)
@@ -196,18 +193,14 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _find(data: memoryview, *names: bytes) -> memoryview:
-    """Content of the first box at this path; empty where there is none."""
+    """Content of the first box at this path; empty if there is none."""
     for wanted in names:
         data = next((box for name, box in _boxes(data) if name == wanted), data[:0])
     return data
 
 
-def _is_video(trak: memoryview) -> bool:
-    return _find(trak, b"mdia", b"hdlr")[8:12] == b"vide"
-
-
 def _items(data: memoryview, depth: int = _DEEPEST) -> dict[str, str]:
-    """The items of all `meta` boxes in these containers, some boxes deep."""
+    """Items of all `meta` boxes in these containers, nested up to `depth`."""
     found: dict[str, str] = {}
     for name, box in _boxes(data):
         if name == b"meta":

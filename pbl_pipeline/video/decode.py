@@ -1,9 +1,9 @@
 """One pass over the frames of a video file, shared by `probe` and `read_frames` so that both count the same frames.
 
-What counts as a frame: it decodes, and its presentation time is later than the one before it. Frames that an edit list
-cuts away do not count (a player does not show them), whatever the header announces. When the pass reaches the end,
-`Decoder` compares what came out with what the container promised; a recording that lost its end, or pictures in its
-middle, raises instead of passing as a shorter one.
+A frame counts if it decodes and its presentation time is later than the one before it. Frames that an edit list cuts
+away do not count (a player does not show them), whatever the header announces. At the end `Decoder` compares the
+decoded frames with the announcement of the container: a recording that lost its end, or pictures in its middle, raises
+an error instead of passing as a shorter one.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from .container_tags import family, missing_end, photo_format
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
-#: What reading a file can raise. Memory: a header that lies about sizes asks for more than there is.
+#: Errors that reading a file can raise. Memory: a header with wrong sizes asks for more than there is.
 FFMPEG_ERRORS = (FFmpegError, MemoryError)
-#: Of a decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 pictures that others are drawn from,
-#: and one for each thread; 16 of 5.3K with 5 threads take 760 MiB.
+#: Largest decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 reference pictures, and one for
+#: each thread; 16 of 5.3K with 5 threads take 760 MiB.
 _MAX_PICTURE, _MAX_IN_THREADS = 26 << 20, 128 << 20
-#: Pixels of a picture in the format with the fewest bytes for each (8 bits, colour at half the resolution).
+#: Most pixels of a picture, in the format with the fewest bytes for each (8 bits, colour at half the resolution).
 _MAX_PIXELS = {"max_pixels": str(_MAX_PICTURE * 2 // 3)}
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file", **_MAX_PIXELS}
 
@@ -63,7 +63,7 @@ def check_file(path: str | Path) -> Path:
             "VIDEO_MISSING",
             found=f"the file cannot be read ({_words(error)})",
             expected="a file that this account may read",
-            next_step="change the file's permissions or copy it to a folder of your own",
+            next_step="change the file's permissions or copy it to one of your folders",
             key=path,
         ) from error
     if not first:
@@ -72,19 +72,19 @@ def check_file(path: str | Path) -> Path:
 
 
 def decode_threads() -> int:
-    """Threads for decoding: the cores this process may use, at most 8 (more brings nothing and costs memory)."""
+    """Number of threads for decoding: the cores this process may use, at most 8 (more cost memory and gain nothing)."""
     return min(cores(), 8)
 
 
 class Decoder:
-    """Iterate over `(pts, frame)` once; `time_base` turns a stamp into seconds, `notes` fills up on the way.
+    """Iterate over `(pts, frame)` once; `time_base` converts a stamp to seconds, `notes` are complete at the end.
 
-    With `exact`, threads share one frame instead of taking one each. FFmpeg's H.264 decoder hands a frame on before
-    another thread has found the damage in it, so that only then damage is certain to be seen (measured: with two frame
-    threads a third of the runs missed a broken last picture). Frames and stamps of a sound file are the same.
+    With `exact`, threads share one frame instead of taking one each, so that damage is certain to be seen: FFmpeg's
+    H.264 decoder otherwise returns a frame before another thread has found the damage in it (measured: with two frame
+    threads a third of the runs missed a broken last picture). Frames and stamps of an intact file are the same.
 
-    Of an HEVC recording FFmpeg decodes damaged pictures without a word (0 of 24 changed files were noticed, 19 of 24 in
-    H.264): there only a lost end is seen.
+    FFmpeg decodes damaged HEVC pictures silently (0 of 24 changed files were noticed, 19 of 24 in H.264): of such
+    recordings only a lost end is seen.
     """
 
     def __init__(self, path: Path, threads: int | None = None, exact: bool = False) -> None:
@@ -96,7 +96,7 @@ class Decoder:
         self.stream.thread_type = "SLICE" if exact else "AUTO"
         room = max(1, _MAX_IN_THREADS // max(1, _picture_bytes(self.stream)))
         self.stream.codec_context.thread_count = min(threads or decode_threads(), room)
-        self.stream.codec_context.options = _MAX_PIXELS  # also for pictures that are larger than announced
+        self.stream.codec_context.options = _MAX_PIXELS  # also refuses pictures that are larger than announced
         self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
         self.n_frames = 0
         self._first_pts: int | None = None
@@ -117,7 +117,7 @@ class Decoder:
 
     @property
     def n_announced(self) -> int:
-        """Frames the header claims; 0 when it says nothing."""
+        """Frames that the header announces; 0 if it does not."""
         return self.stream.frames
 
     def __iter__(self) -> Iterator[tuple[int, av.VideoFrame]]:
@@ -138,12 +138,12 @@ class Decoder:
         self._check()
 
     def packet_stamps(self) -> list[int]:
-        """Stamps of the pictures in the order of the file, without decoding any; in place of iterating."""
+        """Stamps of the pictures in the order of the file, without decoding; to be called instead of iterating."""
         stamps = [p.dts if p.pts is None else p.pts for p in self._packets() if p.size and not p.is_discard]
         return [s for s in stamps if s is not None]
 
     def _packets(self) -> Iterator[av.Packet]:
-        """Every packet of the video stream; those of the other streams only tell how long the file is."""
+        """Every packet of the video stream; those of the other streams only show the length of the file."""
         packets = self.container.demux()
         while True:
             try:
@@ -174,9 +174,9 @@ class Decoder:
             yield flush
 
     def _accept(self, frame: av.VideoFrame) -> int | None:
-        """The frame's stamp when it counts, else None."""
+        """Return the frame's stamp if it counts, else None."""
         self._last_frame_corrupt = frame.is_corrupt
-        if frame.is_corrupt:  # a picture with patches guessed by the decoder
+        if frame.is_corrupt:  # parts of the picture are guessed by the decoder
             self._n_damaged += 1
         pts = frame.pts
         if pts is None:  # AVI has no presentation stamps; its decoding stamps are the frame numbers
@@ -194,7 +194,7 @@ class Decoder:
                 "VIDEO_DAMAGED",
                 found=f"the picture is {w}x{h} px, but {size[0]}x{size[1]} px from frame {n} on",
                 expected="one picture size for the whole recording",
-                next_step="cut the recording where the size changes and process the pieces as videos of their own",
+                next_step="cut the recording where the size changes and process the pieces as separate videos",
                 key=self.path,
             )
         self._size = size
@@ -265,7 +265,7 @@ class Decoder:
                 return f"the container announces {self.n_announced} frames and holds {n_stored}"
             self._n_hidden = n_stored - self.n_frames
         if not self.n_announced and self.container.duration is not None:
-            # Only where no count is announced: the length may be rounded, or that of another stream.
+            # Only without an announced count: the length may be rounded, or that of another stream.
             start_s = (self.container.start_time or 0) / av.time_base
             missing_s = self.container.duration / av.time_base - (self._end_s - start_s)
             if missing_s > 0.5:

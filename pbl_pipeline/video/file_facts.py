@@ -1,11 +1,9 @@
-"""Everything known of a video file before its pictures are used.
+"""Facts of a video file that are known before its pictures are used.
 
-Whether the stamps of a video are the time in which the movement happened.
-
-Slow motion is kept in two ways. The phone's original has stamps of real time and some hundred frames a second. An
-exported or edited copy has the frames spread to 30 a second, and a second of it is a part of one: every duration comes
-out too long. Android says so (`com.android.capture.fps`); an edit list may (its speed, which no decoder applies); of a
-copy that an iPhone exported nothing in the file tells.
+Slow motion is stored in two ways. The phone's original has stamps of real time and some hundred frames a second. An
+exported or edited copy plays 30 of these frames a second, so every duration comes out too long. Android states the
+original rate (`com.android.capture.fps`); an edit list may (its speed, which no decoder applies); in a copy that an
+iPhone exported nothing shows it.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import is_plain
 from pbl_pipeline.qc import FAIL, PASS, Check
+from pbl_pipeline.runs import runs
 
 from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
@@ -39,7 +38,7 @@ _SLOW_MOTION_FPS = 100.0
 
 
 def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) -> list[str]:
-    """What a reader should know of a video of `fps` frames a second; `speeds` are those of its edit list."""
+    """Notes on the playing speed of a video of `fps` frames a second; `speeds` are those of its edit list."""
     notes = []
     ratio = stretch(fps, capture_fps)
     if ratio > _MOST_RATIO:
@@ -57,14 +56,14 @@ def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) 
 
 
 def stretch(fps: float, capture_fps: float | None) -> float:
-    """How many times longer the stamps make a movement than it was; 1 where nothing says so."""
+    """Factor by which the stamps lengthen the movement; 1 if not known."""
     if capture_fps is None or not math.isfinite(fps) or fps <= 0:
         return 1.0
     return max(1.0, capture_fps / fps)
 
 
 def check_timing(video: VideoInfo) -> tuple[Check, ...]:
-    """Check `time_stretch` of a video whose phone states the rate it recorded at; nothing of the others."""
+    """Check `time_stretch` of a video whose phone states the rate of recording; no check of others."""
     if video.capture_fps is None:
         return ()
     ratio = stretch(video.fps, video.capture_fps)
@@ -77,29 +76,31 @@ def check_timing(video: VideoInfo) -> tuple[Check, ...]:
     return (Check("time_stretch", FAIL, ratio, _MOST_RATIO, advice),)
 
 
-#: Longer side (px) of the reduced grey picture, and every how many frames it is looked at.
+#: Longer side (px) of the reduced grey picture, and its interval in frames.
 _SIDE_PX, EVERY = 160, 10
-#: Grey levels (of 255) by which a border may differ from its colour, over place and time, and by which the picture
-#: beside it differs: between the two lies a sharp edge, which a light that falls off over a wall does not have.
+#: Grey levels (of 255) by which a border may differ from its colour, over area and time, and by which the picture
+#: beside it differs: the edge between the two is sharp, unlike light that falls off over a wall.
 _LEVELS, _EDGE_LEVELS = 6, 20
 #: Least width of the borders on two opposite sides, and least extent of the picture along them, as fractions of the
 #: whole: a player fills the screen in one direction.
 _LEAST_WIDTH, _LEAST_EXTENT = 0.03, 0.5
-#: Fraction of a row that differs so: of the picture's at its edges at least (a room may be as dark as the border), of
-#: the border's beside it at most at any time (the edge is straight), and on average (a clock, a progress bar).
+#: Fraction of a row that differs: least of the picture's rows at its edges (a room may be as dark as the border), most
+#: of the border's row beside it at any time (the edge is straight), and on average (a clock, a progress bar).
 _AT_EDGE, _BESIDE, _OUTSIDE = 0.3, 0.05, 0.2
 
 
-#: A line of a screen (the edge of a window, of a bar) is a step of so many grey levels between two rows of pixels, and
-#: of so much of the step over six rows, in so much of so long a part of a row: a camera's edge is blurred and tilted.
+#: A line of a screen (the edge of a window or bar) is a step between two rows of pixels, straight and sharp, unlike a
+#: camera's edges: least step (grey levels), its least fraction of the step over six rows, the fraction of pixels that
+#: have both, and the length of the line as a fraction of the row.
 _STEP_LEVELS, _OF_STEP, _STRAIGHT, _LONG = 10, 0.6, 0.9, 0.4
-#: Lines this near to the picture's edge are padding of a file; so many around so much of what moves are a screen's.
+#: Lines nearer to the picture's edge than this fraction are padding; least number of lines that show a screen, and the
+#: fraction of the movement that they enclose.
 _PADDING, _LEAST_LINES, _ENCLOSED = 0.015, 4, 0.9
 
 
 class BorderMeter:
-    """Where a video's picture has another grey than its edges, at a reduced size: ever, and how often by far; its mean
-    at its own size, and where it moves."""
+    """Statistics of a video's pictures that show borders and a screen: where, at a reduced size, the grey ever differs
+    from that of the edges and how often it differs by far, where it moves, and the mean picture at full size."""
 
     def __init__(self) -> None:
         self._n = 0
@@ -111,17 +112,18 @@ class BorderMeter:
         self._often: np.ndarray = np.empty(0, np.int64)
 
     def add(self, frame: av.VideoFrame) -> None:
-        """Look at a frame; all have one size."""
+        """Add a frame; all have one size."""
         scale = _SIDE_PX / max(frame.width, frame.height)
-        width, height = max(2, round(frame.width * scale)), max(2, round(frame.height * scale))
-        grey = frame.reformat(width, height, "gray", interpolation="AREA").to_ndarray().astype(np.int16)
+        size = max(2, round(frame.width * scale)), max(2, round(frame.height * scale))
+        full = frame.reformat(format="gray")
+        self._last = full.to_ndarray()
+        grey = full.reformat(*size, interpolation="AREA").to_ndarray().astype(np.int16)
         if not self._n:
             # Of the first and last row, and of the first and last column: a border keeps its colour.
             self._colours = np.array([np.median(grey[[0, -1]]), np.median(grey[:, [0, -1]])])[:, None, None]
             self._ever, self._often = np.zeros((2, *grey.shape), bool), np.zeros((2, *grey.shape), np.int64)
             self._sum, self._moved = np.zeros((frame.height, frame.width), np.float32), np.zeros(grey.shape)
             self._before = grey
-        self._last = frame.reformat(format="gray").to_ndarray()
         self._first = self._last if not self._n else self._first
         self._sum += self._last
         self._moved += np.abs(grey - self._before) > _EDGE_LEVELS
@@ -132,16 +134,16 @@ class BorderMeter:
         self._often += off > _EDGE_LEVELS
 
     def widths(self) -> tuple[float, float] | None:
-        """Return the widths of the borders at two opposite sides of the stored picture, as fractions of it; None where
-        it has none."""
+        """Return the widths of the borders at two opposite sides of the stored picture, as fractions of it; None
+        without borders."""
         if not self._n:
             return None
-        # Half of the time: what moves over a flat background is not the picture.
+        # Half of the time: an object that moves over a flat background is not the picture.
         usual = self._often >= 0.5 * self._n
         return _at_ends(usual[0], self._ever[0]) or _at_ends(usual[1].T, self._ever[1].T)
 
     def lines(self) -> int:
-        """Return how many lines of a screen are around what moves; 0 where they are too few, or what moves is not
+        """Return the number of a screen's lines around the movement; 0 if they are too few, or the movement is not
         between them."""
         greys = (self._sum / max(self._n, 1), self._first, self._last)
         sides = [(greys, self._moved), ([np.ascontiguousarray(g.T) for g in greys], self._moved.T)] if self._n else []
@@ -156,9 +158,9 @@ class BorderMeter:
 
 
 def _lines(greys: Sequence[np.ndarray]) -> np.ndarray:
-    """Places of the horizontal lines of a screen in (H, W) grey levels, as fractions of H; of neighbours one.
+    """Rows of the horizontal lines of a screen in (H, W) grey levels, as fractions of H; one of adjacent rows.
 
-    greys: the mean of all pictures, and the first and the last, where an edge of what moves is elsewhere.
+    greys: the mean of all pictures, and the first and the last, in which moving edges differ.
     """
     height, width = greys[0].shape
     n, rows = max(1, int(_LONG * width)), []
@@ -175,18 +177,18 @@ def _lines(greys: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _steps(grey: np.ndarray, part: float) -> np.ndarray:
-    """(H - 5, W) where (H, W) grey levels rise from one row to the next by a part of what the line of a screen does."""
+    """(H - 5, W) where (H, W) grey levels rise from one row to the next by `part` of the step of a screen's line."""
     step, over = grey[3:-2] - grey[2:-3], grey[5:] - grey[:-5]
     return (step >= part * _STEP_LEVELS) & (step >= part * _OF_STEP * over)
 
 
 def _at_ends(usual: np.ndarray, ever: np.ndarray) -> tuple[float, float] | None:
-    """Widths of the borders of one colour at the first and the last row, None where one is missing.
+    """Widths of the borders of one colour at the first and the last row, None if one is missing.
 
     Parameters
     ----------
     usual, ever
-        (H, W) bool: another grey than the border's by far most of the time, at any time.
+        (H, W) bool: the grey differs from the border's by far most of the time, or at all at any time.
     """
     of_columns = usual.mean(axis=0)
     columns = np.flatnonzero(of_columns > 0.5 * of_columns.max())
@@ -194,22 +196,21 @@ def _at_ends(usual: np.ndarray, ever: np.ndarray) -> tuple[float, float] | None:
     if across.stop - across.start < _LEAST_EXTENT * len(of_columns):
         return None
     # The longest run of rows that differ: a progress bar or the text of an app is a shorter one.
-    differs = ever[:, across].mean(axis=1) > _BESIDE
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], differs, [False]]))).reshape(-1, 2)
-    if not len(runs):
+    rows = max(runs(ever[:, across].mean(axis=1) > _BESIDE), key=lambda r: r.stop - r.start, default=None)
+    if rows is None:
         return None
-    top, end = (int(i) for i in runs[np.argmax(runs[:, 1] - runs[:, 0])])
+    top, end = rows.start, rows.stop
     widths = top / len(ever), 1.0 - end / len(ever)
     if min(widths) < _LEAST_WIDTH:
         return None
-    # The row at an edge may hold a part of both.
+    # The row at an edge may belong to both.
     filled = usual[:, across].mean(axis=1)
     sharp = min(filled[top : top + 2].max(), filled[max(0, end - 2) : end].max()) >= _AT_EDGE
     return widths if sharp and max(ever[:top].mean(), ever[end:].mean()) <= _OUTSIDE else None
 
 
 def sha256_of(path: str | Path) -> str:
-    """SHA-256 of a video file as 64 hex digits, read in pieces.
+    """SHA-256 of a video file as 64 hex digits, computed in pieces.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY.
     """
@@ -218,10 +219,10 @@ def sha256_of(path: str | Path) -> str:
 
 
 def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
-    """Decode `path` once and say what it holds.
+    """Decode `path` once and describe it.
 
-    The whole file is decoded, because only that tells which frames there are: edit lists, damaged ends and announced
-    counts differ from it. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
+    The whole file is decoded, because that alone shows which frames there are: edit lists, damaged ends and announced
+    counts may differ. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED,
     VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN.
@@ -287,7 +288,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
 
 
 def read_first(path: str | Path) -> FirstPicture:
-    """Size and rotation of a video's first picture, and the phone that recorded it. No more is decoded.
+    """Size and rotation of a video's first picture, and the phone that recorded it. Nothing else is decoded.
 
     Raises `PblError` as `probe`.
     """
@@ -313,7 +314,7 @@ def packet_times(path: str | Path) -> np.ndarray:
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
-    """What a file says beside its pictures (place, phone, times, ...): names in lower case, and texts of one line.
+    """Return the metadata of a file (place, phone, times, ...): names in lower case, and texts of one line.
 
     Raises `PblError` as `probe`.
     """
@@ -324,7 +325,7 @@ def read_metadata(path: str | Path) -> dict[str, str]:
 
 
 def recorded_utc(path: str | Path) -> str | None:
-    """Return when a file says that it was recorded (YYYY-MM-DDTHH:MM:SSZ); None where it does not. Nothing is decoded.
+    """Return the file's time of recording (YYYY-MM-DDTHH:MM:SSZ); None if it states none. Nothing is decoded.
 
     Raises `PblError` as `probe`.
     """
@@ -332,7 +333,7 @@ def recorded_utc(path: str | Path) -> str | None:
 
 
 def _metadata(decoder: Decoder, tags: Tags) -> dict[str, str]:
-    """Of the stream, the container and its atoms by name; the later ones win."""
+    """Metadata of the stream, the container and its atoms by name; the later ones take precedence."""
     return dict(decoder.stream.metadata) | dict(decoder.container.metadata) | tags.items
 
 
@@ -346,7 +347,7 @@ def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tuple[float, bool]:
-    """Median interval (s) and whether the intervals vary by more than a tenth of it and more than rounding explains."""
+    """Median interval (s), and True if intervals vary by more than a tenth of it and more than rounding explains."""
     if len(time_s) < 2:
         return (1.0 / announced_fps if announced_fps else float("nan")), False
     steps = np.diff(time_s)
@@ -385,7 +386,7 @@ def _recorded_utc(metadata: Mapping[str, str]) -> str | None:
     if when.tzinfo is None:
         when = when.replace(tzinfo=datetime.UTC)
     when = when.astimezone(datetime.UTC)
-    # 1904 and 1970 are the zeros of two clocks: a camera that did not know the time.
+    # 1904 and 1970 are the zeros of two clocks: the camera did not know the time.
     return when.strftime("%Y-%m-%dT%H:%M:%SZ") if when.year > 1990 else None
 
 
@@ -395,7 +396,7 @@ def _first(metadata: Mapping[str, str], *names: str) -> str | None:
 
 
 def _number(metadata: Mapping[str, str], *names: str) -> float | None:
-    """The positive number that a tag begins with ("27", "27.00mm"); None where there is none."""
+    """The positive number at the beginning of a tag ("27", "27.00mm"); None if there is none."""
     digits = re.match(r"\d+(\.\d+)?", _first(metadata, *names) or "")
     value = float(digits[0]) if digits else 0.0
     return value if value > 0 else None

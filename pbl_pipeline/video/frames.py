@@ -1,9 +1,7 @@
-"""Frames of a video, one after the other, upright and as regions.
+"""Frames of a video in order, upright, and regions of them.
 
-A region of a decoded picture, taken from its brightness and colour planes before anything is converted.
-
-A detector looks at some 256 x 256 pixels, a phone's picture has 2 or 8 million. Cutting first and converting then gives
-the same region for a tenth of the work.
+A region is cut from the brightness and colour planes of a decoded picture and then converted: a detector needs some
+256 x 256 pixels, a phone's picture has 2 or 8 million, and cutting first takes a tenth of the time.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from .types import Frame, coarser, cut_samples, square
 
 @dataclasses.dataclass(frozen=True)
 class Orientation:
-    """How the stored picture becomes the one a person sees: transpose, then flip left-right, then top-bottom."""
+    """Steps from the stored picture to the one that is shown: transpose, then flip left-right, then top-bottom."""
 
     transpose: bool = False
     flip_x: bool = False
@@ -37,12 +35,12 @@ class Orientation:
 
     @property
     def mirrored(self) -> bool:
-        """True when left and right are swapped, which no turning undoes."""
+        """True if left and right are swapped, which no rotation undoes."""
         return self.transpose ^ self.flip_x ^ self.flip_y
 
     @property
     def rotation_deg(self) -> int:
-        """Clockwise turn of the stored picture: 0, 90, 180 or 270; of a mirrored one before it is mirrored."""
+        """Clockwise rotation of the stored picture: 0, 90, 180 or 270; of a mirrored one before mirroring."""
         flip_x = self.flip_x ^ self.mirrored
         if self.transpose:
             return 90 if flip_x else 270
@@ -53,7 +51,7 @@ class Orientation:
         return (height, width) if self.transpose else (width, height)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """The upright picture, contiguous; (H, W, 3) -> (H', W', 3)."""
+        """Return the upright picture, contiguous; (H, W, 3) -> (H', W', 3)."""
         if self.transpose:
             image = cv2.transpose(image)
         if self.flip_x or self.flip_y:
@@ -62,7 +60,7 @@ class Orientation:
 
 
 def orientation_of(frame: av.VideoFrame) -> Orientation:
-    """From the frame's display matrix (ISO/IEC 14496-12, 6.2.2).
+    """Return the orientation in the frame's display matrix (ISO/IEC 14496-12, 6.2.2).
 
     The matrix [[a, b, u], [c, d, v], [x, y, w]] sends the stored point (p, q), p to the right and q down, to
     (a p + c q, b p + d q). Angles that are not multiples of 90 degrees are rounded to one (`exact` is then False).
@@ -93,8 +91,8 @@ _PLANAR = {
     "yuv422p10le": (2, 1, 10),
 }
 _FULL_RANGE = 2  # FFmpeg's AVCOL_RANGE_JPEG
-#: Shares of red and blue in the brightness by FFmpeg's number of the colour space: ITU-R BT.709 and BT.2020; all others
-#: BT.601, which FFmpeg's converter takes as well where a file says nothing.
+#: Fractions of red and blue in the brightness by FFmpeg's number of the colour space: ITU-R BT.709 and BT.2020; all
+#: others BT.601, as FFmpeg's converter for files that state none.
 _RED_BLUE = {1: (0.2126, 0.0722), 9: (0.2627, 0.0593), 10: (0.2627, 0.0593)}
 _BT_601 = (0.299, 0.114)
 
@@ -146,8 +144,8 @@ def _to_bgr(colorspace: int, full_range: bool) -> np.ndarray:
 
 @functools.cache
 def _from_upright(turn: Orientation, width: int, height: int) -> np.ndarray:
-    """(2, 3) matrix from pixel centres of the upright picture to those of the stored one, `width` x `height`; not to be
-    written to."""
+    """(2, 3) matrix from pixel centres of the upright picture to those of the stored one, `width` x `height`; do not
+    modify it."""
     upright_width, upright_height = turn.size(width, height)
     x = [-1.0, 0.0, upright_width - 1.0] if turn.flip_x else [1.0, 0.0, 0.0]
     y = [0.0, -1.0, upright_height - 1.0] if turn.flip_y else [0.0, 1.0, 0.0]
@@ -161,15 +159,14 @@ def read_frames(
 
     Frame `index` has `time_s` equal to `probe(path).time_s[index]`, whatever `start` is. Decoding begins at the start
     of the file (frames count from there) and ends after the last frame asked for; only the frames asked for are
-    converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in whichever thread does so. At most
-    a few frames are in memory beside those that the caller keeps, and those of `kept.frames_kept`, which are not
-    decoded again.
+    converted to `image` (H, W, 3) uint8 BGR, each when its `image` is first read, in the thread that reads it. Only a
+    few frames are in memory besides those that the caller keeps, and those of `kept.frames_kept`, which are not decoded
+    again.
 
     Raises
     ------
     PblError
-        As `probe`. A file that lost its end raises VIDEO_TRUNCATED after the last frame that decodes, when the
-        reading gets there.
+        As `probe`. A file that lost its end raises VIDEO_TRUNCATED after the last frame that decodes.
     ValueError
         `start` negative or `step` below 1.
     """
@@ -179,18 +176,18 @@ def read_frames(
 
 
 class _ToBgr:
-    """Decoded picture to upright BGR. One converter per thread for the whole file: a new one per frame would set itself
-    up, with threads of its own, each time."""
+    """Converter of decoded pictures to upright BGR, one per thread for the whole file: a new one per frame would start
+    its threads each time."""
 
     def __init__(self) -> None:
         self._local = threading.local()
 
     def __call__(self, frame: av.VideoFrame, turn: Orientation) -> np.ndarray:
-        """The picture (H, W, 3); its rows may lie apart in memory, as those of a region of an array do."""
+        """Return the picture (H, W, 3); its rows may lie apart in memory, as those of a region of an array."""
         if not hasattr(self._local, "converter"):
             self._local.converter = VideoReformatter()
         plane = self._local.converter.reformat(frame, format="bgr24", threads=1).planes[0]
-        # The converter's own memory, which is new for each picture: a copy would cost more than the conversion.
+        # A view of the converter's memory, new for each picture: a copy would cost more than the conversion.
         rows = np.frombuffer(memoryview(plane), np.uint8).reshape(plane.height, plane.line_size)
         return turn.apply(rows[:, : 3 * plane.width].reshape(plane.height, plane.width, 3))
 

@@ -1,4 +1,4 @@
-"""Pictures to a video file that browsers play, each at its own time stamp."""
+"""Writing pictures to a video file that browsers play, each at its own time stamp."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ def write_h264(
     crf: int,
     tags: Mapping[str, str] | None = None,
 ) -> None:
-    """Write H.264 in MP4 with the given times. The index stands at the front, so that a browser starts at once.
+    """Write H.264 in MP4 with the given times. The index is at the front, so that a browser starts at once.
 
     Parameters
     ----------
     pictures
         Time (s) and picture (H, W, 3) uint8 BGR, upright, in order.
     size
-        Width and height (px). Colour has half the resolution where both are even, and the full one elsewhere, which
-        not every browser plays.
+        Width and height (px). Colour has half the resolution if both are even, otherwise the full one, which not every
+        browser plays.
     time_s : (T,)
-        Stamps of all pictures, rounded here to 1/90,000 s: how long each is shown.
+        Stamps of all pictures, rounded here to 1/90,000 s.
     crf
         x264's quality, 0 (lossless) to 51.
     tags
-        Metadata of the file, by name; beside them stands the name of the encoding library only.
+        Metadata of the file, by name; the only other one is the name of the encoding library.
     """
     ticks = np.rint(np.asarray(time_s, float) * _TICKS_PER_S).astype(np.int64)
     step = int(np.median(np.diff(ticks))) if len(ticks) > 1 else _TICKS_PER_S // 30

@@ -1,7 +1,7 @@
-"""The decoded pictures of one video in memory, so that probe, tracking and keypoints share one decoding.
+"""Decoded pictures of one video in memory, so that probe, tracking and keypoints share one decoding.
 
-Decoding costs as much as all that the three do beside the networks. Pictures are kept where `frames_kept` asks for it,
-and where those of the whole video fit into this process's share of the memory; longer videos are decoded each time.
+Decoding takes as long as all their other work outside the networks. Pictures are kept within `frames_kept` if those of
+the whole video fit into this process's share of the memory; longer videos are decoded each time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pbl_pipeline.resources import share_of_memory
 
 from .decode import Decoder
 
-#: Of the process's share of the memory, so much at most are pictures.
+#: Largest fraction of the process's share of the memory for pictures.
 _FRACTION = 1 / 8
 
 
@@ -32,7 +32,7 @@ class Pictures:
 
 
 class _Shelf:
-    """The last video that was read whole in this process, where pictures are to be kept."""
+    """The last video that was read whole in this process, while pictures are to be kept."""
 
     def __init__(self) -> None:
         self.wanted = 0
@@ -55,7 +55,7 @@ def frames_kept() -> Iterator[None]:
 
 
 def release_frames() -> None:
-    """Give the memory back; what is kept will not be read again."""
+    """Release the memory of the kept pictures."""
     _shelf.pictures = None
 
 
@@ -66,12 +66,12 @@ def kept(path: Path) -> Pictures | None:
 
 
 def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
-    """Hand on what a decoder yields, and keep it where that is wanted and the end is reached."""
+    """Yield the pictures of a decoder, and keep them if that is wanted and the end is reached."""
     release_frames()
     room = share_of_memory() * _FRACTION if _shelf.wanted else 0.0
     file, stamped = _identity(decoder.path), []
     for pts, frame in decoder:
-        # A picture that is decoded for others to be drawn from has its own memory, whoever else has it too.
+        # The memory of a reference picture counts in full, although the decoder also holds it.
         room -= sum(plane.buffer_size for plane in frame.planes)
         if room >= 0:
             stamped.append((pts, frame))

@@ -1,17 +1,15 @@
-"""Which lens of which phone recorded a video, and the calibration of one that serves all its recordings.
+"""The lens of the phone that recorded a video, and its calibration: measured, from the file, or published.
 
-A phone stores pictures as its sensor lies, however it is held, and states by the rotation flag how a player has to turn
-them. So a lens that was measured in portrait serves in landscape as well, turned by the difference of the two flags. It
-does not serve another size of the stored picture, another rate of frames or another focal length in the file: there the
-phone reads another part of its sensor, or zooms.
+A phone stores pictures as its sensor lies, however it is held; the rotation flag states how a player has to turn them.
+So a calibration measured in portrait also holds in landscape, turned by the difference of the two flags. It does not
+hold for another size of the stored picture, frame rate or focal length in the file: then the phone reads another part
+of its sensor, or zooms.
 
-Calibrations of known phones' main cameras, brought to the size and turn of a recording.
-
-The figures (`data/phone_cameras.json`, made by `research/phone_cameras.py`) hold for the upright portrait picture of
-video of 720 or 2160 lines. Video of 16:9 uses the full width of the sensor's longer side, so a recording of another
-size is taken as the same view scaled by its longer side, and one of another shape as cut (or widened) about the
-middle along the shorter side. How much a phone's own stabilisation crops is not published; it makes the focal length
-longer.
+The published calibrations of phones' main cameras (`data/phone_cameras.json`, made by `research/phone_cameras.py`) hold
+for the upright portrait picture of video of 720 or 2160 lines. Video of 16:9 uses the full width of the sensor's longer
+side, so a recording of another size is taken as the same view scaled by its longer side, and one of another shape as
+cropped (or widened) about the middle along the shorter side. The crop of a phone's stabilisation is not published; it
+makes the focal length longer.
 """
 
 from __future__ import annotations
@@ -35,24 +33,24 @@ from .camera import guess_camera, load_camera, scaled_matrix
 from .file_facts import probe
 from .types import Camera, FirstPicture, VideoInfo
 
-#: Standard deviation of a preset's focal length as a fraction of it. The two recording formats that are published of
-#: one phone differ by 1.2 % (iPhone 11) and 0.1 % (iPhone 12 Pro); the rest is for the crop of stabilised video, which
-#: the calibrated recordings did not have. The project's own estimate.
+#: Standard deviation of a preset's focal length as a fraction of it, our estimate. The two recording formats that are
+#: published of one phone differ by 1.2 % (iPhone 11) and 0.1 % (iPhone 12 Pro); the rest allows for the crop of
+#: stabilised video, which the calibrated recordings did not have.
 PRESET_REL_SD = 0.04
-#: Lenses shorter than this (mm, the glass itself) are front or ultra-wide cameras; the presets are of the main ones.
+#: Lenses of a shorter physical focal length (mm) are front or ultra-wide cameras; the presets are of main cameras.
 _SHORTEST_MAIN_MM = 3.0
 _nameless = functools.partial(
     PblError,
     "CAMERA_INVALID",
-    expected="a phone that is named: by the camera file of `pbl calibrate`, or by an original recording (--like)",
+    expected="the name of the phone, in the camera file of `pbl calibrate` or in an original recording (--like)",
     next_step="calibrate again with an original of the phone, pass --like RECORDING, or pass --camera with each "
     "video; converted copies lose the name",
 )
 
 
 def preset_camera(video: VideoInfo) -> Camera | None:
-    """The intrinsics published for the phone that `video.model` names (Apple's name or identifier); None where it is
-    not known, or where `video.lens` says that another than its main camera recorded."""
+    """Published intrinsics of the phone that `video.model` names (Apple's name or identifier); None if there are none,
+    or if `video.lens` is not its main camera."""
     known = presets()
     name = _plain(video.model)
     models = [m for m, n in known["names"].items() if name in (_plain(m), _plain(n))]
@@ -84,14 +82,14 @@ def preset_camera(video: VideoInfo) -> Camera | None:
 
 @functools.cache
 def presets() -> dict[str, Any]:
-    """The data file: `source`, `names` (identifier to name), `cameras`."""
+    """Content of the data file: `source`, `names` (identifier to name), `cameras`."""
     return json.loads((files("pbl_pipeline.video") / "data" / "phone_cameras.json").read_text(encoding="utf-8"))
 
 
 def quarter_turn(matrix: np.ndarray, distortion: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics (3, 3) and (5,) after the picture, `width` px wide, is turned counter-clockwise by 90 degrees.
 
-    A point (x, y) comes to (y, width - 1 - x); the tangential coefficients change places as the axes do.
+    A point (x, y) moves to (y, width - 1 - x); the tangential coefficients are swapped as the axes are.
     """
     k1, k2, p1, p2, k3 = distortion
     turned = np.array(
@@ -124,45 +122,41 @@ def _plain(text: str | None) -> str:
     return re.sub(r"\s+", " ", (text or "").strip()).casefold()
 
 
-#: Rates (1/s) at which phones read their sensor; a recording belongs to the nearest (24 and 25 to 30, 50 to 60).
+#: Rates (1/s) at which phones read their sensor; a recording has the nearest (24 and 25 to 30, 50 to 60).
 RATES = (30, 60, 120, 240)
-#: Figures of 35 mm film that differ by more (mm) are different lenses or zooms.
+#: Focal lengths on 35 mm film that differ by more (mm) are of different lenses or zooms.
 _SAME_FOCAL_MM = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class PhoneLens:
-    """A lens as its recordings name it.
+    """A lens as its recordings describe it."""
 
-    make, model, lens: texts of the file, "" where it has none. stored_px: width and height before the rotation flag is
-    applied. rate: the nearest of `RATES`. focal_35mm: of the same view on 35 mm film (mm), None if not stated.
-    """
-
-    make: str
+    make: str  # these three: texts of the file, "" if it has none
     model: str
     lens: str
-    stored_px: tuple[int, int]
-    rate: int
-    focal_35mm: float | None = None
+    stored_px: tuple[int, int]  # width and height before the rotation flag is applied
+    rate: int  # the nearest of `RATES`
+    focal_35mm: float | None = None  # focal length (mm) of the same view on 35 mm film, None if not stated
 
     def same_focal(self, focal_35mm: float | None) -> bool:
-        """Whether this figure is not another than the lens's; one that is not known is none."""
+        """True if the focal length agrees with the lens's, or one of the two is not known."""
         known = self.focal_35mm is not None and focal_35mm is not None
         return not known or abs(self.focal_35mm - focal_35mm) <= _SAME_FOCAL_MM  # type: ignore[operator]
 
     @property
     def name(self) -> str:
-        """Make, model and lens; phones begin the lens's name with the model."""
+        """Make, model and lens; the model is left out if the lens's name begins with it."""
         model = "" if self.lens.startswith(self.model) else self.model
         return " ".join(n for n in (self.make, model, self.lens) if n)
 
     def text(self) -> str:
-        """In words."""
+        """Description in words."""
         return f"{self.name}, {self.stored_px[0]}x{self.stored_px[1]} px as stored, about {self.rate} frames a second"
 
 
 def phone_lens(video: VideoInfo) -> PhoneLens | None:
-    """The lens that recorded a probed video; None where the file names no model, or has no rate of frames."""
+    """Return the lens that recorded a probed video; None if the file names no model, or has no frame rate."""
     rate = video.capture_fps or video.fps
     if not video.model or not math.isfinite(rate) or rate <= 0:
         return None
@@ -172,7 +166,7 @@ def phone_lens(video: VideoInfo) -> PhoneLens | None:
 
 
 def turned_camera(camera: Camera, size_px: tuple[int, int], turn_deg: int) -> Camera:
-    """The intrinsics after the picture of `size_px` (width, height) is turned clockwise by 0, 90, 180 or 270 deg."""
+    """Intrinsics after turning the picture of `size_px` (width, height) clockwise by 0, 90, 180 or 270 deg."""
     matrix, distortion, (width, height) = camera.matrix, camera.distortion, size_px
     for _ in range(-turn_deg // 90 % 4):  # counter-clockwise
         matrix, distortion = quarter_turn(matrix, distortion, width)
@@ -182,23 +176,22 @@ def turned_camera(camera: Camera, size_px: tuple[int, int], turn_deg: int) -> Ca
 
 @dataclasses.dataclass(frozen=True)
 class LensCalibration:
-    """A calibration of a phone's lens: `camera` for the upright picture of `size_px` (width, height), which was stored
-    turned by `rotation_deg` (the flag of the calibration video)."""
+    """A calibration of a phone's lens."""
 
     lens: PhoneLens
-    camera: Camera
-    size_px: tuple[int, int]
-    rotation_deg: int
+    camera: Camera  # for the upright picture
+    size_px: tuple[int, int]  # width and height of the upright picture
+    rotation_deg: int  # rotation flag of the calibration video
 
 
 def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> LensCalibration:
-    """A camera file together with the phone that it is of.
+    """Read a camera file and the phone that it belongs to.
 
-    The phone stands in a file of `pbl calibrate`; of another file it is that of the recording `like`, whose upright
-    picture the calibration then must be of.
+    A file of `pbl calibrate` names the phone; for another file it is that of the recording `like`, whose upright
+    picture must then be the calibrated one.
 
-    Raises `PblError` CAMERA_INVALID: what `load_camera` refuses, and a file or recording that does not name the phone's
-    model. The VIDEO_ codes.
+    Raises `PblError` CAMERA_INVALID: as `load_camera`, and a file or recording that does not name the phone's model.
+    The VIDEO_ codes.
     """
     path = Path(path)
     if like is not None:
@@ -213,13 +206,13 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
 
 
 def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Camera:
-    """The intrinsics in a calibration file, for the upright picture of a video.
+    """Return the intrinsics in a calibration file, for the upright picture of a video.
 
-    Where the file says how the phone was held (`pbl calibrate` does) and the video is of the other format, they are
-    turned by the difference of the two rotation flags. What does not fit without being turned is else refused.
+    If the file states the rotation flag (`pbl calibrate` does) and the video has the other format (portrait,
+    landscape), they are turned by the difference of the two flags; otherwise the other format is refused.
 
     Raises `PblError` CAMERA_INVALID: as `load_camera`, and a calibration of another phone, lens or zoom than the
-    video's; what one of them does not say is no difference.
+    video's, where both state it.
     """
     content = _content(Path(file))
     _check_same_phone(content, video)
@@ -232,8 +225,8 @@ def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Came
 
 
 def _turn_between(content: Mapping[str, Any], video: VideoInfo | FirstPicture) -> int:
-    """How far (deg, clockwise) the calibrated picture has to be turned to be the video's. Flags that differ by a
-    quarter in pictures of one format are those of a copy whose pictures were turned."""
+    """Angle (deg, clockwise) from the calibrated picture to the video's. Flags that differ by a quarter turn in
+    pictures of one format are those of a copy whose pictures were turned."""
     filmed, size = content.get("video"), content.get("image_size_px")
     measured = filmed.get("rotation_deg") if isinstance(filmed, Mapping) else None
     if measured not in (0, 90, 180, 270) or not _whole(size):
@@ -270,7 +263,7 @@ def _check_same_phone(content: Mapping[str, Any], video: VideoInfo | FirstPictur
 
 
 def about_phone(video: VideoInfo) -> dict[str, Any]:
-    """What a camera file says of the video that it was measured with, for `load_lens_calibration`."""
+    """Fields of a camera file about the video that it was measured with, for `load_lens_calibration`."""
     lens = phone_lens(video)
     return {
         "video": {"name": Path(video.path).name, "sha256": video.sha256, "rotation_deg": video.rotation_deg},
@@ -288,7 +281,7 @@ def about_phone(video: VideoInfo) -> dict[str, Any]:
 def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
     content = _content(path)
     if not content:
-        load_camera(path, (1, 1))  # says what is wrong with it, unless it is a TOML
+        load_camera(path, (1, 1))  # raises the error, unless it is a TOML
         raise _nameless("a camera file that names no phone", key=path)
     phone, video = content.get("phone"), content.get("video")
     if not isinstance(phone, Mapping) or not isinstance(video, Mapping) or not phone.get("model"):
@@ -296,7 +289,7 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
     rate, rotation, focal = phone.get("rate"), video.get("rotation_deg"), phone.get("focal_35mm")
     size = content.get("image_size_px")
     if rate not in RATES or rotation not in (0, 90, 180, 270) or not _whole(size):
-        raise _nameless("a camera file without the phone's rate of frames, rotation flag or size", key=path)
+        raise _nameless("a camera file without the phone's frame rate, rotation flag or size", key=path)
     names = [str(phone.get(n) or "") for n in ("make", "model", "lens")]
     width, height = int(size[0]), int(size[1])  # type: ignore[index]
     stored = _stored(width, height, rotation)
@@ -305,7 +298,7 @@ def _read(path: Path) -> tuple[PhoneLens, tuple[int, int], int]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """The fields of a JSON file; none where it is no such file."""
+    """Fields of a JSON file; empty if it is not one."""
     try:
         content = read_json(path)
     except (OSError, ValueError):
@@ -319,17 +312,17 @@ def _stored(width: int, height: int, rotation_deg: int) -> tuple[int, int]:
 
 #: 35 mm film: width and diagonal of its frame (mm).
 _FILM_WIDTH_MM, _FILM_DIAGONAL_MM = 36.0, math.hypot(36.0, 24.0)
-#: Standard deviation of a focal length from the file's 35 mm figure, as a fraction of it: 2.3 % for the two readings of
-#: such a figure, 1.1 % for its rounding to whole millimetres, and room for a crop that it does not count. Of an iPhone
-#: 13 the figure is 27 mm, from which comes 0.733 of the longer side; its published calibration has 0.732.
+#: Standard deviation of a focal length from the file's 35 mm equivalent, as a fraction of it: 2.3 % for its two
+#: definitions, 1.1 % for its rounding to whole millimetres, and an allowance for a crop that it does not include. Of an
+#: iPhone 13 it is 27 mm, that is 0.733 of the longer side; its published calibration has 0.732.
 METADATA_REL_SD = 0.03
 
 
 def find_camera(video: VideoInfo, file: str | Path | None = None) -> Camera:
-    """The best known intrinsics of a probed video; `source` says whose they are.
+    """Return the best known intrinsics of a probed video; `source` states their origin.
 
     In this order: the calibration `file`; the focal length that the phone wrote into the video; the published
-    calibration of a phone of that model; a typical phone's (`guess_camera`).
+    calibration of that model; a typical phone's (`guess_camera`).
 
     Raises `PblError` CAMERA_INVALID for a calibration that cannot be used (`calibrated_camera`).
     """
@@ -339,12 +332,11 @@ def find_camera(video: VideoInfo, file: str | Path | None = None) -> Camera:
 
 
 def metadata_camera(video: VideoInfo) -> Camera | None:
-    """Intrinsics from the figure of 35 mm film in the file (`focal_35mm`); None where it has none that can be.
+    """Intrinsics from the file's focal length on 35 mm film (`focal_35mm`); None if it is missing or implausible.
 
-    Two readings of such figures are in use: as long as a lens that gives the same view along the diagonal (CIPA
-    DCG-001), or along the longer side. In a picture of 16:9 the second is 5 % longer; their geometric mean is taken.
-    The distortion is that of the phone's published calibration, where it has one whose focal length agrees: then it is
-    the same lens, not zoomed. Else it is zero.
+    Two definitions are in use: the same angle of view along the diagonal (CIPA DCG-001), or along the longer side. In a
+    picture of 16:9 the second is 5 % longer; their geometric mean is taken. The distortion is that of the phone's
+    published calibration if its focal length agrees: then it is the same lens, not zoomed. Otherwise it is zero.
     """
     if video.focal_35mm is None or not 5 <= video.focal_35mm <= 500:
         return None

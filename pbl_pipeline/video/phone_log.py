@@ -1,7 +1,7 @@
-"""The sensor log of a phone that filmed: orientation, and what else it measured, as a recording app wrote it.
+"""Sensor log of a phone that filmed: orientation and other sensors, as a recording app wrote them.
 
-Here are the two forms of the project's own (CSV, JSON; docs/phone_capture.md). Nothing is turned or shifted:
-`load_attitude` brings a log to a video.
+This module reads our two formats (CSV, JSON; docs/phone_capture.md). Nothing is turned or shifted: `load_attitude`
+brings a log to a video.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pbl_pipeline.errors import os_errors_as
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
-#: Clocks of a log: the video's own; nearly that, so that the pictures decide; UTC (`start_utc_s` is known); its own,
+#: Clocks of a log: the video's; nearly the video's, so that the pictures decide; UTC (`start_utc_s` is known); another,
 #: begun some time before the video.
 VIDEO_CLOCK, PICTURES_CLOCK, UTC_CLOCK, OWN_CLOCK = "video", "pictures", "utc", "own"
 QUATERNION = ("qw", "qx", "qy", "qz")
@@ -48,24 +48,18 @@ class Sensor:
 
 @dataclasses.dataclass(frozen=True)
 class PhoneLog:
-    """A log as written; times are seconds of `clock`.
+    """A log as written, checked by `check_attitude`."""
 
-    time_s, quat_wxyz: (P,), (P, 4) checked by `check_attitude`, from `frame` ("camera", "device") to a world with z up.
-    rotation_deg: how far the phone was turned clockwise from portrait, None where the log does not say. start_utc_s:
-    seconds from 1970 to time 0, None where not known. sensors: those of `SENSORS` that are there, and "gravity".
-    form: which format it was. notes: what was left out in reading.
-    """
-
-    time_s: np.ndarray
-    quat_wxyz: np.ndarray
-    frame: str
-    rotation_deg: float | None
+    time_s: np.ndarray  # (P,) seconds of `clock`
+    quat_wxyz: np.ndarray  # (P, 4) from `frame` to a world with z up
+    frame: str  # "camera" or "device"
+    rotation_deg: float | None  # clockwise turn of the phone from portrait, None if not stated
     clock: str
-    start_utc_s: float | None
-    sensors: Mapping[str, Sensor]
-    form: str
+    start_utc_s: float | None  # seconds from 1970 to time 0, None if not known
+    sensors: Mapping[str, Sensor]  # those of `SENSORS` that the log has, and "gravity"
+    form: str  # name of the format
     device: str = ""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # on omitted rows
 
     @property
     def rate_hz(self) -> float:
@@ -74,8 +68,7 @@ class PhoneLog:
 
 
 def read_own_form(path: Path) -> PhoneLog:
-    """Read a log in one of the project's own forms, by what its text begins with. Raises `PblError` FILE_MISSING,
-    PHONE_LOG."""
+    """Read a log in one of our formats, known by its first character. Raises `PblError` FILE_MISSING, PHONE_LOG."""
     text = read_text(path)
     is_json = text[:1000].lstrip()[:1] in ("{", "[")
     return _read_json(path, text) if is_json else _read_csv(path, text)
@@ -95,8 +88,8 @@ def read_text(path: Path) -> str:
 
 
 def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str], list[dict[str, str | None]]]:
-    """Column names of a CSV text and its rows, of which the `wanted` columns are kept; empty lines and lines that start
-    with # left out. Raises PHONE_LOG."""
+    """Column names of a CSV text and the `wanted` columns of its rows, without empty lines and lines that start with #.
+    Raises `PblError` PHONE_LOG."""
     rows = csv.reader((t for t in io.StringIO(text, newline=None) if t.strip() and t[0] != "#"), skipinitialspace=True)
     try:
         bounded.count_rows(max(text.count("\n"), text.count("\r")))
@@ -104,7 +97,7 @@ def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str
         kept = [(i, n) for i, n in enumerate(names) if n in wanted]
         table = [{n: row[i] if i < len(row) else None for i, n in kept} for row in rows if row]
     except (csv.Error, ValueError) as error:
-        raise log_error(f"no CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), key=path) from error
+        raise log_error(f"not CSV ({error})", "CSV with the columns " + ", ".join(_COLUMNS), key=path) from error
     return names, table
 
 
@@ -116,7 +109,6 @@ def numbers(path: Path, table: Sequence[Mapping[str, Any]], name: str) -> np.nda
         raise log_error(f"column {name}: {error}", "a number in each row", key=path) from error
 
 
-# -------------------------------------------------------------------------------------------------- the project's own
 def _read_csv(path: Path, text: str) -> PhoneLog:
     axes = {axis for columns, _ in SENSORS.values() for axis in columns}
     names, table = read_table(path, text, {*_COLUMNS, *_SETTINGS, *axes})
@@ -143,7 +135,7 @@ def _read_json(path: Path, text: str) -> PhoneLog:
     try:
         content = bounded.parse_json(text)
     except ValueError as error:
-        raise log_error(f"no JSON ({error})", "an object with " + ", ".join(_COLUMNS), key=path) from error
+        raise log_error(f"not JSON ({error})", "an object with " + ", ".join(_COLUMNS), key=path) from error
     if not isinstance(content, dict):
         raise log_error("JSON that is not an object", "an object with " + ", ".join(_COLUMNS), key=path)
     orientation = content.get("orientation", content)
@@ -220,7 +212,7 @@ def _frame(path: Path, settings: Mapping[str, object]) -> tuple[str, float | Non
 
 
 def _utc(path: Path, value: object) -> float | None:
-    """Seconds since 1970 of a time with its zone ("2026-03-01T09:15:30.250Z"). A time without one says too little."""
+    """Seconds since 1970 of a time with its zone ("2026-03-01T09:15:30.250Z"); the zone is required."""
     if value is None:
         return None
     try:

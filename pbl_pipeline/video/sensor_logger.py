@@ -2,9 +2,9 @@
 
 By its documentation (github.com/tszheichoi/awesome-sensor-logger: README, UNITS, COORDINATES) `time` is UTC in
 nanoseconds since 1970, `seconds_elapsed` counts from the tap on Record, values are in m/s^2, rad/s and uT, and rows may
-be repeated. The quaternion is the system's own (Android's rotation vector, iOS' CMAttitude), both of which turn the
-device's axes into a world with z up. That it does can be seen in each file: the last row of its matrix holds the sine
-of `pitch`, which Android counts the other way. A file in which it does not is refused.
+be repeated. The quaternion is the system's (Android's rotation vector, iOS' CMAttitude), both from the device's axes to
+a world with z up. Each file is checked for it: the last row of the rotation matrix holds the sine of `pitch`, which
+Android counts the other way. Otherwise the file is refused.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from .attitude import DEVICE, check_attitude, log_error
 from .phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_own_form, read_table, read_text
 
 _ORIENTATION = "Orientation"
-#: Names of its sensors -> ours. "Accelerometer" there is without gravity, which our schema's is with.
+#: Names of its sensors -> ours. Its "Accelerometer" is without gravity, ours with it.
 _SENSORS = {
     "TotalAcceleration": "accelerometer",
     "Gravity": "gravity",
     "Gyroscope": "gyroscope",
     "Magnetometer": "magnetometer",
 }
-#: Repeated rows are left out; more than this fraction, and the stamps are not to be trusted.
+#: Repeated rows are omitted; with more than this fraction the stamps cannot be trusted.
 _MOST_REPEATS = 0.1
-#: How far the sine of the stated pitch may lie from the quaternion's.
+#: Largest difference between the sines of the stated pitch and of the quaternion's.
 _PITCH_TOL = 0.05
-#: Stamps before this (s since 1970; 2015) are of a clock that does not know the date.
+#: Stamps before this (s since 1970; 2015) are of a clock that was not set.
 _EARLIEST_UTC_S = 1.42e9
 
 #: The columns that are read of any sensor.
@@ -44,7 +44,7 @@ _Rows = Sequence[Mapping[str, Any]]
 
 
 def is_sensor_logger(path: Path) -> bool:
-    """Whether this looks like such an export: a folder, an archive, or a file with its names at the beginning."""
+    """True for a folder, an archive, and a file that begins with the names of such an export."""
     if path.is_dir() or path.suffix.lower() == ".zip":
         return True
     try:
@@ -83,7 +83,7 @@ def read_sensor_logger(path: Path) -> PhoneLog:
 
 
 def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
-    """A function from a sensor's name to its rows (empty where there are none), and the form."""
+    """Return a function from a sensor's name to its rows (empty if there are none), and the name of the format."""
     if path.is_dir():
         return lambda name: _csv(path, _member(path, name)), "folder"
     if path.suffix.lower() == ".zip":
@@ -93,7 +93,7 @@ def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
         try:
             content = bounded.parse_json(text)
         except ValueError as error:
-            raise log_error(f"no JSON ({error})", "a list of rows, as Sensor Logger exports it", key=path) from error
+            raise log_error(f"not JSON ({error})", "a list of rows, as Sensor Logger exports it", key=path) from error
         rows = [r for r in content if isinstance(r, dict)]
         return lambda name: [r for r in rows if r.get("sensor") == name], "JSON"
     return lambda name: _csv(path, text) if name == _ORIENTATION else [], "CSV"
@@ -118,12 +118,12 @@ def _unzipped(path: Path, name: str) -> str | None:
             )
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
-            read_text(path)  # says so
+            read_text(path)  # raises the error
         raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", key=path) from error
 
 
 def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
-    """First stamp (ns), times (s) after it, and the rows they belong to, repeats left out."""
+    """First stamp (ns), times (s) after it, and their rows, without repeats."""
     try:
         ns = np.array([int(str(row["time"]).split(".")[0]) for row in rows], np.int64)
     except (KeyError, ValueError, OverflowError) as error:
@@ -132,7 +132,7 @@ def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
     n = int((~kept).sum())
     if n > _MOST_REPEATS * len(ns):
         raise log_error(f"{n} of {len(ns)} stamps repeat the one before", "a different stamp for each sample", key=path)
-    notes = [f"{n} repeated rows were left out"] if n else []
+    notes = [f"{n} repeated rows were omitted"] if n else []
     rows = [row for row, keep in zip(rows, kept, strict=True) if keep]
     return int(ns[0]), (ns[kept] - ns[0]) / 1e9, rows, notes
 
@@ -153,16 +153,16 @@ def _check_pitch(path: Path, rows: _Rows, quat_wxyz: np.ndarray) -> None:
 
 #: Latest time in a log (s), on whichever clock.
 _LATEST_S = 1e10
-#: An accelerometer shows gravity where its typical length (m/s^2) lies in this range; it then must agree with the log's
-#: way up within this angle.
+#: An accelerometer shows gravity if its median length (m/s^2) is in this range; its direction must then agree with the
+#: log's vertical within this angle.
 _GRAVITY, _MOST_TILT_DEG = (8.8, 10.8), 25.0
 
 
 def read_phone_log(path: str | Path) -> PhoneLog:
-    """Read a log in one of the forms of docs/phone_capture.md; what it is follows from its content.
+    """Read a log in one of the formats of docs/phone_capture.md, which is found by its content.
 
-    Raises `PblError` FILE_MISSING: no such file. PHONE_LOG: none of the forms, a field missing, what `check_attitude`
-    refuses, an unknown frame, sensors whose gravity contradicts the orientation.
+    Raises `PblError` FILE_MISSING: no such file. PHONE_LOG: none of the formats, a field missing, as `check_attitude`,
+    an unknown frame, sensors whose gravity contradicts the orientation.
     """
     path = Path(path)
     log = read_sensor_logger(path) if is_sensor_logger(path) else read_own_form(path)
@@ -176,8 +176,8 @@ def read_phone_log(path: str | Path) -> PhoneLog:
 
 
 def _check_gravity(path: Path, log: PhoneLog) -> None:
-    """Compare the way up of the orientation with that of the accelerometer. Android counts it upwards, iOS downwards,
-    so the line counts. It tells a wrong frame from a right one; heading it does not see."""
+    """Compare the vertical of the orientation with that of the accelerometer, up to sign (Android counts it upwards,
+    iOS downwards). This detects a wrong frame, not a wrong heading."""
     sensor = log.sensors.get("gravity") or log.sensors.get("accelerometer")
     if sensor is None or log.frame != DEVICE or len(sensor.time_s) < 2:
         return

@@ -1,4 +1,4 @@
-"""What is known of a video file, one decoded frame, and regions of it."""
+"""Types of a video file: its facts, one decoded frame and regions of it, and the intrinsics of its camera."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import numpy as np
 
 
 def cut_image(image: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """`Frame.cut` of a picture (H, W, 3) uint8 that is converted already."""
+    """`Frame.cut` of a converted picture (H, W, 3) uint8."""
     return cut_samples(image, matrix, size_px, 0.0)
 
 
 def cut_samples(samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], border: float) -> np.ndarray:
-    """Bilinear, after averaging blocks of 2^n x 2^n samples where the region's pixels lie that far apart: a pixel that
-    stands for fifty and shows one of them would flicker."""
+    """Bilinear interpolation, after averaging blocks of 2^n x 2^n samples if the region's pixels lie that far apart:
+    otherwise the region would flicker."""
     (a, b, _), (c, d, _) = matrix.tolist()
     block = 1 << max(0, math.floor(math.log2(max(math.sqrt(abs(a * d - b * c)), 1.0))))
     if block > 1:
         samples, left, top = _needed(samples, matrix, size_px, block)
-        if not samples.size:  # the region lies beyond the picture: any place there will do
+        if not samples.size:  # the region lies beyond the picture
             samples = np.full((block, block, *samples.shape[2:]), border, samples.dtype)
         down, right = (-n % block for n in samples.shape[:2])
-        if down or right:  # the last block is not whole
+        if down or right:  # the last block is incomplete
             samples = cv2.copyMakeBorder(samples, 0, down, 0, right, cv2.BORDER_REPLICATE)
         size = samples.shape[1] // block, samples.shape[0] // block
         samples = cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
@@ -38,7 +38,7 @@ def cut_samples(samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int
 def _needed(
     samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], block: int
 ) -> tuple[np.ndarray, int, int]:
-    """The samples around the region, in whole blocks, and where they begin (x, y)."""
+    """The samples around the region, in whole blocks, and their first column and row."""
     width, height = size_px
     corners = matrix @ np.array([[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1], [1, 1, 1, 1]])
     left, top = (max(math.floor(n / block - 1) * block, 0) for n in corners.min(axis=1).tolist())
@@ -48,12 +48,12 @@ def _needed(
 
 @functools.cache
 def coarser(x: int, y: int) -> np.ndarray:
-    """(2, 3) matrix from pixel centres to the centres of blocks of x by y of them; not to be written to."""
+    """(2, 3) matrix from pixel centres to the centres of blocks of x by y of them; do not modify it."""
     return np.array([[1 / x, 0.0, (1 / x - 1) / 2], [0.0, 1 / y, (1 / y - 1) / 2]])
 
 
 def square(matrix: np.ndarray) -> np.ndarray:
-    """A matrix (2, 3) as one (3, 3) that others can follow."""
+    """A matrix (2, 3) as a homogeneous one (3, 3)."""
     out = np.eye(3)
     out[:2] = matrix
     return out
@@ -61,7 +61,7 @@ def square(matrix: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class FirstPicture:
-    """What a video says of its pictures and its phone without being decoded further; fields as in `VideoInfo`."""
+    """Facts of a video that are known from its first picture; fields as in `VideoInfo`."""
 
     path: str
     width_px: int
@@ -75,34 +75,34 @@ class FirstPicture:
 
 @dataclasses.dataclass(frozen=True)
 class VideoInfo:
-    """A probed video. Sizes are after the rotation flag is applied: what a person sees when it plays.
+    """A probed video. Sizes are after the rotation flag is applied, as it plays.
 
     Attributes
     ----------
     time_s : (T,) float64
         Presentation time of each frame that decodes, from the container's own stamps, first frame at 0.
     fps
-        1 / median frame interval; a description only: no computation may use it instead of `time_s`.
+        1 / median frame interval; for display only: computations use `time_s`.
     n_frames_announced
-        What the container's header claims (0 when it says nothing). What decodes counts.
+        Number of frames in the container's header (0 if not stated). Only decoded frames count.
     rotation_deg
-        How far the stored picture is turned clockwise to stand upright: 0, 90, 180 or 270.
+        Clockwise rotation of the stored picture to stand upright: 0, 90, 180 or 270.
     duration_s
         From the first frame to the end of the last (its length taken as the median interval); NaN for a single frame
         whose container announces no rate, as is `fps`.
     variable_frame_rate
-        True when an interval differs from the median by more than a tenth and more than the stamps' own rounding.
+        True if an interval differs from the median by more than a tenth and more than the rounding of the stamps.
     recorded_utc
-        "2026-01-31T09:15:00Z", or None when the file does not say.
+        "2026-01-31T09:15:00Z", or None if not stated.
     make, model, lens
         As the phone wrote them, or None: "Apple", "iPhone 13", "iPhone 13 back dual wide camera 5.1mm f/1.6".
     focal_35mm
         Focal length (mm) of the same view on 35 mm film, or None.
     capture_fps
-        Frames per second at which the phone says it recorded, or None. Where it is above `fps`, playing is slower than
-        the movement was, and so are the stamps.
+        Frames per second at which the phone recorded, or None if not stated. Above `fps` for slow motion, whose stamps
+        are slower than the movement.
     notes
-        What a reader should know and no field says: frames an edit list hides, stamps that repeat, a mirrored picture.
+        Remarks for the reader: frames hidden by an edit list, repeated stamps, a mirrored picture.
     """
 
     path: str
@@ -132,8 +132,8 @@ class VideoInfo:
 class Frame:
     """One decoded frame. `image` (H, W, 3) uint8, channels BGR (OpenCV's order), upright.
 
-    The picture is converted when it is first asked for: who looks at every tenth frame pays for every tenth. Who looks
-    at one region only takes `cut`, which converts no more than that. Not to be asked by two threads at once.
+    The picture is converted at the first access, so frames that are not used cost nothing; `cut` converts one region
+    only. Not safe for use by two threads at once.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class Frame:
     def image(self) -> np.ndarray:
         assert self._convert is not None
         image = self._convert()
-        self._convert = self._cut = None  # lets go of the decoder's own picture
+        self._convert = self._cut = None  # releases the decoder's picture
         return image
 
     @property
@@ -165,13 +165,13 @@ class Frame:
         """A region of the upright picture, (height, width, 3) uint8 BGR for `size_px` = (width, height).
 
         `matrix` (2, 3) sends pixel centres of the region (0, 0 is the first) to pixel centres of the picture. Pixels
-        that lie far apart there show the mean of what is between them. Black beyond the picture.
+        that lie far apart there show the mean of the pixels between them. Black beyond the picture.
         """
         region = self._cut(matrix, size_px) if self._cut is not None else None
         return cut_image(self.image, matrix, size_px) if region is None else region
 
 
-#: Kinds of sources of intrinsics, the best known first; `other` where a source names none of them.
+#: Kinds of sources of intrinsics, the most accurate first; `other` if a source names none of them.
 CAMERA_KINDS = ("file", "measured", "metadata", "preset", "guess", "other")
 
 
@@ -179,9 +179,9 @@ CAMERA_KINDS = ("file", "measured", "metadata", "preset", "guess", "other")
 class Camera:
     """Intrinsics of the upright frame: `matrix` (3, 3) in px, `distortion` (5,) OpenCV order k1 k2 p1 p2 k3.
 
-    `source` says where they come from, its first word is the `kind`: "file" and "measured" (a calibration), "metadata"
-    (what the phone wrote into the video), "preset" (a phone of that model), "guess". `focal_rel_sd`: standard deviation
-    of the focal length as a fraction of it, NaN where nothing is known of it.
+    `source` states their origin, its first word is the `kind`: "file" and "measured" (a calibration), "metadata" (the
+    phone's entry in the video), "preset" (a phone of that model), "guess". `focal_rel_sd`: standard deviation of the
+    focal length as a fraction of it, NaN if not known.
     """
 
     matrix: np.ndarray
@@ -191,13 +191,13 @@ class Camera:
 
     @property
     def kind(self) -> str:
-        """Kind of the source, one of `CAMERA_KINDS`: files keep it as the first word of `source`."""
+        """Kind of the source, one of `CAMERA_KINDS`: files store it as the first word of `source`."""
         word = self.source.partition(":")[0]
         return word if word in CAMERA_KINDS else "other"
 
     @property
     def calibrated(self) -> bool:
-        """Whether the intrinsics were measured with this camera."""
+        """True if the intrinsics were measured with this camera."""
         return self.kind in ("file", "measured")
 
     @property

@@ -1,4 +1,4 @@
-"""A visit with everything that was computed of it, and its folder of files.
+"""A visit with all its results, and its folder of files.
 
 `pipeline.run_visit` makes a `Visit` from videos, `load_visit` reads it from its folder, and `schemas.load_visit` from
 the tables. Report, overlay, exports and web pages take a `Visit` and compute nothing themselves.
@@ -6,7 +6,6 @@ the tables. Report, overlay, exports and web pages take a `Visit` and compute no
 
 from .files import (
     FIT,
-    KINETICS,
     METRICS,
     OVERLAY,
     REPORT,
@@ -21,4 +20,4 @@ from .files import (
     visit_facts,
     visit_of_fits,
 )
-from .types import Held, Recording, Solution, Visit, stage_checks
+from .types import Held, Recording, Solution, Visit

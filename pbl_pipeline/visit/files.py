@@ -1,4 +1,4 @@
-"""How a visit lies in a folder: the one place that knows its files (docs/files.md)."""
+"""Files of a visit in a folder; no other module knows their names (docs/files.md)."""
 
 from __future__ import annotations
 
@@ -114,11 +114,11 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
 
 
 def load_visit(folder: Path, *, measures: bool = True) -> Visit:
-    """Read the visit that `save_visit` wrote. Arrays are loaded when they are asked for; `lacks` names what is missing.
+    """Read a visit written by `save_visit`. Arrays are loaded on access; `lacks` names missing files.
 
-    `measures`: also those of its metrics.json. A folder without a session.json, which is written last, is that of a run
-    that was ended: its fits are read. Raises `PblError` FILE_MISSING where there are none either, FILE_FORMAT for
-    content that `save_visit` did not write.
+    `measures`: also read metrics.json. A folder without session.json, which is written last, is that of an interrupted
+    run: its fits are read. Raises `PblError` FILE_MISSING if there are no fits either, FILE_FORMAT for content that
+    `save_visit` did not write.
     """
     path = folder / SESSION
     found = [] if path.is_file() else [name_of_fit(fit) for fit in sorted(folder.glob(f"*.{FIT}"))]
@@ -148,11 +148,11 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
 
 
 def visit_of_fits(paths: Sequence[Path], *, markers: MarkerSet | None = None, measures: bool = True) -> Visit:
-    """Return the visit of these fit.npz files, loaded, with what lies beside them where it is of these fits.
+    """Return the visit of these fit.npz files, loaded, with the other files in their folders that belong to them.
 
-    Of several folders, or of some of a folder's fits, each recording has its own measures, and there are none over
-    all of them; of several folders the facts of the visit are also unknown. `markers`: the lab's own table, of which
-    the fits are. Raises as `load_visit`, and as `TrialFit.load`.
+    With several folders, or some of a folder's fits, each recording has its own measures, but there are none over all
+    of them; with several folders the facts of the visit are also unknown. `markers`: the lab's own marker table of
+    these fits. Raises as `load_visit`, and as `TrialFit.load`.
     """
     folders = {p.parent: None for p in paths}
     known = {f: load_visit(f, measures=measures) for f in folders if (f / SESSION).is_file()}
@@ -197,7 +197,7 @@ def _save_recording(recording: Recording, folder: Path) -> list[Path]:
 
 
 def save_beside(measured: Sequence[TrialMetrics], fits: Sequence[Path], metrics: Path) -> None:
-    """Write events and cycles that belong to a metrics.json, for those of the fits that it is written beside."""
+    """Write the events and cycles of those fits that are in the folder of a metrics.json."""
     for trial, path in zip(measured, fits, strict=True):
         if path.name == f"{trial.name}.{FIT}" and path.resolve().parent == metrics.resolve().parent:
             _save_measured(trial, metrics.parent, trial.name)
@@ -219,7 +219,7 @@ def _file(folder: Path, name: str, end: str) -> Path:
 
 
 def recording_facts(recording: Recording) -> dict[str, Any]:
-    """Return what session.json holds of a recording: facts, no arrays, and of its path the file's name alone."""
+    """Return the content of session.json about a recording: facts without arrays, and only the name of its file."""
     video, choice = recording.video, recording.choice
     facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None, "choice": None}
     facts["condition"] = dataclasses.asdict(recording.condition)
@@ -241,22 +241,22 @@ def _json(value: Any) -> Any:
 
 
 def _known(value: float) -> float | None:
-    """Return the number for JSON; None where it is NaN."""
+    """Return the number for JSON; None for NaN."""
     return round(float(value), 4) if math.isfinite(value) else None
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
 @contextlib.contextmanager
 def file_of_visit(path: Path, again: str = _AGAIN) -> Iterator[None]:
-    """Turn what reading a file of a visit raises into a `PblError` FILE_FORMAT. `again`: what writes the file."""
+    """Turn errors of reading a file of a visit into `PblError` FILE_FORMAT. `again`: how to write the file again."""
     try:
         yield
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise PblError(
             "FILE_FORMAT",
             found=f"{type(error).__name__}: {error}",
-            expected=f"the {path.name} that `pbl run` or `pbl fit` wrote with the files beside it",
-            next_step=f"{again}; or move the file away: then what it holds is not known",
+            expected=f"the {path.name} that `pbl run` or `pbl fit` wrote with the other files of its folder",
+            next_step=f"{again}; or move the file away: then its content is not known",
             key=str(path),
         ) from error
 
@@ -280,7 +280,7 @@ def _read(path: Path, again: str = _AGAIN) -> dict[str, Any]:
 
 
 def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
-    """Return a fitted recording from its files; `facts`: what session.json holds of it."""
+    """Return a fitted recording from its files and its `facts` in session.json."""
     name = name_of_fit(fit)
     points = fit.with_name(f"{name}.{KEYPOINTS}")
     return Recording(
@@ -292,7 +292,7 @@ def _recording(fit: Path, facts: Mapping[str, Any]) -> Recording:
 
 
 def _told(facts: Mapping[str, Any], points: Path | None) -> dict[str, Any]:
-    """Return the fields of a recording that session.json holds; `points`: file of its keypoints."""
+    """Return the fields of a recording from its facts in session.json; `points`: file of its keypoints."""
     video, choice = facts.get("video"), facts.get("choice")
     return {
         "video": None if video is None else _video(video, points),
@@ -303,7 +303,7 @@ def _told(facts: Mapping[str, Any], points: Path | None) -> dict[str, Any]:
 
 
 def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
-    """Return the facts of a video. Its time stamps are those of its keypoints, NaN where there are none."""
+    """Return the facts of a video. Its time stamps are those of its keypoints, NaN without them."""
     own = dict(facts)
     file, n = str(own.pop("file")), int(own["n_frames"])
     time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
@@ -320,7 +320,7 @@ def _choice(facts: Mapping[str, Any]) -> SubjectChoice:
 
 
 def _keypoints_of(path: Path, fit_path: Path) -> Keypoints | None:
-    """Return the keypoints of a fit; None where there is no such file or it is of another recording."""
+    """Return the keypoints of a fit; None if there is no such file or it is of another recording."""
     if not path.is_file():
         return None
     found, fit = Keypoints.load(path), TrialFit.load(fit_path)
@@ -348,7 +348,7 @@ def _checks_unknown(names: Sequence[str]) -> Check:
 
 
 def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
-    """Return the visit with the measures of its metrics.json, and with what is missing of them in `lacks`."""
+    """Return the visit with the measures of its metrics.json, and their missing files in `lacks`."""
     path, lacks = folder / METRICS, list(visit.lacks)
     if not path.is_file():
         return dataclasses.replace(visit, lacks=(*lacks, f"no {METRICS}: {_MEASURE}"))
@@ -377,9 +377,9 @@ def _with_stored_measures(visit: Visit, folder: Path) -> Visit:
 
 
 def load_kinetics(folder: Path, names: Sequence[str]) -> Kinetics | None:
-    """Return the kinetics of the fitted recordings `names`; None where the folder has none (files of version 0.2).
+    """Return the kinetics of the fitted recordings `names`; None if the folder has none (files of version 0.2).
 
-    Raises `PblError` FILE_FORMAT where they are those of other recordings.
+    Raises `PblError` FILE_FORMAT if they are those of other recordings.
     """
     if not (folder / KINETICS).is_file():
         return None

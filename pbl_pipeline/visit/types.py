@@ -1,4 +1,4 @@
-"""A visit and its recordings: what the chain computes and every consumer reads."""
+"""Types of a visit and its recordings, which the chain computes and all consumers read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True)
 class Held(Generic[T]):
-    """A value where a `Recording` wants a function that loads it."""
+    """A value in memory, as the function of a `Recording` that loads it."""
 
     value: T
 
@@ -37,23 +37,23 @@ class Held(Generic[T]):
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """One recording of a visit. Results of stages that did not run are None; `problem` says why there is no fit."""
+    """One recording of a visit. Results of stages that did not run are None; `problem` explains a missing fit."""
 
     name: str  # of its files: the video's name without its ending, distinct within the visit
-    path: Path | None = None  # the video; None where it is not known (results alone, markers of a laboratory)
+    path: Path | None = None  # the video; None if it is not known (results alone, markers of a laboratory)
     video: VideoInfo | None = None  # facts of the video
     choice: SubjectChoice | None = None  # of the person who is measured
     condition: Condition = dataclasses.field(default_factory=Condition)  # activity and pace
-    events: GaitEvents | None = None  # those of `measured` where there is one
+    events: GaitEvents | None = None  # those of `measured`, if any
     cycles: tuple[GaitCycle, ...] = ()  # likewise
-    measured: TrialMetrics | None = None  # all of the gait: events, cycles, measures and index
-    problem: str = ""  # why there is no fit, in a sentence; empty where there is one
+    measured: TrialMetrics | None = None  # events, cycles, measures and index
+    problem: str = ""  # reason for a missing fit, in a sentence
     shown: Path | None = None  # the recording whose pictures may be shown: `path`, or a copy with hidden heads
-    markers: MarkerSet | None = None  # the marker table of the fit, where the lab has its own
+    markers: MarkerSet | None = None  # the lab's own marker table of the fit
     number: int | None = None  # in the tables the `video_id`
-    load_keypoints: Callable[[], Keypoints | None] | None = None  # loads `keypoints`; None where there are none
-    load_fit: Callable[[], TrialFit] | None = None  # loads `fit`; None where there is none
-    load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None  # loads `log`; None where there is none
+    load_keypoints: Callable[[], Keypoints | None] | None = None  # loads `keypoints`; None without them
+    load_fit: Callable[[], TrialFit] | None = None  # loads `fit`; None without one
+    load_log: Callable[[], tuple[PhoneLog, float] | None] | None = None  # loads `log`; None without one
 
     @classmethod
     def of(cls, name: str, fit: TrialFit | None = None, keypoints: Keypoints | None = None, **fields: Any) -> Recording:
@@ -67,7 +67,7 @@ class Recording:
 
     @property
     def fitted(self) -> bool:
-        """Whether a body was fitted."""
+        """True if a body was fitted."""
         return self.load_fit is not None
 
     @functools.cached_property
@@ -82,7 +82,7 @@ class Recording:
 
     @functools.cached_property
     def log(self) -> tuple[PhoneLog, float] | None:
-        """The phone's sensor log and what added to its times gives the video's (s). Raises `PblError` PHONE_LOG."""
+        """The phone's sensor log and the shift from its times to the video's (s). Raises `PblError` PHONE_LOG."""
         return None if self.load_log is None else self.load_log()
 
     def loaded(self) -> Recording:
@@ -103,37 +103,33 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Solution:
-    """How the body of a visit was fitted, without the fitted movements. `software`: version and commit of the code.
-
-    scale (8,): multipliers of `body.SCALE_NAMES`; loss_trace (K, 2): step, loss; iterations, converged: None where they
-    were not recorded.
-    """
+    """Result of fitting the body of a visit, without the movements."""
 
     solver: str
     params_hash: str
-    iterations: int | None
-    converged: bool | None
-    scale: np.ndarray
-    loss_trace: np.ndarray
+    iterations: int | None  # None if not recorded
+    converged: bool | None  # None if not recorded
+    scale: np.ndarray  # (8,) multipliers of `body.SCALE_NAMES`
+    loss_trace: np.ndarray  # (K, 2) step, loss
     seconds: float
     compile_seconds: float
     device: str
-    software: str = ""
+    software: str = ""  # version and commit of the code
 
     @classmethod
     def of(cls, fit: SessionFit, software: str = "") -> Solution:
-        """Return what a session fit says of itself."""
+        """Return the solution of a session fit."""
         own = [f.name for f in dataclasses.fields(cls) if f.name != "software"]
         return cls(**{name: getattr(fit, name) for name in own}, software=software or code_version())
 
 
 @dataclasses.dataclass(frozen=True)
 class Visit:
-    """A visit: whose, when, by which methods, and what was computed."""
+    """A visit: person, date, methods and results."""
 
     recordings: tuple[Recording, ...]  # in the order of the fit, those without a fit after them
-    solution: Solution | None = None  # how the body was fitted; None where the chain ended before
-    fit_checks: tuple[Check, ...] = ()  # how well it was fitted
+    solution: Solution | None = None  # of the fit; None if the chain ended before
+    fit_checks: tuple[Check, ...] = ()  # quality of the fit
     measures: GaitMetrics | None = None  # its trials are the fitted recordings in their order
     subject: str = "-"  # code of the person, never a name
     label: str = ""  # of the visit
@@ -141,9 +137,9 @@ class Visit:
     kind: str = "single"  # "single" (recordings of one camera), "rig" (several cameras) or "markers" (a laboratory's)
     #: Name of a stage up to the fit to the method that computed it, in words; those of the gait are in `measures`.
     methods: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    #: Things that its files lack, in sentences: those of an older version, or of a run that was ended.
+    #: Missing files and facts, in sentences: of an older version, or of an interrupted run.
     lacks: tuple[str, ...] = ()
-    #: Forces and joint moments of the fitted recordings, None where they were not computed.
+    #: Forces and joint moments of the fitted recordings, None if they were not computed.
     kinetics: Kinetics | None = None
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables the primary key of its result
 
@@ -170,15 +166,15 @@ class Visit:
 
     @property
     def judged(self) -> GaitMetrics | None:
-        """The measures, judged by all checks of the visit: what metrics.json, terminal and report show."""
+        """The measures, judged by all checks of the visit, as in metrics.json, terminal and report."""
         if self.measures is None or self.measures.before:
             return self.measures
         return self.measures.with_checks(self.checks)
 
     @property
     def filming(self) -> Filming:
-        """How the pooled recordings were filmed; aid and orthosis are stated in tables alone. Loads the fits; raises as
-        `Recording.fit`."""
+        """Filming conditions of the pooled recordings; aid and orthosis are only stated in tables. Loads the fits and
+        raises as `Recording.fit`."""
         pooled = [r for r in self.fitted if r.measured is not None and r.measured.pooled]
         fits = [r.fit for r in pooled if r.fit is not None]
         one_camera = self.kind == "single"
@@ -193,7 +189,7 @@ class Visit:
 
     @property
     def title(self) -> str:
-        """Subject and label, as a list shows them."""
+        """Subject and label, for lists."""
         return " ".join(t for t in (self.subject if self.subject != "-" else "", self.label or self.date) if t)
 
     def recording(self, name: str) -> Recording:
@@ -206,7 +202,7 @@ class Visit:
     def with_measures(self, measures: GaitMetrics) -> Visit:
         """Return the visit with these measures.
 
-        Raises `PblError` FILE_FORMAT where they are not of the fitted recordings in their order.
+        Raises `PblError` FILE_FORMAT if they are not of the fitted recordings in their order.
         """
         fitted = [r.name for r in self.fitted]
         if [t.name for t in measures.trials] != fitted:
@@ -244,7 +240,7 @@ class Visit:
 
 
 def stage_checks(recordings: Sequence[Recording]) -> tuple[Check, ...]:
-    """Return the checks of each fitted recording, with its name where there are several, and of those left out."""
+    """Return the checks of each fitted recording, with its name if there are several, and of those left out."""
     fitted = [r for r in recordings if r.fitted]
     named = [(f" ({r.name})" if len(fitted) > 1 else "", c) for r in fitted for c in r.checks]
     found = [dataclasses.replace(c, check=c.check + name) for name, c in named]

@@ -150,7 +150,7 @@ def test_events_of_a_recording_by_command(walk, tmp_path):
 
 @pytest.mark.parametrize(
     ("axes", "signs", "words"),
-    [([0, 2, 1], [1, 1, -1], "nobody stands"), ([0, 1, 2], [1, -1, 1], None), ([0, 1, 2], [1, -1, -1], None)],
+    [([0, 2, 1], [1, 1, -1], "no one is standing"), ([0, 1, 2], [1, -1, 1], None), ([0, 1, 2], [1, -1, -1], None)],
     ids=["y up", "mirrored", "upside down"],
 )
 def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes, signs, words):

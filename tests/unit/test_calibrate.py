@@ -186,7 +186,9 @@ def test_corners_on_one_line_are_no_view(monkeypatch):
 
     def find(ids: np.ndarray):
         answer = (view.xy_px[ids].reshape(-1, 1, 2), ids.reshape(-1, 1), None, None)
-        monkeypatch.setattr(board.__class__, "_detector", lambda _: SimpleNamespace(detectBoard=lambda _: answer))
+        monkeypatch.setattr(
+            "pbl_pipeline.video.boards._detector", lambda _: SimpleNamespace(detectBoard=lambda _: answer)
+        )
         return board.find(np.zeros((4, 4), np.uint8))
 
     along = board.squares[0] - 1

@@ -69,7 +69,7 @@ def test_all_there_ends_with_zero(machine, monkeypatch):
     monkeypatch.setattr(assets, "status", lambda: [assets.AssetStatus(a, a.path, "ok") for a in assets.ASSETS.values()])
     result = doctor()
     assert result.exit_code == 0, result.output
-    assert result.output.splitlines()[-1] == "All that is needed is here."
+    assert result.output.splitlines()[-1] == "Nothing is missing."
     for what in ("Python", "packages", "JAX device", "compile cache", "LiteRT", "ONNX runtime", "video codecs"):
         assert " ok " in line(result, what) or " note " in line(result, what)
     assert "jax 0." in result.output

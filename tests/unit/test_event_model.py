@@ -312,7 +312,7 @@ def test_another_vertical_axis_is_told(axes):
     truth = truth_of(seed=1, seconds=6.0)
     for sign in (1, -1):
         found = detect_events(feet_of(truth, lambda xyz, s=sign: xyz[..., axes] * [s, 1, 1]))
-        empty(found, "nobody stands")
+        empty(found, "no one is standing")
         assert "z up" in found.qc[0].advice
 
 

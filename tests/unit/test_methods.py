@@ -186,8 +186,8 @@ def test_a_stage_of_ones_own():
     plain = json.loads(second.paramset.canonical_json)
     assert stage.find(Paramset("toy", "second", 1, plain)) == second
     wrong = {
-        "'x' is no float @ $.inner.share": {"inner": {"share": "x"}},
-        "True is no float @ $.gain": {"gain": True},
+        "'x' is not of type float @ $.inner.share": {"inner": {"share": "x"}},
+        "True is not of type float @ $.gain": {"gain": True},
         "extra fields found (z) @ $.inner": {"inner": {"z": 1}},
         "$.places[0]": {"places": [["knee"]]},
     }

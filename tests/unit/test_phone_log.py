@@ -333,7 +333,7 @@ def test_a_log_of_another_hand_is_not_matched(tmp_path, info):
     """The same time, other movement: the time of recording alone does not do, where a log could lie in two places."""
     other = sensor_logger(tmp_path / "other", 30.0, begin_s=100.0)
     error = error_of(load_attitude, other, recorded(info, 15.0))
-    assert "nothing tells" in error.found
+    assert "cannot be found" in error.found
     log = read_phone_log(other)
     turns = hand(100.013 + log.time_s).as_quat(scalar_first=True)
     match = match_pictures(log.time_s, turns, info, [(-24.0, 0.0)])

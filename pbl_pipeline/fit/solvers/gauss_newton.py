@@ -19,8 +19,8 @@ from .result import Result
 LONGEST_STEP = 0.5
 #: Damping of the first step, the least at all and after a step that was refused (less changes no step), and the most.
 DAMPING_START, DAMPING_LEAST, DAMPING_REFUSED, DAMPING_MOST = 1e-2, 1e-7, 1e-3, 1e7
-#: Where no unknown of a frame moves further than `NEAR`, the step is as many Gauss-Newton steps long as a secant says,
-#: within these bounds: weak directions creep, or swing to and fro, by a fixed share of the remaining way.
+#: Where no unknown of a frame moves further than `NEAR`, the step is as many Gauss-Newton steps long as a secant
+#: estimates, within these bounds: weak directions creep, or oscillate, by a fixed share of the remaining way.
 NEAR, SHORTEST, LONGEST = 0.2, 0.4, 2.5
 #: Space for the cost of each iteration: the bound on their number.
 MOST_ITERATIONS = 200
@@ -45,7 +45,7 @@ class Quadratic(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """When the iteration ends, as data: after a step in which no unknown of a frame moved further than `step`, or three
+    """End of the iteration, as data: after a step in which no unknown of a frame moved further than `step`, or three
     in a row whose gain was below the fraction `gain` of the cost, or `iterations` steps.
     """
 
@@ -57,7 +57,7 @@ class Limits:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Where the iteration stands: the best state with its cost and quadratic model (`latest`), and the state to try
+    """State of the iteration: the best state with its cost and quadratic model (`latest`), and the state to try
     next. trace: the cost after each iteration.
     """
 
@@ -83,7 +83,7 @@ class Progress:
 
 
 def before_first(evaluate: Callable[[S], Quadratic], start: S) -> Progress:
-    """What `minimise` begins with: nothing is evaluated yet."""
+    """Initial `Progress` of `minimise`: nothing is evaluated yet."""
     shapes = jax.eval_shape(evaluate, start)
     return Progress(
         state=start,
@@ -113,14 +113,14 @@ def minimise(
     same steps.
 
     `evaluate`: cost and its quadratic model at a state; `move`: the state after a step (F, Q) of the frames' unknowns
-    and (K,) of the shared ones; `counts`: 0 for frames whose step says nothing of convergence.
+    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence.
     Each pass of the loop evaluates one state: a second copy of that program, for the start or for the cost alone, would
     double the time it takes to compile.
     """
 
     def step(p: Progress) -> Progress:
         now, first = evaluate(p.candidate), p.iteration < 0
-        # Single precision: a change below the rounding of the sum is no reason to go back.
+        # Single precision: a change below the rounding of the sum does not refuse a step.
         accepted = now.cost <= p.cost * (1 + 1e-6)
         better = accepted & ~first
         keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
@@ -128,7 +128,7 @@ def minimise(
         damping = jnp.where(first, p.damping, jnp.where(accepted, p.damping / 10, p.damping * 10))
         damping = jnp.clip(damping, jnp.where(accepted, DAMPING_LEAST, DAMPING_REFUSED), DAMPING_MOST)
         gained = p.cost - now.cost > limits.gain * p.cost
-        # A step that was refused says nothing of the minimum: the next one is damped more.
+        # A refused step is not evidence of a minimum: the next one is damped more.
         idle = jnp.where(better, jnp.where(gained, 0, p.idle + 1), p.idle)
         result = jnp.where(idle >= 3, Result.SMALL_GAIN, Result.BOUND)
         result = jnp.where(better & (p.step < limits.step), Result.SMALL_STEP, result)
@@ -160,12 +160,12 @@ def minimise(
 
 
 def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:
-    """How steeply the cost falls along a step."""
+    """Slope of the cost along a step, positive where it falls."""
     return jnp.sum(at.g * dx) + jnp.sum(at.h * dy)
 
 
 def _damped(system: BorderedBandedSystem, damping: Array) -> BorderedBandedSystem:
-    """Marquardt's damping of the frames' unknowns: in units of their own curvature, with a floor for what is unseen."""
+    """Marquardt's damping of the frames' unknowns: in units of their curvature, with a floor for unobserved ones."""
     own = jnp.diagonal(system.diagonal, axis1=-2, axis2=-1)
     floor = 1e-4 * jnp.max(own, axis=-1, keepdims=True) + 1e-6
     extra = (damping * own + (1e-4 + damping) * floor)[..., None] * jnp.eye(own.shape[-1], dtype=own.dtype)

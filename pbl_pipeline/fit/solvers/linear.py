@@ -22,7 +22,7 @@ import numpy as np
 from jax.lax.linalg import triangular_solve
 from jaxtyping import Array, Float
 
-#: Columns of the border that are worked on at once where memory counts: for the variances, and in long sessions.
+#: Columns of the border that are processed at once where memory counts: for the variances, and in long sessions.
 COLUMNS = 32
 #: Most pairs of frames that are eliminated one after the other, by JAX platform.
 CHAIN = {"cpu": 2**31, "gpu": 8}
@@ -47,7 +47,7 @@ class BorderedBandedSystem:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Level:
-    """What one level of the reduction leaves: with block = L L', the inverse of L and its product with the links to the
+    """Result of one level of the reduction: with block = L L', the inverse of L and its product with the links to the
     blocks before (the first n columns) and after."""
 
     inverse: Float[Array, "M n n"]
@@ -65,7 +65,7 @@ class _Chain:
 
 
 class _Factors(NamedTuple):
-    """Factors of A: the levels of the reduction, then the chain of what they leave."""
+    """Factors of A: the levels of the reduction, then the chain of the remaining blocks."""
 
     levels: list[_Level]
     chain: _Chain
@@ -81,7 +81,7 @@ def solve(
             reduced = _substitute(factors, g[..., None]).reshape(1, -1) @ matrix.border.reshape(g.size, -1)
             y = _solve_corner(matrix.corner - _by_columns(factors, matrix.border), h - reduced[0])
             return _substitute(factors, (g - matrix.border @ y)[..., None])[..., 0], y
-        # The border and g are eliminated together, and what was eliminated serves again for x.
+        # The border and g are eliminated together, and the eliminated rows are used again for x.
         rows = _eliminated(factors, jnp.concatenate([matrix.border, g[..., None]], axis=-1))
         both = _grams(rows)
         y = _solve_corner(matrix.corner - both[:-1, :-1], h - both[:-1, -1])
@@ -225,7 +225,7 @@ def _reduce(blocks: Array, links: Array) -> tuple[_Level, Array, Array]:
 
 
 def _forward(level: _Level, rhs: Float[Array, "M n R"]) -> tuple[Array, Array]:
-    """What a level's eliminated rows of the right-hand side become, and the rows that stay."""
+    """The eliminated rows of a right-hand side at a level, and the rows that stay."""
     n = rhs.shape[1]
     gone, stay = _split(_even(rhs, jnp.zeros_like(rhs[0])))
     y = level.inverse @ gone

@@ -1,4 +1,4 @@
-"""Why a solver ended."""
+"""Reason why a solver ended."""
 
 from __future__ import annotations
 
@@ -17,5 +17,5 @@ class Result(enum.IntEnum):
 
     @property
     def converged(self) -> bool:
-        """Whether the solver ended at a minimum."""
+        """True if the solver ended at a minimum."""
         return self is not Result.BOUND

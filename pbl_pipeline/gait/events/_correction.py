@@ -31,7 +31,7 @@ _implausible = functools.partial(
 def check_correction(
     events: Iterable[GaitEvent], first_s: float, last_s: float, detected: Collection[tuple[float, str, str]] = ()
 ) -> tuple[GaitEvent, ...]:
-    """Return the events that a person set in order of time, or say what is wrong with one of them.
+    """Return the events that a person set in order of time, or raise an error about one of them.
 
     Initial contacts and toe-offs of a side alternate, at least `SHORTEST_PHASE_S` apart; two events of one kind and
     side are at least `SHORTEST_CYCLE_S` apart. Nothing is required between two that are more than `LONGEST_CYCLE_S`
@@ -59,12 +59,10 @@ def check_correction(
     for side in SIDES:
         own = [e for e in found if e.side == side]
         for before, e in itertools.pairwise(own):
-            apart, both = (
-                e.time_s - before.time_s,
-                f"{_said(e)}, {e.time_s - before.time_s:.2f} s after {_said(before)}",
-            )
             if (_key(before), _key(e)) in left_so:
                 continue
+            apart = e.time_s - before.time_s
+            both = f"{_said(e)}, {apart:.2f} s after {_said(before)}"
             if apart < SHORTEST_PHASE_S:
                 raise _implausible(both, f"at least {SHORTEST_PHASE_S:g} s between two events of a side")
             if e.event != before.event:
@@ -78,15 +76,15 @@ def check_correction(
 
 
 def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_changed: int) -> GaitEvents:
-    """Return the events that count where a person corrected the `detected` ones, in bouts of walking.
+    """Return the events after a person corrected the `detected` ones, in bouts of walking.
 
     A bout ends where the next event is not the next in the order of walking, or comes later than `LONGEST_PHASE_S`.
-    Method, parameters and source stay those of the detection; the check `events_by_hand` tells corrected events apart.
+    Method, parameters and source stay those of the detection; the check `events_by_hand` marks corrected events.
 
     Parameters
     ----------
     events
-        All events that there are now, as `check_correction` returned them.
+        All events after the correction, as `check_correction` returned them.
     n_changed
         Number of events that the person moved, added or removed.
     """

@@ -13,10 +13,10 @@ from .types import GaitEvents
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
     """Foot down and foot up of both sides in order of time, in bouts of walking.
 
-    Raises `PblError` GAIT_INPUT where no frame holds what the method needs, or the legs are upside down or mirrored;
-    SOLVER_UNKNOWN for an unknown method; ASSET_MISSING where the event model's weights are not there.
+    Raises `PblError` GAIT_INPUT if no frame has the method's input, or the legs are upside down or mirrored;
+    SOLVER_UNKNOWN for an unknown method; ASSET_MISSING if the event model's weights are missing.
 
-    The status is PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view).
+    The status is PASS, or EMPTY with a reason without walking (standing, sit-to-stand, too short in view).
 
     Parameters
     ----------

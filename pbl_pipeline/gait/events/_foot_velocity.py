@@ -1,4 +1,4 @@
-"""Detection of foot down and foot up from how fast the middle of the foot goes up and down."""
+"""Detection of foot down and foot up from the vertical speed of the middle of the foot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
 
 @dataclasses.dataclass(frozen=True)
 class FootVelocityParams(EventParams):
-    """Parameters of the foot-velocity detector, on top of those it shares with the coordinate-based one.
+    """Parameters of the foot-velocity detector, in addition to those of the coordinate-based one.
 
     min_speed_leg_per_s
         Smallest extremum of the vertical speed that counts, in leg lengths per second. The foot sinks with only 0.15 to

@@ -15,27 +15,28 @@ from pbl_pipeline.gait.motion import FootTrajectories
 from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 from .types import SIDES
 
-#: Somebody who sits has the hips at half of this length above the feet and more; below it the legs lie.
+#: Minimum hip height above the feet (leg lengths); below it the person is lying. Seated people have half a leg or more.
 MIN_HIP_HEIGHT = 0.3
-#: Hips above the lower foot, as a share of thigh and shank together, below which somebody sits. Walking, crouched to 60
-#: deg at the knee too, 0.92 and more; on a chair 0.67 to 0.72 (5th percentiles of recorded and synthetic motions).
+#: Height of the hips above the lower foot, as a share of thigh and shank together, below which a person is seated.
+#: Walking, also crouched to 60 deg at the knee: 0.92 and more; on a chair 0.67 to 0.72 (5th percentiles of recorded and
+#: synthetic motions).
 SEATED_HEIGHT = 0.8
-#: Who sits in more of the frames than this is not searched.
+#: Skip detection if the person is seated in more than this fraction of frames.
 SEATED_SHARE = 0.95
-#: Cosine between where the pelvis faces and where it goes, below which the person walks backwards.
+#: Cosine between the heading of the pelvis and its displacement, below which the person walks backwards.
 BACKWARDS = -0.5
-#: GAIT_INPUT of points that cannot be searched.
+#: GAIT_INPUT for points that cannot be searched.
 input_error = functools.partial(
     PblError, "GAIT_INPUT", next_step="correct the points or the axes; the overlay shows which leg is which"
 )
 
 
 def check_preconditions(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str]:
-    """The legs on an even grid, and why they are not searched: reason and advice, both empty where they are.
+    """The legs on an even grid, and the reason and advice if they are not searched, else both empty.
 
-    The grid is None where the legs' joints are not known (`legs_m` None; then only the way on the ground is looked at)
-    or are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down, mirrored or all
-    at one place, or more than `MAX_SECONDS`.
+    The grid is None if the legs' joints are not known (`legs_m` None; then only the direction of travel is checked) or
+    are in view for less than `least_s`. Raises `PblError` GAIT_INPUT: joints upside down, mirrored or all at one place,
+    or more than `MAX_SECONDS`.
     """
     grid, reason, advice = _grid(feet, least_s)
     if not reason and feet.heading_agreement < BACKWARDS:
@@ -68,7 +69,7 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
             return grid, f"the {side} foot is never seen", "film from where both legs are in view"
     height = check_upright(grid)
     if height < MIN_HIP_HEIGHT:
-        said = f"the hips are {height:.2f} leg lengths above the feet: nobody stands"
+        said = f"the hips are {height:.2f} leg lengths above the feet: no one is standing"
         return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
     if np.mean(seated(grid)[hips]) > SEATED_SHARE:
         said = "the person sits: the hips are hardly ever as high above the lower foot as a standing person's"
@@ -77,7 +78,8 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
 
 
 def seated(grid: Grid) -> Bool[np.ndarray, " N"]:
-    """Frames in which somebody sits, by `SEATED_HEIGHT`; none where hips, knees and ankles are never seen together."""
+    """Frames in which the person is seated, by `SEATED_HEIGHT`; none if hips, knees and ankles are never seen
+    together."""
     x = np.where(grid.known[..., None], grid.joints_m, np.nan)
     leg = np.linalg.norm(np.diff(x[:, :3], axis=1), axis=-1).sum(axis=1)
     if not np.isfinite(leg).any():
@@ -88,10 +90,10 @@ def seated(grid: Grid) -> Bool[np.ndarray, " N"]:
 
 
 def check_upright(grid: Grid) -> float:
-    """How high the hips are above the feet (leg lengths, median over frames and joints below the knee).
+    """Height of the hips above the feet (leg lengths, median over frames and joints below the knee).
 
-    Refuses legs that point up, and legs whose left and right are exchanged or mirrored: then the feet, or the knees,
-    point backwards of where the hips face. Raises `PblError` GAIT_INPUT.
+    Refuses legs that point up, and legs whose sides are exchanged or mirrored: then the feet, or the knees, point
+    backwards against the heading of the hips. Raises `PblError` GAIT_INPUT.
     """
     known, x = grid.known, grid.joints_m
     hips = np.asarray(known[:, 0].all(axis=1))

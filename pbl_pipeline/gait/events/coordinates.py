@@ -48,10 +48,10 @@ def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -
     threshold, near 1 for one far above it, times the confidence `c` of the points where the source states one. It
     orders events by how clear they are; it is not calibrated against truth.
 
-    Raises `PblError` GAIT_INPUT where no frame holds feet, pelvis and heading, or the legs are upside down or mirrored.
+    Raises `PblError` GAIT_INPUT if no frame has feet, pelvis and heading, or the legs are upside down or mirrored.
 
-    The status is PASS, or EMPTY with a reason where nobody walks (standing, sit-to-stand, too short in view), one foot
-    is never seen, or the person walks backwards.
+    The status is PASS, or EMPTY with a reason without walking (standing, sit-to-stand, too short in view), if one foot
+    is never seen, or if the person walks backwards.
     """
     p = method.params
     _, reason, advice = check_preconditions(feet, p.min_segment_s)
@@ -87,13 +87,13 @@ def detect_by_extrema(
         return no_events(
             method.name, method.hash, feet.source, f"the feet are not seen for {p.min_segment_s:g} s at a time"
         )
-    confidence = _mean_confidence(feet)
+    confidence = _mean_known(feet.confidence, np.ones(2))
     per_segment = [extrema(s) for s in segments]
     threshold = _thresholds(per_segment, least, p)
     bouts: list[list[Candidate]] = []
     n_candidates = breaks = 0
     for segment, candidates in zip(segments, per_segment, strict=True):
-        c = _local_confidence(feet, confidence, segment)
+        c = _mean_known(feet.confidence[segment.frames[0] : segment.frames[1] + 1], confidence)
         kept = [_candidate(e, threshold, c) for e in candidates if e.prominence >= threshold[e.side, e.event]]
         n_candidates += len(kept)
         runs = best_sequence(kept, p)
@@ -104,8 +104,9 @@ def detect_by_extrema(
     if not bouts:
         reason = _why_not(swing, n_candidates, p)
         return no_events(method.name, method.hash, feet.source, reason, "", n_candidates, breaks)
+    offset = {FOOT_DOWN: p.foot_down_offset_s, FOOT_UP: p.foot_up_offset_s}
     events = tuple(
-        GaitEvent(c.time_s + _offset(c.event, p), c.side, c.event, c.weight, number)
+        GaitEvent(c.time_s + offset[c.event], c.side, c.event, c.weight, number)
         for number, bout in enumerate(bouts)
         for c in bout
     )
@@ -125,7 +126,7 @@ def detect_by_extrema(
 
 @dataclasses.dataclass(frozen=True)
 class Extremum:
-    """A candidate: when, of which foot, of which kind, how much it stands out."""
+    """A candidate for an event: time, foot, kind and prominence."""
 
     time_s: float
     side: str
@@ -179,12 +180,9 @@ def _candidates(segment: Segment, leg: float, p: EventParams) -> list[Extremum]:
 
 def prominence(signal: np.ndarray, at: int, left: int, right: int) -> float:
     """The smaller of the drops to both sides, but a drop that the end of the segment cuts short does not count."""
-    before, after = float(signal[at] - signal[left]), float(signal[at] - signal[right])
-    if left == 0 and right != len(signal) - 1:
-        return max(before, after)
-    if right == len(signal) - 1 and left != 0:
-        return max(before, after)
-    return min(before, after)
+    drops = float(signal[at] - signal[left]), float(signal[at] - signal[right])
+    one_is_cut = (left == 0) != (right == len(signal) - 1)
+    return max(drops) if one_is_cut else min(drops)
 
 
 def _thresholds(per_segment: list[list[Extremum]], least: float, p: EventParams) -> dict[tuple[str, str], float]:
@@ -204,19 +202,11 @@ def _candidate(e: Extremum, threshold: dict[tuple[str, str], float], confidence:
     return Candidate(e.time_s, e.side, e.event, float(c / (1 + ratio**2)))
 
 
-def _mean_confidence(feet: FootTrajectories) -> np.ndarray:
-    known = np.isfinite(feet.confidence)
+def _mean_known(confidence: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Mean (2,) of the known confidences (T, 2) of each foot; `otherwise` (2,) if the source states none."""
+    known = np.isfinite(confidence)
     n = known.sum(axis=0)
-    mean = np.where(known, feet.confidence, 0.0).sum(axis=0) / np.maximum(n, 1)
-    return np.where(n > 0, mean, 1.0)
-
-
-def _local_confidence(feet: FootTrajectories, overall: np.ndarray, segment: Segment) -> np.ndarray:
-    """Mean confidence of each foot within the segment; 1 where the source states none."""
-    part = np.asarray(feet.confidence)[segment.frames[0] : segment.frames[1] + 1]
-    known = np.isfinite(part)
-    n = known.sum(axis=0)
-    return np.where(n > 0, np.where(known, part, 0.0).sum(axis=0) / np.maximum(n, 1), overall)
+    return np.where(n > 0, np.where(known, confidence, 0.0).sum(axis=0) / np.maximum(n, 1), otherwise)
 
 
 def _walks(run: list[Candidate], segment: Segment, leg: float, p: EventParams) -> bool:
@@ -239,10 +229,6 @@ def _why_not(swing: float, n_candidates: int, p: EventParams) -> str:
         f"no walking: {n_candidates} movements of the feet, but not {p.min_foot_downs} steps in the order "
         "left down, right up, right down, left up"
     )
-
-
-def _offset(event: str, p: EventParams) -> float:
-    return p.foot_down_offset_s if event == FOOT_DOWN else p.foot_up_offset_s
 
 
 def _checks(feet: FootTrajectories, n_events: int, breaks: int) -> tuple[Check, ...]:

@@ -30,7 +30,7 @@ class PhaseParams:
     model, model_sha256
         Name and checksum of the weights (`data/<model>.npz`).
     walking, filter
-        What counts as walking; what the filter believes.
+        Parameters of the stretches of walking, and of the filter.
     min_seen_s
         Shortest time in view that is searched.
     min_leg_share
@@ -100,7 +100,7 @@ def detect_by_phase(feet: FootTrajectories, method: Method[PhaseParams]) -> Gait
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Candidate:
-    """A wrap of a phase, and what speaks for it (`event_evidence`)."""
+    """A wrap of a phase, and its evidence (`event_evidence`)."""
 
     time_s: float
     side: str
@@ -115,8 +115,8 @@ class Candidate:
 
 
 def candidates(grid: Any, phases: Any, p: PhaseParams) -> tuple[list[list[Candidate]], int]:
-    """The wraps of all four phases in each stretch of walking, in order of time, before any is judged; and how many
-    stretches were left out because a leg is hardly seen."""
+    """The wraps of all four phases in each stretch of walking, in order of time, before any is judged; and the number
+    of stretches that were left out because a leg is hardly seen."""
     out, half_seen = [], 0
     for first, last in walking_stretches(grid, phases, p.walking):
         cut = slice(first, last + 1)
@@ -137,8 +137,8 @@ def candidates(grid: Any, phases: Any, p: PhaseParams) -> tuple[list[list[Candid
 
 
 def event_evidence(smooth: SmoothPhases, z: np.ndarray, walking: np.ndarray, k: int, i: int) -> np.ndarray:
-    """What speaks for an event of kind `k` at frame `i`: the logit of walking there, how sure the model's phase is
-    (log variance), how far it is from the smoothed one (rad), and the frames to the end of the stretch."""
+    """Evidence for an event of kind `k` at frame `i`: the logit of walking there, the log variance of the model's
+    phase, its distance from the smoothed one (rad), and the time to the end of the stretch (25 frames, at most 1)."""
     near = slice(max(i - 4, 0), i + 5)
     odds = float(np.mean(np.clip(walking[near], 1e-4, 1 - 1e-4)))
     length = float(np.clip(np.mean(np.abs(z[near, k])), 0.02, 0.9999))
@@ -164,8 +164,8 @@ def _downs(run: list[GaitEvent]) -> list[GaitEvent]:
 
 
 def double_support_s(events: list[GaitEvent]) -> np.ndarray:
-    """From each foot down to the nearest foot up of the other foot (s) of the same bout; negative where it left before:
-    the body was in the air."""
+    """Time (s) from each foot down to the nearest foot up of the other foot of the same bout; negative if that came
+    before, with the body in the air."""
     out = []
     for down in _downs(events):
         ups = [e.time_s for e in events if e.event == FOOT_UP and e.side != down.side and e.bout == down.bout]
@@ -216,7 +216,7 @@ def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, tur
 
 
 def _breaks(events: list[GaitEvent]) -> int:
-    """How often an event does not follow the one that comes before it in walking."""
+    """Number of events that do not follow the previous one in the order of walking."""
     return sum(
         PHASE_ORDER[(PHASE_ORDER.index((a.side, a.event)) + 1) % 4] != (b.side, b.event)
         for a, b in itertools.pairwise(events)

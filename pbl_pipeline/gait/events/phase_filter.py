@@ -1,7 +1,7 @@
 """Kalman filter and Rauch-Tung-Striebel smoother over phase, phase rate and three offsets (Cotton et al. 2022).
 
-State: the phase of left foot down (rad, unwrapped), its rate (rad/s), and how much the phases of right foot up, right
-foot down and left foot up lie ahead of it (rad). Measured are the four phases, each modulo a turn: the innovation is
+State: the phase of left foot down (rad, unwrapped), its rate (rad/s), and the lead of the phases of right foot up,
+right foot down and left foot up over it (rad). Measured are the four phases, each modulo a turn: the innovation is
 wrapped, so that the filter stays linear.
 """
 
@@ -17,16 +17,16 @@ _TURN = 2 * np.pi
 
 @dataclasses.dataclass(frozen=True)
 class FilterParams:
-    """What the filter believes.
+    """Noise parameters of the filter.
 
     rate_noise
-        How the rate wanders (rad/s per sqrt(s)).
+        Random walk of the rate (rad/s per sqrt(s)).
     offset_noise
-        How the offsets wander (rad per sqrt(s)).
+        Random walk of the offsets (rad per sqrt(s)).
     phase_noise
-        How the phase wanders against its rate (rad per sqrt(s)).
+        Random walk of the phase against its rate (rad per sqrt(s)).
     memory_frames
-        Errors of the model's phases resemble each other over so many frames: their variance is multiplied by it.
+        Errors of the model's phases are correlated over so many frames: their variance is multiplied by it.
     least_sd_rad
         Least standard deviation of a measured phase.
     """
@@ -49,10 +49,10 @@ class SmoothPhases:
 
 
 def smooth_phases(z: np.ndarray, step_s: float, params: FilterParams) -> SmoothPhases:
-    """Phases that fit together, from the model's complex numbers `z` (T, 4), cos + i sin; 0 or NaN is not measured.
+    """Consistent phases from the model's complex numbers `z` (T, 4), cos + i sin; 0 or NaN is not measured.
 
-    The length of a number tells how sure the model is: if angles scatter with variance s^2, their mean has the
-    length exp(-s^2 / 2).
+    The length of a number is the model's certainty: if angles scatter with variance s^2, their mean has the length
+    exp(-s^2 / 2).
     """
     z = np.where(np.isfinite(z), z, 0.0)
     length = np.clip(np.abs(z), 1e-3, 0.99999)

@@ -31,7 +31,7 @@ def uniform_segments(
     interpolator: Callable[..., Any] = PchipInterpolator,
 ) -> list[Segment]:
     """Split (T, C) `values` at gaps, interpolate onto a uniform grid (monotone cubic, or scipy's `interpolator`) and
-    low-pass without lag.
+    low-pass filter without lag.
 
     A gap is a time of more than `max_gap_s` between frames in which every value is finite. The filter is a
     Butterworth run forward and backward: `filter_order` counts both passes, and its cut-off is corrected so that

@@ -44,7 +44,7 @@ class EventParams:
     min_swing_s, max_phase_s
         Shortest swing; longest swing or double support.
     break_cost
-        What a break of the event order costs in the search for the best sequence (one event weighs its probability).
+        Cost of a break of the event order in the search for the best sequence (one event weighs its probability).
     min_foot_downs
         Fewest foot downs of a walking bout.
     foot_down_offset_s, foot_up_offset_s
@@ -71,8 +71,8 @@ class EventParams:
 
 @dataclasses.dataclass(frozen=True)
 class GaitEvent:
-    """One event. `probability` in 0..1 that it is real: calibrated by the event model, by the coordinate-based methods
-    only how clear it is; `bout` counts walking bouts from 0."""
+    """One event. `probability` in 0..1 that it is real: calibrated in the event model, only a measure of prominence in
+    the coordinate-based methods; `bout` counts walking bouts from 0."""
 
     time_s: float
     side: str
@@ -89,10 +89,10 @@ class GaitEvent:
 class GaitEvents:
     """The events of one trial in order of time.
 
-    `status` is "PASS" or "EMPTY" (nobody walks: `reason` says what was seen). `params_hash` identifies the
-    parameters, `source` the trajectories ("fit", "keypoints blazepose_33", ...). `walking_s` lists start and end of
-    each bout. `n_candidates` counts what might have been events before their check, `n_order_breaks` where a bout
-    ended because an event was missing, or where two are out of order.
+    `status` is "PASS" or "EMPTY" (no walking, with the `reason`). `params_hash` identifies the parameters, `source` the
+    trajectories ("fit", "keypoints blazepose_33", ...). `walking_s` lists start and end of each bout. `n_candidates`
+    counts candidates before their check, `n_order_breaks` the bouts that ended because an event was missing, or the
+    pairs that are out of order.
     """
 
     status: str
@@ -108,7 +108,7 @@ class GaitEvents:
 
     @property
     def corrected(self) -> bool:
-        """Whether a person corrected the detected events."""
+        """True if a person corrected the detected events."""
         return any(c.check == "events_by_hand" for c in self.qc)
 
     def times(self, side: str, event: str) -> list[float]:
@@ -133,13 +133,13 @@ def no_events(
     n_candidates: int = 0,
     n_order_breaks: int = 0,
 ) -> GaitEvents:
-    """EMPTY, with the reason and what to do about it."""
+    """Return EMPTY events, with the reason and advice."""
     check = Check("walking", EMPTY, None, None, f"{reason}: {advice}" if advice else reason)
     return GaitEvents(EMPTY, (), reason, method, params_hash, source, (), n_candidates, n_order_breaks, (check,))
 
 
 def heading_check(agreement: float) -> tuple[Check, ...]:
-    """Whether the person goes where the pelvis faces; nothing where the way is not known (NaN)."""
+    """Check that the person walks in the direction of the pelvis; empty if the way is not known (NaN)."""
     if not math.isfinite(agreement):
         return ()
     advice = "the person does not go where the pelvis faces: sideways, or the camera moved"

@@ -1,4 +1,4 @@
-"""Where somebody walks: stretches of a trial without standing, turning on the spot, or gaps in view."""
+"""Stretches of walking in a trial: without standing, turning on the spot, or gaps in view."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _STRIDE_S = (0.6, 3.0)
 
 @dataclasses.dataclass(frozen=True)
 class WalkingParams:
-    """When a stretch counts as walking.
+    """Parameters of the stretches of walking.
 
     probability
         Least probability of walking, averaged over `average_s`.
@@ -30,9 +30,9 @@ class WalkingParams:
     max_gap_s
         Longer gaps in view end a stretch.
     max_turn_deg_per_stride
-        A heading that changes by more within a stride is turning, not walking on: it ends a stretch. 0: not asked.
+        A heading that changes by more within a stride is turning, not walking on: it ends a stretch. 0: not used.
     max_turn_deg_per_s
-        The same by time, asked where `max_turn_deg_per_stride` is 0 (version 1): it keeps slow walkers' turns and loses
+        The same by time, used if `max_turn_deg_per_stride` is 0 (version 1): it keeps slow walkers' turns and loses
         fast walkers' bends.
     min_swing_leg
         The ankles pass each other by at least this much along the heading (leg lengths).
@@ -49,7 +49,7 @@ class WalkingParams:
 
 
 def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list[tuple[int, int]]:
-    """First and last frame of the grid of each stretch of walking: none while somebody sits."""
+    """First and last frame of the grid of each stretch of walking: none while the person is seated."""
     frames = max(1, round(params.average_s * GRID_HZ))
     count = uniform_filter1d(phases.seen.astype(float), frames, mode="constant")
     mean = uniform_filter1d(phases.walking * phases.seen, frames, mode="constant") / np.maximum(count, 1e-9)
@@ -65,7 +65,7 @@ def walking_stretches(grid: Grid, phases: Phases, params: WalkingParams) -> list
 
 
 def turns(grid: Grid, phases: Phases, params: WalkingParams) -> Bool[np.ndarray, " N"]:
-    """Whether the person turns instead of walking on, of each frame."""
+    """True if the person turns instead of walking on, of each frame."""
     if params.max_turn_deg_per_stride:
         return np.abs(turn_deg_per_stride(grid, phases)) > params.max_turn_deg_per_stride
     return np.abs(turning_deg_per_s(grid)) > params.max_turn_deg_per_s
@@ -92,7 +92,7 @@ def turn_deg_per_stride(grid: Grid, phases: Phases) -> Float[np.ndarray, " N"]:
 
 
 def turning_deg_per_s(grid: Grid) -> Float[np.ndarray, " N"]:
-    """How fast the heading turns to the left."""
+    """Rate at which the heading turns to the left."""
     side = np.cross(grid.up, grid.ahead[:-1])
     change = np.arctan2(np.sum(side * grid.ahead[1:], axis=1), np.sum(grid.ahead[:-1] * grid.ahead[1:], axis=1))
     rate = np.degrees(np.append(change, change[-1:])) * GRID_HZ if len(change) else np.zeros(len(grid.time_s))
@@ -100,7 +100,7 @@ def turning_deg_per_s(grid: Grid) -> Float[np.ndarray, " N"]:
 
 
 def swing_leg(grid: Grid) -> Float[np.ndarray, " N"]:
-    """How far the left foot is ahead of the right one (leg lengths): ankles, else heels, else toes; NaN if not seen."""
+    """Distance of the left foot ahead of the right one (leg lengths): ankles, else heels, else toes; NaN if unseen."""
     out = np.full(len(grid.time_s), np.nan)
     for joint in (4, 3, 2):
         both = grid.known[:, joint].all(axis=1)
@@ -110,14 +110,14 @@ def swing_leg(grid: Grid) -> Float[np.ndarray, " N"]:
 
 
 def reach_leg(swing: np.ndarray) -> float:
-    """How far the feet pass each other, to both sides together (leg lengths), from `swing_leg`: between its 5th and
-    95th percentile, so that a point far off does not count."""
+    """Distance by which the feet pass each other, to both sides together (leg lengths), from `swing_leg`: between its
+    5th and 95th percentile, so that an outlier does not count."""
     seen = swing[np.isfinite(swing)]
     return float(np.diff(np.percentile(seen, [5, 95]))[0]) if len(seen) > 1 else 0.0
 
 
 def _without_short(flags: np.ndarray, value: bool, frames: int) -> np.ndarray:
-    """Runs of `value` shorter than `frames` are turned over; at the ends of the trial, too."""
+    """Invert runs of `value` shorter than `frames`; False runs at the ends of the trial stay."""
     out = flags.copy()
     for run in runs(flags == value):
         inside = value or (run.start > 0 and run.stop < len(flags))

@@ -1,7 +1,6 @@
-"""How a trial moves: poses of the fitted body, the legs' joints, the feet and the heading."""
+"""Motion of a trial: poses of the fitted body, the legs' joints, the feet and the heading."""
 
 from ._feet import (
-    BRIDGED_S,
     FOOT_MARKER_SETS,
     FootTrajectories,
     feet_from_fit,

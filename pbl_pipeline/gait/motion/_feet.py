@@ -1,4 +1,4 @@
-"""Where the feet are: heel, toe and pelvis over time, from a fit, from keypoints or from laboratory markers."""
+"""Heel, toe and pelvis over time, from a fit, from keypoints or from laboratory markers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: The pelvis turns with every stride, so its direction is averaged twice over this time (about one stride).
 HEADING_WINDOW_S = 1.0
-#: Below this speed the direction of travel says nothing about the heading.
+#: Below this speed the direction of travel is not compared with the heading.
 MIN_TRAVEL_M_PER_S = 0.3
 _input_error = functools.partial(
     PblError, "GAIT_INPUT", next_step="pass a fit.npz of `pbl fit`, or a keypoints.npz with 3D points of hips and feet"
@@ -107,7 +107,7 @@ FOOT_MARKER_SETS = tuple(_POINTS)
 _HEEL_IN_CALCN_M = np.array([-0.01617, -0.00123, 0.0])
 _WORLD_UP = np.array([0.0, 0.0, 1.0])
 
-#: The fit's movement between two sights of a foot is taken for real up to this time from the nearer one (s).
+#: The fit's movement between two observations of a foot is accepted up to this time from the nearer one (s).
 BRIDGED_S = 0.25
 #: Bodies whose points are those of a foot.
 _FOOT = ("talus", "calcn", "toes")
@@ -151,8 +151,8 @@ class FootTrajectories:
 def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajectories:
     """Heel, toe joint and hip centres of the fitted body, world frame (z up); `poses` saves computing them again.
 
-    Frames whose qpos is NaN stay NaN, and so does a leg below the hip for as long as nothing of its foot was seen
-    (`_feet_seen`): there the fit goes by its priors, which know no step. Raises `PblError` GAIT_INPUT (no finite
+    Frames whose qpos is NaN stay NaN, and so does a leg below the hip while nothing of its foot was seen
+    (`_feet_seen`): there the fit follows its priors, which contain no steps. Raises `PblError` GAIT_INPUT (no finite
     frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
@@ -179,8 +179,8 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
 def _feet_seen(fit: TrialFit) -> np.ndarray:
     """(T, 2) [left, right]: whether a point of that foot, from the ankle down, was observed within `BRIDGED_S`.
 
-    The residuals tell which points were. A fit of a laboratory's own marker set does not tell where its points are
-    fixed, and counts as seen.
+    Observed points have residuals. A fit of a laboratory's own marker set, whose points are not known here, counts as
+    seen.
     """
     from pbl_pipeline.body import MARKER_SETS, marker_set  # JAX loads only where a fit is read
 
@@ -206,10 +206,10 @@ def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:
 
     With phone orientation the points are turned into the world frame (z up); without it they stay in the camera
     frame and gravity is taken as -y of the camera, which assumes a level camera: 10 deg of tilt shorten the forward
-    movement by 2 % and leave the times of its extrema where they are. Root-relative points are as good as absolute
-    ones because the method is relative to the pelvis; only the check of the heading needs absolute ones.
+    movement by 2 % and do not move its extrema in time. Root-relative points are as good as absolute ones because the
+    method is relative to the pelvis; only the check of the heading needs absolute ones.
 
-    Raises `PblError` GAIT_INPUT where the marker set has no feet or no 3D point was seen.
+    Raises `PblError` GAIT_INPUT if the marker set has no feet or no 3D point was seen.
     """
     xyz = np.asarray(keypoints.xyz_cam_m, float)
     up = np.array([0.0, -1.0, 0.0])

@@ -31,18 +31,18 @@ class BodyPoses:
     rotation: np.ndarray
 
     def index(self, name: str) -> int:
-        """Where a body stands in the second axis."""
+        """Index of a body in the second axis."""
         return self.body.body_names.index(name)
 
     def scale_of(self, name: str, scale: np.ndarray) -> float:
-        """The multiplier of a body's own points."""
+        """The multiplier of a body's points."""
         return float(np.asarray(scale)[self.body.scale_index[self.index(name)]])
 
 
 def trial_poses(fit: TrialFit) -> BodyPoses:
     """Forward kinematics of a fit.
 
-    Raises `PblError` GAIT_INPUT where no frame is finite, joints are missing or in degrees.
+    Raises `PblError` GAIT_INPUT if no frame is finite, or joints are missing or in degrees.
     """
     from pbl_pipeline.body import SLIDES, load_body  # JAX loads only where a fit is read
 
@@ -127,9 +127,9 @@ def legs_from_points(
     xyz_m: Float[np.ndarray, "T J 3"],
     confidence: Float[np.ndarray, "T J"] | None,
 ) -> Float[np.ndarray, "T 5 2 3"]:
-    """Joints of both legs in the frame of the points, NaN where the set has none, nothing was seen or the confidence is
-    below 0.1. Hip joints of `plug_in_gait` follow from the spines of the pelvis (Harrington et al. 2007) where the
-    posterior ones are among the names; else the anterior spine stands for the hip."""
+    """Joints of both legs in the frame of the points, NaN if the set has none, nothing was seen or the confidence is
+    below 0.1. Hip joints of `plug_in_gait` follow from the spines of the pelvis (Harrington et al. 2007) if the
+    posterior ones are among the names; else the anterior spine is taken as the hip."""
     index = {name: i for i, name in enumerate(names)}
     seen = np.asarray(xyz_m, float)
     if confidence is not None:

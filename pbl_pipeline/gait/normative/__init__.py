@@ -1,13 +1,12 @@
-"""Normative gait: what a cycle is compared with."""
+"""Normative gait, with which cycles are compared."""
 
-from ._schwartz import GRAVITY, GaitNorm, gait_norm, harmonic_sum
+from ._schwartz import GRAVITY, gait_norm, harmonic_sum
 from .norm import (
     ANGLE_MODELS,
     BODY_ANGLES,
     DEFAULT_NORM,
     MIN_VECTORS,
     NINE_ANGLES,
-    OFFSET_DEG,
     PLUG_IN_GAIT,
     THREE_ANGLES,
     NormativeSet,

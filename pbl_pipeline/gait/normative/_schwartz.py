@@ -35,8 +35,7 @@ class GaitNorm:
     #: positive; `foot_progression` toes in positive.
     mean_deg: Mapping[str, np.ndarray]
     sd_deg: Mapping[str, np.ndarray]
-    #: Where the figures come from.
-    source: str
+    source: str  # of the figures
     licence: str
 
     @property

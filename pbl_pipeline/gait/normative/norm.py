@@ -1,4 +1,4 @@
-"""Normative sets: a fitted basis and the mean curves that ship, and how their pelvis and hip angles are defined."""
+"""Normative sets: a fitted basis, the mean curves that ship, and the definition of their pelvis and hip angles."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ ANGLE_MODELS: dict[str, str] = {
 #: the 166 controls of Gillette: 12). Two OpenSim experts' solutions of two walks and a laboratory's of a third have a
 #: mean tilt of -3 to 0 and a hip flexion that is 11 less than those controls' (docs/measures.md).
 PELVIS_SLOPE_DEG = 12.0
-#: What the marker model's angle has more than the body's (deg). Both models turn the pelvis about its lateral axis
-#: first and measure hip flexion about that axis, so another slope adds a constant to hip flexion and leaves hip
-#: adduction and rotation as they are; of the pelvis' angles it changes the tilt. (Exactly so only where obliquity and
-#: rotation are zero; where both are 10 deg the tilt is 0.1 deg off, obliquity and rotation change by 2.3 deg.)
+#: Marker model's angle less the body's (deg). Both models turn the pelvis about its lateral axis first and measure hip
+#: flexion about that axis, so another slope adds a constant to hip flexion and does not change hip adduction and
+#: rotation; of the pelvis' angles it changes the tilt. (This is exact only if obliquity and rotation are zero; if both
+#: are 10 deg, the tilt is 0.1 deg off, and obliquity and rotation change by 2.3 deg.)
 OFFSET_DEG = {"hip_flexion": PELVIS_SLOPE_DEG, "pelvis_tilt": PELVIS_SLOPE_DEG}
 _invalid = functools.partial(
     PblError,
@@ -62,7 +62,7 @@ _invalid = functools.partial(
 
 
 def offset_deg(angle: str, source: str, target: str) -> float:
-    """What to add to an angle of the model `source` to have that of `target`. Raises `PblError` NORM_INVALID."""
+    """Offset (deg) from an angle of the model `source` to that of `target`. Raises `PblError` NORM_INVALID."""
     for model in (source, target):
         if model not in ANGLE_MODELS:
             raise PblError(
@@ -110,7 +110,7 @@ _FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 class NormativeSet:
     """Healthy gait with which a cycle is compared."""
 
-    #: Identity, number of normative vectors, where they are from, how their angles are defined.
+    #: Identity, number of normative vectors, their source, definition of their angles.
     name: str
     version: int
     n: int
@@ -132,8 +132,8 @@ class NormativeSet:
     curves: dict[str, dict[str, np.ndarray]]
     source_sha256: str = ""  # of the file the set was built from
     sha256: str = ""  # of the numbers above, checked at loading
-    angle_model: str = PLUG_IN_GAIT  # how the angles of the vectors are defined, one of `ANGLE_MODELS`
-    mapped_from: str = ""  # the definition they were measured in, where they were mapped from another one; else empty
+    angle_model: str = PLUG_IN_GAIT  # definition of the angles, one of `ANGLE_MODELS`
+    mapped_from: str = ""  # the definition in which they were measured, if they were mapped from another one
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:
         """ln of the Euclidean distance of the component scores of (N, V * P) vectors to the normative mean."""
@@ -181,23 +181,23 @@ def fit_norm(
     mapped_from: str = "",
     source_sha256: str = "",
 ) -> NormativeSet:
-    """Principal components that explain `variance` of normative vectors (N, V * P), and their log distances.
+    """Fit principal components that explain `variance` of normative vectors (N, V * P), and their log distances.
 
     Schwartz & Rozumalski 2008 (Gait & Posture 28:351-357) for the index; components of the covariance matrix of the
     normative vectors alone or, as in the paper, of these together with the vectors `pooled` (M, V * P) of patients:
-    mean and log distances are those of the normative vectors either way. `n_components` stands for `variance`.
+    mean and log distances are those of the normative vectors either way. `n_components` replaces `variance`.
 
-    Raises `PblError` NORM_INVALID for too few vectors, no more vectors than components, another length or values that
-    are not finite; ANGLE_UNITS.
+    Raises `PblError` NORM_INVALID for too few vectors in all or for the components, another length or values that are
+    not finite; ANGLE_UNITS.
     """
     vectors = _vectors(vectors, variables, percent)
     _enough(len(vectors), n_components or 0)
     if angle_model not in ANGLE_MODELS:
         raise _invalid(f"angle model {angle_model!r}", f"one of {', '.join(ANGLE_MODELS)}")
     mean = vectors.mean(axis=0)
-    everybody = vectors if pooled is None else np.vstack([vectors, _vectors(pooled, variables, percent)])
-    _, singular, rows = np.linalg.svd(everybody - everybody.mean(axis=0), full_matrices=False)
-    spread = singular**2 / (len(everybody) - 1)
+    everyone = vectors if pooled is None else np.vstack([vectors, _vectors(pooled, variables, percent)])
+    _, singular, rows = np.linalg.svd(everyone - everyone.mean(axis=0), full_matrices=False)
+    spread = singular**2 / (len(everyone) - 1)
     if not spread.sum() > 0:
         raise _invalid("vectors without any variance", "different people")
     fraction = np.cumsum(spread) / spread.sum()
@@ -257,7 +257,7 @@ def _log_length(scores: np.ndarray) -> np.ndarray:
 def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     """A set that ships, by name, or a file of `NormativeSet.save`, by a path that ends in .json.
 
-    Raises `PblError` NORM_UNKNOWN; NORM_INVALID where the file is damaged or its people are too few for its components;
+    Raises `PblError` NORM_UNKNOWN; NORM_INVALID if the file is damaged or has too few people for its components;
     ANGLE_UNITS.
     """
     shipped = not name.endswith(".json")
@@ -301,7 +301,7 @@ def _checksum(data: dict) -> str:
     return hashlib.sha256(canonical_json({k: v for k, v in data.items() if k != "sha256"}).encode()).hexdigest()
 
 
-#: Fields that are no arrays, and what they are.
+#: Types of the fields that are not arrays.
 _PLAIN = {
     **dict.fromkeys(("name", "source", "licence", "convention", "source_sha256", "angle_model", "mapped_from"), str),
     **dict.fromkeys(("version", "n"), int),
@@ -323,7 +323,7 @@ def _from_json(data: dict, checksum: str) -> NormativeSet:
     bands = [np.stack([band[key] for key in ("percent", "mean_deg", "sd_deg")]) for band in norm.curves.values()]
     numbers = [norm.percent, norm.mean_deg, norm.components, norm.explained_variance, *bands]
     if norm.percent.ndim != 1 or not all(np.isfinite(n).all() for n in [*numbers, norm.ln_mean, norm.ln_sd]):
-        raise ValueError("numbers that are not finite, or percent that is no list")
+        raise ValueError("numbers that are not finite, or percent that is not a list")
     length = len(norm.variables) * len(norm.percent)
     k = len(norm.components)
     if (
@@ -342,7 +342,7 @@ def _from_json(data: dict, checksum: str) -> NormativeSet:
 
 
 def _enough(n: int, k: int) -> None:
-    """Whether `n` vectors carry an index of `k` components. Raises `PblError` NORM_INVALID."""
+    """Raise `PblError` NORM_INVALID unless `n` vectors suffice for an index of `k` components."""
     if n < MIN_VECTORS:
         raise _invalid(f"{n} vectors", f"at least {MIN_VECTORS}")
     if k >= n:

@@ -1,4 +1,4 @@
-"""The network of the event model: what it sees (`features`), what it is (`transformer`), and how it runs (`predict`).
+"""The network of the event model: its input (`features`), its layers (`transformer`), and its inference (`predict`).
 
 Import the module you need: JAX loads only with `transformer`.
 """

@@ -1,6 +1,6 @@
-"""What the model sees: the joints of both legs in a frame that goes and turns with the body, on an even grid.
+"""Input of the event model: the joints of both legs in a frame that moves and turns with the body, on an even grid.
 
-Everything here works on NumPy and on JAX arrays alike (`xp`), so that training and use share it to the letter.
+Everything here works on NumPy and on JAX arrays (`xp`), so that training and inference share the same code.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ HEADING_FRAMES = 51
 
 
 def features(joints_m: Any, known: Any, up: Any, leg_m: Any, xp: ModuleType = np) -> tuple[Any, Any]:
-    """Features (T, 40) and whether the frame holds any (T,), from joints (T, 5, 2, 3) and `known` (T, 5, 2).
+    """Features (T, 40) and whether the frame has any (T,), from joints (T, 5, 2, 3) and `known` (T, 5, 2).
 
     Origin: middle of the hips. Axes: ahead (horizontal, across the hip line averaged over a stride), left, `up` (3,).
-    Unit: `leg_m`. Frames without both hips hold nothing. What `joints_m` says where it is not known does not matter.
+    Unit: `leg_m`. Frames without both hips have none. Unknown values of `joints_m` do not matter.
     """
     hips = known[:, 0, 0] & known[:, 0, 1]
     clean = xp.where(known[..., None], joints_m, 0.0)
@@ -53,7 +53,7 @@ def heading(line_m: Any, known: Any, up: Any, xp: ModuleType = np) -> Any:
 def leg_length(joints_m: Any, known: Any, xp: ModuleType = np) -> Any:
     """A length of the leg (m): nearly the greatest distance of the ankles from the middle of the hips.
 
-    A heel stands for an ankle that is missing in the whole trial. NaN where neither is known.
+    A heel replaces an ankle that is missing in the whole trial. NaN if neither is known.
     """
     pelvis = 0.5 * (joints_m[:, 0, 0] + joints_m[:, 0, 1])
     hips = known[:, 0, 0] & known[:, 0, 1]

@@ -40,7 +40,7 @@ class Grid:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Phases:
-    """What the network says: `z` (N, 4) complex phases of left down, right up, right down, left up, 0 where nothing is
+    """Output of the network: `z` (N, 4) complex phases of left down, right up, right down, left up, 0 where nothing is
     seen; `walking` (N,) probability; `seen` (N,)."""
 
     z: np.ndarray
@@ -89,7 +89,7 @@ def predict(grid: Grid, model: str) -> Phases:
     padded[:n], there[:n] = values, seen
     cuts = np.array([s for s in starts if there[s : s + WINDOW].any()], int)
     total, weight = np.zeros((len(padded), 9)), np.zeros(len(padded))
-    # The middle of a window knows both sides; its ends count little where another window has them in its middle.
+    # The middle of a window has context on both sides; its ends count little where another window has its middle.
     ramp = 0.05 + np.minimum(np.arange(WINDOW), np.arange(WINDOW)[::-1]) / (WINDOW / 2)
     network, _ = load(model)
     run = _compiled()
@@ -111,14 +111,14 @@ def predict(grid: Grid, model: str) -> Phases:
 
 @functools.cache
 def load(model: str) -> tuple[Any, dict[str, Any]]:
-    """Network and what is known of it (`probability`: the calibration), by its name in `data/` or by path."""
+    """Network and its metadata (`probability`: the calibration), by its name in `data/` or by path."""
     from .transformer import load_model
 
     return load_model(model_path(model))
 
 
 def model_path(model: str) -> Path:
-    """Where the weights of a model lie. Raises `PblError` ASSET_MISSING."""
+    """Path of the weights of a model. Raises `PblError` ASSET_MISSING."""
     path = DATA / f"{model}.npz" if not model.endswith(".npz") else Path(model)
     if not path.is_file():
         raise PblError(
@@ -131,21 +131,17 @@ def model_path(model: str) -> Path:
 
 
 def check_model(model: str, sha256: str) -> None:
-    """Whether the weights are those that the method names. Raises `PblError` ASSET_MISSING."""
-    if sha256 and _sha256(model) != sha256:
+    """Raise `PblError` ASSET_MISSING unless the weights are those that the method names."""
+    if sha256 and model_sha256(model) != sha256:
         raise PblError(
             "ASSET_MISSING",
-            found=f"weights of the event model with SHA-256 {_sha256(model)}",
+            found=f"weights of the event model with SHA-256 {model_sha256(model)}",
             expected=f"SHA-256 {sha256}, as the method says",
             next_step="use the version of pbl-pipeline that the method came with, or a newer method",
         )
 
 
 @functools.cache
-def _sha256(model: str) -> str:
-    return model_sha256(model)
-
-
 def model_sha256(model: str) -> str:
     """SHA-256 of the weights' file."""
     return hashlib.sha256(model_path(model).read_bytes()).hexdigest()

@@ -106,7 +106,7 @@ def _turned(x: Float[Array, "T H D"]) -> Float[Array, "T H D"]:
 
 
 def save_model(path: str | Path, model: PhaseTransformer, about: dict[str, Any]) -> None:
-    """Write weights as float16 and `about` (what the model card says, calibration) to one npz."""
+    """Write weights as float16 and `about` (model card, calibration) to one npz."""
     named = {k: np.asarray(v, np.float16) for k, v in _named(eqx.filter(model, eqx.is_array)).items()}
     text = json.dumps({**about, "architecture": dataclasses.asdict(model.size)}, sort_keys=True)
     buffer = io.BytesIO()
@@ -115,7 +115,7 @@ def save_model(path: str | Path, model: PhaseTransformer, about: dict[str, Any])
 
 
 def load_model(path: str | Path) -> tuple[PhaseTransformer, dict[str, Any]]:
-    """The model and what was written beside it."""
+    """The model and its metadata."""
     with np.load(path, allow_pickle=False) as f:
         about = json.loads(str(f["about"]))
         arrays = {k: np.asarray(f[k], np.float32) for k in f.files if k not in ("about", "allow_pickle")}
