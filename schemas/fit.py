@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 schema = dj.Schema()
 
-#: Name in place of the methods before the fit where markers of a laboratory are fitted.
+#: Stands for the methods before the fit if laboratory markers are fitted.
 LABORATORY = "laboratory markers"
 #: Kinds of sets, which are never fitted, pooled or averaged with one another: videos of one camera each, trials of
 #: several calibrated cameras, marker recordings.
@@ -114,7 +114,7 @@ class TrialInput(dj.Computed):
 
     @staticmethod
     def with_trials(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """These keys of Keypoints, and those of the trials of which the videos are views."""
+        """Return these keys of Keypoints, and those of the trials whose views the videos are."""
         trial_of = trials_of([int(k["video_id"]) for k in keys])
         more = [{**k, "video_id": trial_of[v]} for k in keys if (v := int(k["video_id"])) in trial_of]
         return [*map(dict, keys), *(k for k in more if k not in keys)]
@@ -384,12 +384,12 @@ class SessionFit(dj.Computed):
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:
-    """The session of a set, by a key that holds `fit_set`.
+    """Return the session of a set, by a key with `fit_set`.
 
     It stands in every computed table below a set, so that its natural join with `session.Session` is its own visit and
     not every pair. A set never changes its session. The session's row is locked as the insert of a row that refers to
-    it does: here before other rows, so that who plans the session (which locks it, then its sets) waits and never meets
-    a deadlock.
+    it does, but before other rows, so that planning the session (which locks it, then its sets) waits instead of
+    deadlocking.
     """
     number = int(one(FitSet & {"fit_set": key["fit_set"]}, "session_id"))
     sessions = session.Session
@@ -429,6 +429,14 @@ def videos_of(trial: int) -> list[int]:
 def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
     """File of the calibration and the camera of each view; None for a video of one camera."""
     return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None
+
+
+def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:
+    """Return the library's `TrialFit` in a file of the store."""
+    from pbl_pipeline.fit import TrialFit
+
+    with stored_file(ref) as path:
+        return TrialFit.load(path)
 
 
 def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False) -> lib.Trial:

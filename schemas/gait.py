@@ -24,7 +24,7 @@ schema = dj.Schema()
 
 
 def measure_columns(prefix: str) -> str:
-    """Definition lines of a part table of measures; `measure_rows` gives its rows."""
+    """Definition lines of a part table of measures; `measure_rows` returns its rows."""
     return f"""
     -> master
     {prefix}             : varchar(32)         # name, with its unit
@@ -183,12 +183,9 @@ class GaitEvents(dj.Computed):
 
     @computes
     def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import detect_events, feet_from_fit
 
-        with stored_file(ref) as path:
-            trial = TrialFit.load(path)
-        return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
+        return detect_events(feet_from_fit(fit.load_trial(ref)), methods.stored(**method)), method["sha"]
 
     def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(
@@ -279,13 +276,10 @@ class GaitCycle(dj.Computed):
         correction: Mapping[str, Any] | None,
         accepted: float | None,
     ) -> tuple[tuple[lib.GaitCycle, ...], int | None]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
         from pbl_pipeline.qc import Check
 
-        with stored_file(ref) as path:
-            trial = TrialFit.load(path)
-        cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
+        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=[Check(*check) for check in checks])
         if accepted is not None and refused_cadence(cycles) == accepted:
             cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
@@ -383,14 +377,12 @@ class Spatiotemporal(dj.Computed):
         ref: dict,
         checks: Sequence[tuple],
     ) -> tuple[lib.Spatiotemporal]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
         from pbl_pipeline.qc import Check
 
         found = spatiotemporal([cycle_of_row(r, name) for r in rows])
         if activity in TASK_MEASURES:
-            with stored_file(ref) as path:
-                motion = task_motion(TrialFit.load(path))
+            motion = task_motion(fit.load_trial(ref))
             found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
         return (found,)
 

@@ -22,7 +22,7 @@ schema = dj.Schema()
 
 
 def profile_columns(prefix: str) -> str:
-    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` gives its rows."""
+    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` returns its rows."""
     return f"""
     -> master
     {prefix}_angle             : varchar(32)   # name
@@ -361,7 +361,7 @@ def profile_rows(profile: lib.MovementProfile | None, prefix: str) -> list[dict[
 def profile_of_rows(
     rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str
 ) -> lib.MovementProfile | None:
-    """The library's `MovementProfile`, None where there are no rows."""
+    """Return the library's `MovementProfile`; None without rows."""
     from pbl_pipeline.gait import NINE_ANGLES, MovementProfile
 
     if not rows:
@@ -419,7 +419,7 @@ def norm_keys(name: str) -> list[str]:
 
 
 def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
-    """What `norm_of_row` takes: name, checksum and, of a set that was built here, its file."""
+    """Return the arguments of `norm_of_row`: name, checksum and, for a set that was built here, its file."""
     name, sha256, stored = one(NormativeSet & key, "norm_name", "norm_sha256", "norm_file")
     return name, sha256, None if stored is None else file_ref(stored)
 

@@ -15,7 +15,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, check_columns, check_row, number
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref
 
 if TYPE_CHECKING:
     from pbl_pipeline import kinetics as lib
@@ -152,13 +152,11 @@ class Kinetics(dj.Computed):
         aid: str,
         method: Mapping[str, Any],
     ) -> tuple[lib.Kinetics, list[int], str]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.kinetics import visit_kinetics
 
         fits, walks = [], []
         for trial in trials:
-            with stored_file(trial["file"]) as path:
-                fits.append(dataclasses.replace(TrialFit.load(path), name=trial["trial_name"]))
+            fits.append(dataclasses.replace(fit.load_trial(trial["file"]), name=trial["trial_name"]))
             own = [gait.cycle_of_row(r, trial["trial_name"]) for r in cycles if r["video_id"] == trial["video_id"]]
             walks.append(_Walk(trial["events"], tuple(own), trial["pooled"]))
         found = visit_kinetics(fits, walks, methods.stored(**method), mass_kg=mass_kg, aid=aid)

@@ -22,7 +22,7 @@ _DAYS = {"day": 1.0, "week": 7.0, "month": 30.4375, "year": 365.25}
 
 
 def role_days(role: str) -> float | None:
-    """Days after the event that a role names: 42 for "6_weeks", -inf for those before it; None for one's own."""
+    """Days after the event that a role names: 42 for "6_weeks", -inf for those before it; None for custom ones."""
     if role in FIRST_ROLES:
         return -math.inf
     match = _AFTER.fullmatch(role)
@@ -30,7 +30,7 @@ def role_days(role: str) -> float | None:
 
 
 def is_role(text: str) -> bool:
-    """Whether a text can be a role: small letters, digits and underscores."""
+    """Return whether a text can be a role: small letters, digits and underscores."""
     return _ROLE.fullmatch(text) is not None
 
 

@@ -1,5 +1,5 @@
-"""Whether the tables on the server are those of this version of the code: asked at every start, before anything reads
-or writes them.
+"""Check that the tables on the server are those of this version of the code: at every start, before anything reads or
+writes them.
 
 The table `~migrations` in the schema `lab` has a row for each numbered migration (`schemas.migrations`) that the tables
 have been through. New tables are made as this version defines them, so they get all of its rows when they are created.

@@ -91,13 +91,10 @@ class KinematicError(dj.Computed):
         self, key: dict, fitted: Mapping[str, Any], reference: Mapping[str, Any]
     ) -> tuple[lib.KinematicErrors]:
         from pbl_pipeline import validation as lib
-        from pbl_pipeline.fit import TrialFit
 
-        with stored_file(fitted) as path:
-            trial = TrialFit.load(path)
         with stored_file(reference) as path:
             truth = lib.Reference.load(path)
-        return (lib.compare(trial, truth),)
+        return (lib.compare(fit.load_trial(fitted), truth),)
 
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
         self.insert1(

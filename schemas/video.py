@@ -354,7 +354,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
             found=f"{path} has SHA-256 {found}",
             expected=f"SHA-256 {sha256}, as registered",
             next_step="restore the original file, then `pbl populate --retry-errors`; "
-            "or `pbl ingest` the changed file as a video of its own",
+            "or `pbl ingest` the changed file as a separate video",
             key=f"video_id={key['video_id']}",
         )
     return Path(path)

@@ -1,4 +1,4 @@
-"""Who works on the queues: processes with their heartbeats, what they did by the minute."""
+"""Working processes with their heartbeats, and their throughput by the minute."""
 
 from __future__ import annotations
 

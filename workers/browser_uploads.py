@@ -1,5 +1,5 @@
-"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in as an upload
-of the drop folder is."""
+"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in like an
+upload of the drop folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from schemas.intake import Registered, VisitRecord
 from schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, check_opens, has_room, take_in
+from .incoming import VIDEO_ENDINGS, Copy, check_opens, take_in
 
 #: Age at which the rest of a broken upload is removed (s).
 _REST_S = 86_400.0
@@ -38,7 +38,7 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of a file: its name as it was sent; status as in `Registered`."""
+    """Outcome for a file: its name as it was sent; status as in `Registered`."""
 
     name: str
     status: str
@@ -81,7 +81,7 @@ class Arriving:
 
     @property
     def is_log(self) -> bool:
-        """Whether it is a sensor log, by its ending."""
+        """True for a sensor log, by its ending."""
         return self.path.suffix in LOG_ENDINGS
 
     def write(self, piece: bytes) -> None:
@@ -104,17 +104,6 @@ class Arriving:
         """Remove it; what was taken into the archive has another name and stays."""
         self._file.close()
         self.path.unlink(missing_ok=True)
-
-
-def check_room(n_bytes: int) -> None:
-    """Raise `PblError` FILE_UNWRITABLE where so many bytes do not fit into the archive."""
-    if not has_room(archive_dir(), n_bytes):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
-            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step="tell who runs the server",
-        )
 
 
 def check(arrived: Arriving) -> PblError | None:

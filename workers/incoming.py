@@ -1,12 +1,12 @@
-"""Recordings that phones upload: taken over from the drop folder when they are whole.
+"""Import of complete uploads from the drop folder of phones.
 
-Layout: SUBJECT/SESSION/FILE under the place that `PBL_INCOMING` names. Beside a video may lie the phone's sensor log of
-the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when it was the same
-in two runs at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then
-removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the next run goes
-on. A recording that cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
+Layout: SUBJECT/SESSION/FILE in the folder `PBL_INCOMING`. A video may have the phone's sensor log of the same name
+(.csv, .json, .zip; docs/phone_capture.md), which is imported with it. A file is complete if it was the same in two runs
+at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then removed from the
+drop folder: after an interruption the bytes are in at least one place, and the next run continues. A recording that
+cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
 
-Uploads are taken in random order: whatever one of them does to the run, no other waits behind it for ever.
+Uploads are imported in random order, so that none waits forever behind one that breaks the run.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from schemas.subject_codes import check_subject
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0
-#: What is a recording, by the ending; what is neither that nor a log is left alone and named.
+#: Endings of recordings; files that are neither recordings nor logs are ignored and named.
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
-#: After this time a run begins no further upload, and gives up one that is still being copied (s).
+#: Time after which a run begins no further upload, and that after which it gives up copying one (s).
 RUN_S, UPLOAD_S = 600.0, 600.0
-#: What reading a sensor log may take (s, bytes).
+#: Limits for reading a sensor log (s, bytes).
 LOG_S, LOG_BYTES = 60.0, 2**30
-#: What opening a recording may take (s, bytes).
+#: Limits for opening a recording (s, bytes).
 _OPEN_S, _OPEN_BYTES = 60.0, 2**31
 #: Space on the archive's disk that uploads do not fill (bytes).
 KEPT_FREE = 10**9
@@ -85,12 +85,12 @@ class Copy:
 def take_over(
     url: str | None = None, archive: Path | None = None, settled_s: float = SETTLED_S, run_s: float = RUN_S
 ) -> Taken | None:
-    """List the drop folder, and take what is whole. Safe to break off and to repeat.
+    """Import the complete uploads of the drop folder. Safe to interrupt and to repeat.
 
-    Returns None where another process does it now.
+    Returns None if another process is importing.
 
-    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE. What
-    was not taken until then stays in the drop folder.
+    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE.
+    Uploads that were not imported until then stay in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
     with worker.alone(LOCK, video.Video.connection) as obtained:
@@ -245,6 +245,14 @@ def has_room(folder: Path, n_bytes: int) -> bool:
     while not folder.is_dir():
         folder = folder.parent
     return shutil.disk_usage(folder).free >= n_bytes + KEPT_FREE
+
+
+def check_room(n_bytes: int, next_step: str) -> None:
+    """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
+    if not has_room(archive_dir(), n_bytes):
+        found = f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server"
+        expected = f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free"
+        raise PblError("FILE_UNWRITABLE", found, expected, next_step)
 
 
 def check_opens(path: Path, expected: str, next_step: str) -> None:

@@ -1,15 +1,14 @@
-"""Recordings that phones send, from the first part to the row: the parts as files of the archive, checked and put
-together, taken in as an upload of the drop folder is, and computed before everything else.
+"""Recordings that phones send, from the first part to the row: the parts as files of the archive, checked and joined,
+taken in like an upload of the drop folder, and computed before everything else.
 
-Every part is a file of its own, which has its name only when it is whole and on disk. Whatever breaks off, the parts
-that are there count, and all of them stay until the recording is registered.
+Every part is a separate file, which gets its name only when it is complete and on disk. After an interruption the
+existing parts count, and all of them stay until the recording is registered.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import shutil
 from pathlib import Path
 
@@ -19,10 +18,10 @@ from schemas.capture import UPLOADING
 from schemas.intake import VisitRecord, phone_recordings
 from schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders
-from schemas.operations.folders import private_folder, sync_folders
+from schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import KEPT_FREE, Copy, check_opens, has_room, take_in
+from .incoming import Copy, check_opens, take_in
 from .registry import FIRST
 
 
@@ -37,18 +36,6 @@ def missing(phone: Phone, sent: Sent) -> list[int]:
         return []
     here = {path.name for path in folder(phone, sent).iterdir()}
     return [n for n in range(sent.n_parts) if str(n) not in here]
-
-
-def check_room(sent: Sent) -> None:
-    """Raise `PblError` FILE_UNWRITABLE where a recording does not fit into the archive."""
-    # Twice: the parts stay until the whole is registered.
-    if not has_room(archive_dir(), 2 * (sent.video_bytes + sent.log_bytes)):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found="no room for the recording in the archive of the server",
-            expected=f"room for it twice, beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step="tell who runs the server; the recording stays on the phone until there is room",
-        )
 
 
 def check_part(sent: Sent, start: int, end: int, total: int) -> int:
@@ -75,12 +62,7 @@ def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -
     if hashlib.sha256(body).hexdigest() != sha256:
         raise upload_refused(f"part {number} with another SHA-256 than was sent", "it is sent again")
     here = folder(phone, sent)
-    new = here / f".{secrets.token_hex(6)}"
-    with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as target:
-        target.write(body)
-        target.flush()
-        os.fsync(target.fileno())
-    new.replace(here / str(number))
+    write_text(here / str(number), body)
     sync_folders(here, here)
 
 

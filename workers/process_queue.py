@@ -35,7 +35,7 @@ class Task:
 
     function: Callable[..., object]  # importable by name
     args: tuple[Any, ...]
-    broken: Callable[[str], PblError]  # error to report where the process died or exceeded a limit, from what happened
+    broken: Callable[[str], PblError]  # makes the error of a process that died or exceeded a limit
     file: str = ""  # name of the file that the function writes: its path is the first argument then
     open_files: contextlib.ExitStack = dataclasses.field(default_factory=contextlib.ExitStack)  # closed at the end
     seconds: float = math.inf  # limits of `limited`
@@ -67,7 +67,7 @@ class Work:
 
     @property
     def error(self) -> PblError | None:
-        """Why the task failed; None where it did not."""
+        """Error of a failed task, else None."""
         found = self._future.exception() if self.ended and not self._future.cancelled() else None
         return found if isinstance(found, PblError) else None
 

@@ -1,8 +1,8 @@
-"""The queue of a table: DataJoint's own job rows, filled in one statement, reserved, put back, fenced.
+"""The queue of a table: DataJoint's job rows, filled in one statement, reserved, put back, fenced.
 
-A job row is `pending`, `reserved` or `error`; a finished one is deleted, because the result row says that it is done.
-What a reservation needs to be told from a dead one: host, process and connection (DataJoint writes them), and the
-heartbeat of that process (`workers.heartbeat`).
+A job row is `pending`, `reserved` or `error`; a finished one is deleted, because the result row marks it as done. Host,
+process and connection (written by DataJoint) and the heartbeat of that process (`workers.heartbeat`) distinguish a live
+reservation from a dead one.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from schemas.transactions import repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
 
-#: Candidates looked at for each job that is wanted: others look at the same ones.
+#: Candidates that are read for each job: other workers read the same ones.
 _SPREAD = 4
-#: The longest that a job which was put back waits (s).
+#: Longest wait of a job that was put back (s).
 LONGEST_WAIT_S = 60.0
 #: Jobs that this process holds: table and hash of the key.
 _held: set[tuple[str, str]] = set()
@@ -36,7 +36,7 @@ _held: set[tuple[str, str]] = set()
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A reserved job. The reservation is its holder's as long as the row says what is written here."""
+    """A reserved job. The reservation is valid while its row has these values."""
 
     table: Any
     key: dict[str, Any]
@@ -61,7 +61,7 @@ def key_hash(key: Mapping[str, Any]) -> str:
 
 
 def is_held(table: Any, key: Mapping[str, Any]) -> bool:
-    """Whether this process has reserved the job and not ended it."""
+    """Return whether this process has reserved the job and not ended it."""
     return (table.__name__, key_hash(key)) in _held
 
 
@@ -94,7 +94,7 @@ def fill(
 
 
 def _is_long(keys: Any) -> str:
-    """Condition on keys: that of a long recording, or of a set with one."""
+    """Return the condition on keys of a long recording, or of a set with one."""
     long = video.VideoInfo.proj("n_frames") & f"n_frames > {LONG_FRAMES}"
     name = "video_id"
     if name not in keys.heading.primary_key:
@@ -112,7 +112,7 @@ def _alone(connection: Any, statement: Callable[[], int]) -> int:
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
-    """Delete jobs that are not needed any more: done by another route, or no longer asked for; returns how many."""
+    """Delete jobs that are done by another route or no longer requested; return how many."""
     n = 0
     for needless in (table.proj(), dj.Not(keys_of(table).proj())):
         if jobs := jobs_of(table) & which:  # most often there are none
@@ -123,8 +123,7 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 
 # --------------------------------------------------------------------------------------------------- reserving, ending
 def most_urgent(table: Any, where: str | None = None) -> int | None:
-    """Priority of the first job that can be taken now; None where there is none. `where`: of those for whose key a
-    condition holds."""
+    """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
     jobs = jobs_of(table)
     row = jobs.connection.query(
         f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
@@ -154,13 +153,13 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
 
 
 def anything_reserved_here() -> bool:
-    """Whether a process of this machine has a job in hand."""
+    """Return whether a process of this machine works on a job."""
     here = {"host": platform.node()}
     return any(len(jobs_of(table).reserved & here) for table in computed_tables())
 
 
 def finish(job: Claim) -> None:
-    """The job is done: its row goes, if it is still ours."""
+    """Delete the row of a finished job, if it is still ours."""
     _mine(job).delete_quick()
     let_go(job)
 
@@ -175,8 +174,8 @@ def fail(job: Claim, message: str, stack: str = "") -> bool:
 
 
 def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, **counts: int) -> bool:
-    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
-    columns of `schemas.jobs.COUNTS`. Whether it was ours."""
+    """Make the job pending again, earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
+    columns of `schemas.jobs.COUNTS`. Return whether it was ours."""
     ours = reset(_mine(job), reason, delay_s, **counts) == 1
     let_go(job)
     return ours
@@ -188,7 +187,7 @@ def let_go(job: Claim) -> None:
 
 
 def let_go_all() -> None:
-    """Forget every job: nothing is in hand any more. What is still reserved is freed like a dead process'."""
+    """Forget all jobs. Remaining reservations are freed like those of a dead process."""
     _held.clear()
 
 
@@ -225,7 +224,7 @@ def _mine(job: Claim) -> Any:
 
 
 class ReservationLost(Exception):
-    """Another worker holds the job by now: its result must not be written twice."""
+    """Raised if another worker holds the job by now: its result must not be written twice."""
 
 
 def hold(job: Claim) -> float:
@@ -248,7 +247,7 @@ def hold(job: Claim) -> float:
 
 
 def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, Any]] | None = None) -> Any:
-    """The error rows of a table, of one code or of some keys if asked."""
+    """Return the error rows of a table, optionally of one code or of some keys."""
     rows = jobs_of(table).errors
     if code is not None:
         if not code.replace("_", "").isalnum():

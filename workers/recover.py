@@ -16,12 +16,12 @@ from schemas.jobs import jobs_of
 from . import queue
 from .queue import Claim
 
-#: A worker that has not been seen for so long is dead. Its heart beats every `heartbeat.PERIOD_S`; this also outlasts
-#: a database that is away for a minute and a process that compiles.
+#: Time without a heartbeat after which a worker is dead (s). It exceeds `heartbeat.PERIOD_S`, a minute without the
+#: database, and a process that compiles.
 DEAD_AFTER_S = 180.0
 
-#: After so many crashes of its process a job becomes an error row; and after so many deaths of the whole worker that
-#: held it, which may have had another cause.
+#: Crashes of its process, and deaths of the whole worker that held it (which may have another cause), after which a job
+#: becomes an error row.
 CRASHES, DEATHS = 3, 10
 
 #: Exceptions that say nothing about the job: a signal, a lost server. DataJoint's own populate makes error rows of them
@@ -103,7 +103,7 @@ def _alive(row: dict[str, Any], table: Any) -> bool:
 
 
 def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.datetime) -> bool:
-    """Whether a process of this host lives; a number that a younger process carries by now counts as dead."""
+    """Return whether a process of this host lives; a number that a younger process has by now counts as dead."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -118,7 +118,7 @@ def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.date
 
 
 def _age_of_process(pid: int) -> float | None:
-    """Seconds since a process started; None where the system does not tell (no /proc)."""
+    """Return the seconds since a process started; None without /proc."""
     try:
         ticks = int(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19])
         uptime = float(Path("/proc/uptime").read_text(encoding="utf-8").split()[0])

@@ -78,13 +78,13 @@ def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
 
 
 def refresh(everything: bool | None = None) -> Refreshed | None:
-    """Look for what can be computed: free dead reservations, drop what a decision made outdated, queue what is missing.
+    """Look for computable keys: free dead reservations, drop results that a decision made outdated, queue missing ones.
 
-    What workers finish is queued at once (`after`), so a look is for what came from outside: new recordings, choices,
-    methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the recordings
-    that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
+    Followers of finished jobs are queued at once (`after`), so a look is for changes from outside: new recordings,
+    choices, methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the
+    recordings that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
 
-    Returns None where another process is at it.
+    Returns None while another process is looking.
 
     Parameters
     ----------
@@ -118,8 +118,8 @@ def recent() -> Scope:
 
 
 def refresh_scope(scope: Scope) -> Refreshed:
-    """`refresh` for some recordings alone, beside whoever looks at all: what of them can be computed is queued, what
-    nobody asks for any more is taken out of the queues."""
+    """Refresh some recordings alone, also while another process looks at all: queue what can be computed of them, and
+    remove obsolete jobs of them."""
     return _look(scope, own=True)
 
 
@@ -134,8 +134,8 @@ def queue_visit_of(video_id: int) -> None:
 
 
 def _look(scope: Scope | None, own: bool = False) -> Refreshed:
-    """Fill the queues with what of a scope (None: of all) can be computed. `own`: other recordings are left as they
-    are; else choices that a decision made outdated are dropped, and all queues are swept."""
+    """Queue what can be computed of a scope (None: of all). `own`: other recordings stay untouched; otherwise outdated
+    choices are dropped, and all queues are swept."""
     from schemas.tracking import drop_outdated_choices
 
     out, tables = Refreshed(), chain.computed_tables()
@@ -167,7 +167,7 @@ def _age_of_full_look() -> float:
         f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608
         args=(ALL,),
     ).fetchone()
-    return float("inf") if row is None or row[0] < 0 else float(row[0])  # in the future: the clock was set back
+    return float("inf") if row is None or row[0] < 0 else float(row[0])  # negative: the clock was set back
 
 
 def _note_full_look() -> None:

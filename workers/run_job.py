@@ -25,8 +25,8 @@ from . import queue
 from .queue import Claim, ReservationLost
 
 #: Outcomes of a job.
-DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has it", "failed", "later"
-#: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
+DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "another worker has it", "failed", "later"
+#: The key of the job is gone: a row above was deleted, or another selection replaced it. The job is deleted.
 VANISHED = "no longer asked for"
 
 #: Exceptions of the driver and DataJoint about the database: where it is away, full or read-only the computed result is
@@ -40,7 +40,7 @@ DATABASE_ERRORS = (
 REPEATS = 10
 #: Attempts of a job whose inputs are gone or changed, and how long it waits after each but the last (s).
 ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
-#: Errors of the file system that say nothing about the job: store full, read-only, away.
+#: Errors of the file system that are unrelated to the job: store full, read-only, away.
 STORE_GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EACCES)
 #: How long a job waits after such an error (s).
 STORE_WAIT_S = queue.LONGEST_WAIT_S
@@ -67,7 +67,7 @@ class Computed:
     result: tuple
 
     def of(self, fetched: tuple) -> bool:
-        """Whether these inputs are the same."""
+        """Return whether these inputs are the same."""
         try:
             if bool(fetched == self.fetched):
                 return True
@@ -154,7 +154,7 @@ class _Attempt:
 
 
 def _is_wanted(job: Claim) -> bool:
-    """Whether the key can still be computed: its rows above are there, and it is still asked for."""
+    """Return whether the key can still be computed: its rows above exist, and it is still requested."""
     return bool(keys_of(job.table) & job.key)
 
 
@@ -213,7 +213,7 @@ def number_of(error: BaseException) -> int:
 
 
 def is_gone(error: BaseException) -> bool:
-    """Whether an error says that the database cannot be reached."""
+    """Return whether an error means that the database cannot be reached."""
     return isinstance(error, LostConnectionError) or (isinstance(error, DATABASE_ERRORS) and number_of(error) in AWAY)
 
 
@@ -240,8 +240,7 @@ def wait_for_database(
 
 
 def fetch_batch(jobs: Sequence[Claim]) -> list[tuple | None]:
-    """The inputs of several jobs of one table; None where they cannot be fetched (what is wrong is said when the job
-    runs alone)."""
+    """Return the inputs of several jobs of one table; None if they cannot be fetched (the job alone reports why)."""
     table, out = jobs[0].table(), []
     for job in jobs:
         try:
@@ -256,7 +255,8 @@ def fetch_batch(jobs: Sequence[Claim]) -> list[tuple | None]:
 def compute_batch(jobs: Sequence[Claim], fetched: Sequence[tuple | None]) -> list[Computed | None]:
     """Compute several jobs together (`make_computes` of their table); touches no database.
 
-    A job without inputs, or of a batch that fails, gives None: it is then run alone, and its error is its own.
+    The result is None for a job without inputs or of a batch that fails: it is then run alone and reports its own
+    error.
     """
     out: list[Computed | None] = [None] * len(jobs)
     good = [i for i, f in enumerate(fetched) if f is not None]

@@ -20,7 +20,7 @@ CADENCE_PER_MIN = 3.0
 
 
 class SelfTestFailed(Exception):
-    """This machine computes something else than it should, or cannot reach what it needs."""
+    """Raised if this machine computes wrong results, or cannot reach what it needs."""
 
 
 def check(tables: Sequence[Any]) -> None:

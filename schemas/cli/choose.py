@@ -33,7 +33,7 @@ def choose(
     note: str,
     usable: bool,
 ) -> None:
-    """Measure PERSON of video VIDEO_ID, or nobody. The choice wins over the automatic one.
+    """Measure PERSON of video VIDEO_ID, or leave the video out. The choice overrides the automatic one.
 
     What was computed for another person is deleted and listed; `pbl populate` computes it anew. Without PERSON nothing
     changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of

@@ -66,7 +66,7 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
     "Example: pbl study slice spine2026",
 )
 @click.argument("name", required=False)
-@click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of everybody).")
+@click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of all).")
 @click.option("--role", "roles", multiple=True, help="Visits of this role; repeat for several (else: all).")
 @click.option("--event", default="", help="What the days of the visits count from, such as surgery.")
 @click.option("--note", default="", help="Shown on the report.")

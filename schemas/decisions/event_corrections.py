@@ -1,4 +1,4 @@
-"""Events that a person corrects: what the page shows, saving them, and going back to the detected ones."""
+"""Correction of gait events: their state on the page, saving, and return to the detected ones."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Shown:
 
 
 def shown(video_id: int) -> Shown | None:
-    """The events of a recording; None where none were detected in a current fit of it yet."""
+    """Return the events of a recording; None before any were detected in a current fit."""
     trial = fit.trial_key(fit.trial_of(video_id))
     key = None if trial is None else gait.newest_events(trial)
     if key is None:
@@ -84,11 +84,11 @@ def shown(video_id: int) -> Shown | None:
 
 
 def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen: str) -> dict[str, int]:
-    """Write the events of a trial as a person set them, with a row of Decision: one transaction.
+    """Write the events that a person set in a trial, with a row of Decision, in one transaction.
 
-    The detected events stay, and so do earlier corrections. Events that are the detected ones again are no correction:
-    the last one is withdrawn, as by `take_back`. Cycles, measures and indices that were computed from other
-    events of this trial are deleted and pending again.
+    The detected events stay, and so do earlier corrections. Restoring the detected events withdraws the last
+    correction, as `take_back` does. Cycles, measures and indices that were computed from other events of this trial are
+    deleted and pending again.
 
     Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without
     events; USAGE where nothing was changed.
@@ -165,7 +165,7 @@ def _of_events(key: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _standing(key: Mapping[str, Any]) -> list[Person]:
-    """The people of whose events the last correction was not withdrawn."""
+    """Return the people whose last correction was not withdrawn."""
     rows = (gait.EventCorrection & _of_events(key)).to_dicts(order_by="correction_no")
     last = {(r["correction_tracking"], r["correction_person"]): bool(r["correction_withdrawn"]) for r in rows}
     return [person for person, withdrawn in last.items() if not withdrawn]

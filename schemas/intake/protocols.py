@@ -34,7 +34,7 @@ class Step:
 
     @property
     def complete(self) -> bool:
-        """Whether the visit has all of its passes."""
+        """True if the visit has all of its passes."""
         return self.done >= self.passes
 
 

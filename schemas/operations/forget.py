@@ -1,11 +1,11 @@
 """Remove a person: every row, every queued job, every stored file, and write a list that proves it.
 
-Recordings (in the archive, the drop folder and where they were registered) go only where that is asked for; copies and
-temporary files that killed processes left go in any case.
+Recordings (in the archive, the drop folder and where they were registered) are deleted on request only; copies and
+temporary files of killed processes in any case.
 
 The columns of a row identify its person: a subject's code, or the number of a session, video or set of videos of that
-person. Every table that depends on a person has one of them (a test checks all foreign keys), also the queues, which
-have no foreign keys at all; DataJoint's cascading delete reaches neither queues nor files.
+person. Every table that depends on a person has one of them (a test checks all foreign keys). So do the queues, which
+have no foreign keys; DataJoint's cascading delete reaches neither queues nor files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from schemas.operations import archive
 from schemas.operations.archive import archive_dir
 from schemas.operations.folders import remove_empty, write_json
 from schemas.rows import delete_below
-from schemas.store import files_below, purge, store_error
+from schemas.store import files_below, purge, store_errors
 from schemas.subject_codes import check_subject
 
 from . import catalog
@@ -59,12 +59,6 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
     return gone, kept
 
 
-def find_recordings(subject: str) -> list[str]:
-    """Return the person's files in the archive, copies of a killed import included, and in the drop folder."""
-    parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)
-    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
-
-
 def _drop() -> Folder | Bucket | None:
     url = os.environ.get("PBL_INCOMING")
     return drop_folder(url) if url else None
@@ -80,7 +74,7 @@ def delete_uploads(subject: str) -> list[str]:
     if drop is None:
         return gone
     for name, upload in _uploads(drop, subject).items():
-        with contextlib.suppress(OSError):  # what cannot be removed is found again, and named
+        with contextlib.suppress(OSError):  # a file that cannot be removed is found again, and named
             drop.remove(upload)
             gone.append(name)
     drop.remove_folders(subject)
@@ -119,7 +113,7 @@ Ids = dict[str, list[Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Everything there is of a person."""
+    """All that is stored of a person."""
 
     rows: dict[str, int]  # table -> number of rows
     files: list[str]  # paths in the store, including files without a row
@@ -152,12 +146,13 @@ def manifest_path(subject: str) -> Path:
 
 
 def find(subject: str) -> tuple[Ids, Found]:
-    """Return everything there is of a person; change nothing.
+    """Return all that is stored of a person; change nothing.
 
     Raises `PblError` DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
     """
     ids, earlier = _identities(subject), read_manifest(subject)
-    recordings = find_recordings(subject)
+    parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)  # copies are of a killed import
+    recordings = [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
     if not lab.Subject & {"subject": subject} and not earlier and not recordings:
         raise PblError(
             "DB_NOT_FOUND",
@@ -180,7 +175,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     Parameters
     ----------
     videos
-        Delete the video files as well, where they still are what was registered.
+        Also delete the video files that are unchanged since registration.
     """
     try:
         with worker.alone(archive.LOCK, connection.connect()) as obtained:
@@ -252,7 +247,7 @@ def _identities(subject: str) -> Ids:
 
 
 def _still_free(ids: Ids) -> Ids:
-    """Return the numbers of an earlier run that are unused now: in a rebuilt database another person may have them."""
+    """Return the numbers of an earlier run that are unused: in a rebuilt database they may be another person's."""
     owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
     return {
         name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
@@ -282,7 +277,8 @@ def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
     # All files in the person's folders: a computation that was killed leaves some without a row.
     store = connection.store_backend()
     files.update(path for folder in _folders(ids) for path in files_below(store, folder))
-    files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
+    with store_errors():
+        files.update(path for path in earlier.get("files", []) if path not in files and store.exists(path))
     return Found(rows, sorted(files), _videos(ids, earlier), running, recordings)
 
 
@@ -318,13 +314,6 @@ def _folders(ids: Ids) -> list[str]:
         if name in {c.name for c in columns}
         for value in ids[name]
     ]
-
-
-def _exists(path: str) -> bool:
-    try:
-        return bool(connection.store_backend().exists(path))
-    except Exception as error:
-        raise store_error(error) from error
 
 
 def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
@@ -368,10 +357,8 @@ def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:
     say(f"Removing {len(files)} files from the store")
     with progress.bar("files", total=len(files), unit="file") as update:
         for path in files:
-            try:
+            with store_errors():
                 store.remove(path)
-            except Exception as error:
-                raise store_error(error) from error
             if store.protocol == "file":
                 # The names of the folders carry the person's numbers.
                 remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
@@ -412,7 +399,7 @@ def read_manifest(subject: str) -> dict[str, Any]:
         found = json.loads(manifest_path(subject).read_text(encoding="utf-8"))
         kinds = {"ids": dict, "files": list, "videos": list, "rows": dict}
         if not isinstance(found, dict) or not all(isinstance(found.get(n, k()), k) for n, k in kinds.items()):
-            raise TypeError("no list of a person's rows and files")
+            raise TypeError("not a list of a person's rows and files")
         return found
     except FileNotFoundError:
         return {}

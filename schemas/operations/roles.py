@@ -1,4 +1,4 @@
-"""Accounts on the database server that have only the rights their work needs.
+"""Accounts on the database server with only the rights that their work needs.
 
 | role | may |
 |---|---|
@@ -6,8 +6,8 @@
 | worker | read, insert, change and delete rows; no table is created, changed or dropped |
 | analyst | read |
 
-The statements are the same on MySQL 8 and MariaDB. DataJoint creates tables when it first meets them, so an admin
-declares all of them before (`pbl db init`, `pbl db migrate`).
+The statements are the same on MySQL 8 and MariaDB. DataJoint creates tables on first use, so an admin declares all of
+them before (`pbl db init`, `pbl db migrate`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Account:
     role: str
     user: str
     host: str  # where it may connect from, as in MySQL: `%` is anywhere
-    schemas: tuple[str, ...] = ()  # custom schemas, without the prefix, with all rights; `mylab` includes `mylab_...`
+    schemas: tuple[str, ...] = ()  # custom schemas with all rights, without the prefix; `mylab` includes `mylab_...`
 
     def __post_init__(self) -> None:
         for name in self.schemas:

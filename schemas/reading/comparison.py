@@ -142,7 +142,7 @@ class Comparison:
 
     @property
     def same_methods(self) -> bool:
-        """Whether one chain of methods made all results that there are."""
+        """True if one chain of methods made all results."""
         return len({(r.kind, r.methods) for c in self.compared if (r := c.about.result) is not None}) <= 1
 
 

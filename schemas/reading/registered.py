@@ -1,4 +1,4 @@
-"""What is registered: people, visits, videos and methods as frames, a row for each."""
+"""Registered people, visits, videos and methods as frames, a row for each."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ class ShownCheck:
 
     @property
     def may_be_accepted(self) -> bool:
-        """Whether a person can accept it (`review_decisions.may_be_accepted`)."""
+        """True if a person can accept it (`review_decisions.may_be_accepted`)."""
         return may_be_accepted(self.check.check, self.check.outcome)
 
 
@@ -207,7 +207,7 @@ def video_facts(recording: Recording) -> dict[str, Any]:
 
 
 def computations(video_id: int) -> tuple[Any, ...]:
-    """Return what tells apart the computations that the shown fit of a recording and its events come from.
+    """Return the identity of the computations of the shown fit of a recording and its events.
 
     Raises as `ShownRecording.fitted`.
     """

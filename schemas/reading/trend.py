@@ -1,4 +1,4 @@
-"""All visits of a person in time: the index or a measure of each, with its interval and its changes."""
+"""Visits of a person in time: the index or a measure of each, with its interval and changes."""
 
 from __future__ import annotations
 

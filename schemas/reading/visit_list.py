@@ -1,7 +1,7 @@
-"""A list of visits to look through: searched, filtered, a page at a time, each with its index, its trend and its state.
+"""List of visits: searched, filtered, a page at a time, each with its index, its trend and its state.
 
-Plain SQL with arguments: what a person types is never part of a statement, and a page of 50,000 visits is one question
-for the numbers and a few for the rows that are shown (`python -m research.benchmarks.visit_list`).
+Plain SQL with arguments: user input is never part of a statement, and a page of 50,000 visits is one query for the
+numbers and a few for the rows that are shown (`python -m research.benchmarks.visit_list`).
 """
 
 # Names of tables are DataJoint's own, quoted, and every value is an argument.
@@ -30,7 +30,7 @@ from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: States of a visit to filter by. empty: no one is in any of its usable videos; unusable: it has no usable video.
+#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video.
 STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
@@ -63,7 +63,7 @@ class Result:
 
     sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
     outcome: worst check, empty before the checks are computed, ACCEPTED where a person accepted every one that asked
-    for attention; worst: the names of those that nobody accepted. corrected: a person corrected events.
+    for attention; worst: the names of those that no one accepted. corrected: a person corrected events.
     """
 
     kind: str
@@ -236,7 +236,7 @@ def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
-    """All visits of a person, newest first."""
+    """Return all visits of a person, newest first."""
     newest_first = "ORDER BY s.session_date DESC, s.session_id DESC"
     rows = _ask(f"SELECT {_VISIT} FROM {_visits()} WHERE s.subject = %s {newest_first}", [subject])
     return _visit_rows(rows)
@@ -297,8 +297,8 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 
 
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
-    """Checks that ask for attention and that nobody accepted, by the key of a result of these visits of which somebody
-    accepted one since it was computed."""
+    """Return the open checks (WARN, not accepted) of the results of these visits of which at least one was accepted
+    since they were computed, by the key of the result."""
     accepted: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
         about = row["decision_about"]
@@ -313,7 +313,7 @@ def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
 
 
 def _settled() -> set[int]:
-    """Visits in which a person accepted every check that asked for attention."""
+    """Return the visits in which a person accepted every check that asked for attention."""
     asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
     found = results_of(int(i) for i in asked.to_arrays("session_id"))
     outcomes = {i: {r.outcome for r in results} for i, results in found.items()}
@@ -365,7 +365,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
             else:
                 add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
     if wanted.state in ("computed", "pending"):
-        # Asked for first: as a part of the question the server would answer them for each visit.
+        # Queried first: as subqueries the server would evaluate them for each visit.
         questions = (_waiting(), _failed(), _empty(), _unusable())
         apart = {int(i) for question in questions for (i,) in _ask(question, [])}
         unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
@@ -420,10 +420,10 @@ def _waiting() -> str:
 def _empty() -> str:
     """Visits without a person in any of their usable videos."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
-    nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
-    some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"
+    without = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
+    some = f"SELECT b.session_id FROM {videos} b JOIN ({without}) c ON c.video_id = b.video_id"
     return (
-        f"SELECT o.session_id FROM {videos} o LEFT JOIN ({nobody}) n ON n.video_id = o.video_id"
+        f"SELECT o.session_id FROM {videos} o LEFT JOIN ({without}) n ON n.video_id = o.video_id"
         f" WHERE o.session_id IN ({some}) AND {_is_usable('o')}"
         " GROUP BY o.session_id HAVING SUM(n.video_id IS NULL) = 0"
     )
@@ -452,7 +452,7 @@ def _failed(column: str = "") -> str:
         if queue_name(table) not in there:
             continue
         jobs, names = quote(*queue_name(table)), table.heading.primary_key
-        if "fit_set" in names:  # of an older set nobody waits for
+        if "fit_set" in names:  # jobs of older sets do not count
             same = "c.fit_set = e.fit_set AND c.fit_method = e.fit_method AND c.fit_current = 1"
             of = f"{_name(fit.FitSet)} o USING (fit_set) JOIN {_name(fit.FitSelection)} c ON {same}"
             failed = f"{jobs} e JOIN {of} WHERE e.status = 'error'"

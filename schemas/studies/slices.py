@@ -124,10 +124,10 @@ def freeze(
 
 
 def study_data(name: str, curves: bool = True) -> StudyData:
-    """The rows of a slice as frames: its visits, whether they count, and its methods are the frozen ones, values those
-    that the tables hold now (`changes` says whether they are the same).
+    """Return the rows of a slice as frames: visits, their inclusion and methods as frozen, values as the tables hold
+    them now (`changes` compares them).
 
-    Set-based but for the curves, whose files are read one by one (`curves` False leaves them out).
+    Set-based except for the curves, whose files are read one by one (`curves` False leaves them out).
 
     Raises `PblError` DB_NOT_FOUND for an unknown slice; STUDY_INVALID as `StudyData`.
     """
@@ -151,8 +151,8 @@ def study_data(name: str, curves: bool = True) -> StudyData:
 
 
 def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
-    """Of each visit, how what was pooled was filmed, and how many videos it has and how many are marked as not usable,
-    with the reasons. No part of the frozen hash."""
+    """Return for each visit how its pooled recordings were filmed, and the numbers of its videos and of those marked as
+    not usable, with the reasons. Not part of the frozen hash."""
     import pandas as pd
 
     chain = {k: about[k] for k in ("fit_set_kind", "fit_method", "gait_method", "gdi_method")}
@@ -346,7 +346,7 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _groups(visits: Any, cohort: str | None) -> Any:
-    """Of each visit's person: the group in the cohort, else the population."""
+    """Return for each visit the person's group in the cohort, else the population."""
     if cohort is None:
         return visits["population"]
     members = study.CohortMember & {"cohort": cohort} & "member_group != ''"

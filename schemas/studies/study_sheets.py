@@ -1,4 +1,4 @@
-"""Visits, scores, cohorts and trials of a study from sheets (`pbl study import`, docs/files.md)."""
+"""Import of visits, scores, cohorts and trials of a study from sheets (`pbl study import`, docs/files.md)."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def import_sheets(paths: Sequence[Path], dry_run: bool = False, distinct_codes: 
 
 
 def import_rows(sheets: Sequence[Sheet], dry_run: bool = False, distinct_codes: bool = False) -> Imported:
-    """As `import_sheets`, of sheets that were read, inside a transaction of the caller."""
+    """Import sheets that were read as `import_sheets` does, inside a transaction of the caller."""
     plan = _Plan(sheets, distinct_codes)
     lines = list(plan.lines.values())
     done = not dry_run and not any(line.errors for line in lines)

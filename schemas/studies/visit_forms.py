@@ -28,7 +28,7 @@ NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
 DISTINCT = "distinct"
 #: Fields of a registered visit and the most characters; height (m) and population are of the person.
 FACTS = {"height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
-#: What the names of the fields of a recording begin with; its video_id follows.
+#: Prefixes of the names of the fields of a recording, followed by its video_id.
 ACTIVITY, PACE = "activity:", "pace:"
 _NUMBERS = ("height_m", "mass_kg")
 #: Kind of decision by the first part of a field's name.
@@ -51,7 +51,7 @@ USUAL_ROLES = (*study.FIRST_ROLES, "6_weeks", "3_months", "6_months", "12_months
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """What is stored of a visit, as a form shows it."""
+    """Stored values of a visit, as a form shows them."""
 
     session_id: int
     subject: str
@@ -62,7 +62,7 @@ class Form:
 
     @property
     def seen(self) -> str:
-        """Another text after each change."""
+        """Text that differs after each change."""
         text = json.dumps([self.session_id, self.values], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -72,7 +72,7 @@ class Form:
         return number_of(Row(name, {}), name, text[:40]) if text and numeric else text or None
 
     def same(self, name: str, text: str) -> bool:
-        """Return whether a text is what is stored, also written otherwise: 1,80 for 1.8."""
+        """Return whether a text is the stored value, also in another notation: 1,80 for 1.8."""
         try:
             return text == self.values[name] or self.stored(name, text) == self.stored(name, self.values[name])
         except PblError:
@@ -203,7 +203,7 @@ def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str]
 
     Raises `PblError` DB_NOT_FOUND, USAGE, DECIDED_MEANWHILE.
     """
-    session.lock(session_id)  # who enters at the same moment waits here
+    session.lock(session_id)  # a concurrent entry waits here
     now = read(session_id)
     if unknown := sorted(set(given) - set(now.values)):
         raise PblError(
@@ -261,7 +261,7 @@ def _enter(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tupl
     rows = {name: Row(name, {**of_visit, **cells[name]}) for name in changed if name not in errors}
     roles = Sheet(ROLE, ("subject", "visit", ROLE), tuple(r for n, r in rows.items() if n == ROLE))
     scores = Sheet("scores", SCORE_COLUMNS, tuple(r for n, r in rows.items() if n != ROLE))
-    # Codes that are alike are a question to who registers people, not to who enters a score.
+    # Similar codes are asked about at registration, not at the entry of a score.
     found = import_rows([s for s in (roles, scores) if s.rows], dry_run=bool(errors), distinct_codes=True)
     errors |= {line.where: line.errors[0] for line in found.lines if line.errors}
     if errors:

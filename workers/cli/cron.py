@@ -118,7 +118,7 @@ def reprocess() -> None:
 def backup(keep: int) -> None:
     """Save database, store and recordings into a new folder of PBL_BACKUP, and remove the oldest.
 
-    A person who was forgotten is gone from the backups, too, when the last one from before that is removed.
+    A person who was forgotten is also gone from the backups once the last older one is removed.
 
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
     """

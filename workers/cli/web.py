@@ -130,5 +130,5 @@ def list_() -> None:
 
 
 def _password() -> str:
-    """Asked for at the terminal, never an argument, which others would see among the processes."""
+    """Ask for a password at the terminal: an argument would be visible among the processes."""
     return click.prompt("Password (15 characters or more)", hide_input=True, confirmation_prompt=True)

@@ -1,4 +1,4 @@
-"""Addresses of the page: each declares the right that it needs, and the look at a person that opening it is."""
+"""Addresses of the page: each declares its right, and the look at a person that it records."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Address(Route):
 
 
 def page(path: str, answer: Callable[..., Any], right: str, *, look: str = "") -> list[Address]:
-    """Return the addresses of a page: as JSON of its values, and as HTML."""
+    """Return the addresses of a page: as JSON and as HTML."""
     return [Address(path + JSON, answer, right, look=look), Address(path, answer, right, look=look)]
 
 

@@ -1,4 +1,4 @@
-"""The application: which address is answered by which page, and what is said where something does not work."""
+"""The application: addresses with their pages, and the answers to errors."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ _KEEP = "public, max-age=31536000, immutable"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
-    on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None where
-    links open the page; secure: browsers reach it by TLS; folder: results that are shown in place of the tables;
+    """Options of the page. hosts: names in a Host header that are answered; name and roles: of the person who opens a
+    link; on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None
+    where links open the page; secure: browsers reach it by TLS; folder: results that are shown instead of the tables;
     target: what the process runs that computes a visit."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})

@@ -83,7 +83,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
 
 
 def charts_of(found: comparison.Comparison, names: Sequence[str], language: str = "en") -> list[Chart]:
-    """Every angle of which any result has curves, in the order of the report."""
+    """Return the charts of all angles with curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
         sides, far = {}, {}
@@ -145,7 +145,7 @@ def without(found: comparison.Comparison) -> dict[tuple[str, ...], list[str]]:
 
 
 def _name(one: comparison.Side) -> str:
-    """What tells a result from the others, without the person's code."""
+    """Return a distinct name of a result, without the person's code."""
     label = one.about.row.label
     if len(one.about.results) < 2 or one.about.result is None:
         return label

@@ -1,4 +1,4 @@
-"""Judge a recording: whether it is usable, and its events by hand. Each decision is a row (`schemas.decisions`)."""
+"""Marks of recordings as not usable, and corrected events. Each decision is a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EVENTS = {"d": "foot_down", "u": "foot_up"}
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """What was decided of a recording, and the state in which the page shows it. views: videos of its trial, which are
+    """Decisions about a recording, and the state in which the page shows it. views: videos of its trial, which are
     marked together; events: those that count, None where none were searched."""
 
     mark: not_usable.Unusable | None
@@ -34,7 +34,7 @@ class Judged:
 
 
 def judged(video_id: int) -> Judged:
-    """Of a registered recording. Reads tables."""
+    """Return the decisions about a registered recording. Reads tables."""
     views = fit.videos_of(fit.trial_of(video_id))
     mark = not_usable.unusable([video_id]).get(video_id)
     return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown(video_id))

@@ -15,7 +15,7 @@ from .address import Address, number_of
 from .pages import Pages, in_field, reader_language
 from .tables import Tables
 
-#: What the names of the fields begin with: an instrument may be called as another field of the form.
+#: Prefix of the names of the fields: an instrument may have the name of another field of the form.
 _FIELD = "value:"
 
 

@@ -42,7 +42,7 @@ async def archive_of(visit: Visit, name: str) -> Response:
     def write() -> Path:
         from pbl_pipeline.export import ExportOptions, write_export
 
-        # As a reviewer sees it: what failed a check says so in its files.
+        # As a reviewer sees it: the files state failed checks.
         options = ExportOptions(number_trials=True, allow_failed=True)
         out, archive = folder.path / "files", folder.path / "visit.zip"
         paths = write_export(visit, FORMATS, out, options)

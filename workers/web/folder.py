@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import functools
 from collections.abc import Hashable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from pbl_pipeline.words import MEASURES
 from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
 from schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
 from schemas.reading.visit_progress import Progress
+from schemas.subject_codes import day_of
 
 from .access import REPORT_POLICY
 from .address import Address, interval, number_of, page
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 _MOST, _DEEP = 1000, 3
 #: Visits that are kept in memory at a time.
 _KEPT = 4
-#: Endings of a recording that is looked for beside its results.
+#: Endings of recordings that are searched beside their results.
 _VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where a visit lies: its name, its folder, and the numbers that its recordings have here."""
+    """Name and folder of a visit, and the numbers of its recordings here."""
 
     name: str
     path: Path
@@ -118,7 +118,7 @@ class ResultsFolder:
         )
 
     def state(self, number: int) -> Hashable:
-        """Return what tells apart what was fitted to a recording."""
+        """Return a value that changes with the fit of a recording."""
         of, name = self._of_recording(number)
         path = self._places[of].path / f"{name}.{FIT}"
         return str(path), path.stat().st_mtime_ns
@@ -216,7 +216,7 @@ class ResultsFolder:
             session_id=number,
             subject="" if visit is None else _subject(visit),
             label=place.name,
-            day=None if visit is None else _day(visit),
+            day=None if visit is None else day_of(visit.date),
             role="",
             videos=len(place.recordings) if visit is None else len(visit.recordings),
             state=state,
@@ -296,14 +296,6 @@ def _tasks(visit: Visit) -> dict[str, dict[str, tuple[Measure | None, str]]]:
 
 def _subject(visit: Visit) -> str:
     return "" if visit.subject == "-" else visit.subject
-
-
-def _day(visit: Visit) -> datetime.date | None:
-    """Return the day of a visit; None where the files have none, or text that is not a day."""
-    try:
-        return datetime.date.fromisoformat(visit.date)
-    except ValueError:
-        return None
 
 
 def _facts_of_fit(recording: Recording) -> dict[str, Any]:

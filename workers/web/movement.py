@@ -22,7 +22,7 @@ POINT_STEPS, _FAR = 2, 2.0
 
 @dataclasses.dataclass(frozen=True)
 class Movement:
-    """What a recording's page asks for: `movement_json`, the numbers of `body_json`, `points_bytes`."""
+    """Data of a recording's page: `movement_json`, the numbers of `body_json`, `points_bytes`."""
 
     movement: bytes
     body: bytes
@@ -30,7 +30,7 @@ class Movement:
 
     @classmethod
     def of(cls, found: Recording) -> Movement:
-        """All three. Raises as they do."""
+        """Return all three. Raises as they do."""
         body, numbers = body_json(found)
         return cls(movement_json(found, body), numbers, points_bytes(found))
 

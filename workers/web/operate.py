@@ -107,7 +107,7 @@ def _whose(key: dict[str, Any]) -> dict[str, int]:
 
 
 def _key(text: str) -> dict[str, Any] | None:
-    """The key of a job as a form names it; None for none. Raises `Refused` for what is no key."""
+    """The key of a job as a form names it; None for none. Raises `Refused` for an invalid key."""
     if not text:
         return None
     try:

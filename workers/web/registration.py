@@ -17,7 +17,7 @@ from schemas.studies import visit_forms
 
 from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
-from ..incoming import VIDEO_ENDINGS, Copy
+from ..incoming import VIDEO_ENDINGS, Copy, check_room
 from ..refresh import queue_visit
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
@@ -28,7 +28,8 @@ from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
-_on_disk = functools.partial(on_disk, "tell who runs the server")
+_NEXT_STEP = "tell who runs the server"
+_on_disk = functools.partial(on_disk, _NEXT_STEP)
 _busy = functools.partial(
     PblError,
     "DB_REFUSED",
@@ -122,7 +123,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             raise Refused("form")
         to = await tables.ask(browser_uploads.place, number_of(request))
         request.scope.get(MORE_TIME, lambda: None)()
-        await _on_disk(browser_uploads.check_room, int(request.headers.get("content-length", "0")))
+        await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
         arriving: list[Arriving] = []
         try:
             fields, outcomes, whole = await _receive(request, to, arriving)

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Asks(Protocol):
-    """A way to what is asked, away from the loop that answers browsers."""
+    """Executor of questions, away from the loop that answers browsers."""
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
         """The answer of a function that reads or writes."""
@@ -75,5 +75,5 @@ class Tables:
             raise
 
     def close(self) -> None:
-        """Wait for the question that is being asked, take no more."""
+        """Wait for the current question and accept no further ones."""
         self._thread.shutdown(cancel_futures=True)

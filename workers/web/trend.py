@@ -1,4 +1,4 @@
-"""All visits of a person in time, and the letter of one visit for the record."""
+"""Page of all visits of a person in time."""
 
 from __future__ import annotations
 
