@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -171,7 +171,7 @@ def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, di
     end = os.times()
     outcomes = [outcome for _, _, outcome in metrics.reports if outcome is not None]
     failed = [outcome for outcome in outcomes if outcome.code]
-    jobs_s: Counter[str] = Counter()
+    jobs_s: dict[str, float] = defaultdict(float)
     for outcome in outcomes:
         jobs_s[outcome.job.table.__name__] += outcome.seconds
     if failed or len(gdi.SessionGdi()) < had + len(recordings):
@@ -182,7 +182,7 @@ def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, di
             next_step="try it alone with `pbl run`",
         )
     processor_s = end.children_user + end.children_system - begin.children_user - begin.children_system
-    return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, dict(jobs_s)
+    return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, jobs_s
 
 
 def _stored(folder: Path) -> int:
