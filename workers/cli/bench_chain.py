@@ -182,7 +182,7 @@ def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, di
             next_step="try it alone with `pbl run`",
         )
     processor_s = end.children_user + end.children_system - begin.children_user - begin.children_system
-    return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, jobs_s
+    return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, dict(jobs_s)
 
 
 def _stored(folder: Path) -> int:
