@@ -41,11 +41,8 @@ def connect(start: bool = False) -> datajoint.Connection:
     Raises `PblError` DB_NOT_RUNNING when nothing answers within a few seconds, DB_REFUSED when the login is refused,
     DB_UNAVAILABLE when `start` fails.
 
-    Parameters
-    ----------
-    start
-        Start the embedded server if it is not running (never if DJ_HOST names a server). After `pbl demo` has stopped
-        it, any connection does.
+    `start`: start the embedded server if it is not running (never if DJ_HOST names a server). After `pbl demo` has
+    stopped it, any connection does.
     """
     target = _target(start)
     configure(target)

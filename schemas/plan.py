@@ -70,10 +70,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
 
     Returns `fit_set` and `fit_method` of the sets that became current now.
 
-    Parameters
-    ----------
-    sessions
-        session_id of those to look at (None: all; that reads whole tables).
+    `sessions`: session_id of those to look at (None: all; that reads whole tables).
     """
     chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
     current = fit.current() & (fit.FitSet & chosen)

@@ -37,10 +37,7 @@ class InputChanged(PblError):
 def one(query: Any, *columns: str) -> Any:
     """`query.fetch1(*columns)` for what a computation reads.
 
-    Raises
-    ------
-    InputChanged
-        There is no such row (any more).
+    Raises InputChanged if there is no such row (any longer).
     """
     try:
         return query.fetch1(*columns)

@@ -121,12 +121,8 @@ def check_store(backend: Any, create: bool = False) -> None:
 
     Raises `PblError` as `store_errors`.
 
-    Parameters
-    ----------
-    backend
-        DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`).
-    create
-        Make the bucket where it is missing.
+    `backend`: DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`). `create`: make
+    the bucket where it is missing.
     """
     # In a bucket always the same object, because a worker's key may not delete; in a folder a separate file that is
     # removed. Several processes may write that object at once: it holds some bytes and their hash whoever wrote it.

@@ -55,10 +55,7 @@ def title(number: int, name: str) -> str:
 def numbered() -> list[tuple[int, str]]:
     """Return number and name of every migration of this version, in the order of their numbers.
 
-    Raises
-    ------
-    ValueError
-        A number that is missing or used twice: a mistake in the code.
+    Raises ValueError for a number that is missing or used twice, a mistake in the code.
     """
     package = importlib.import_module("schemas.migrations")
     names = (_NAME.fullmatch(module.name) for module in pkgutil.iter_modules(package.__path__))

@@ -205,12 +205,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
 def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> Copy:
     """Copy into the archive under a new name, on disk when this returns.
 
-    Raises
-    ------
-    PblError
-        UPLOAD_REFUSED.
-    OSError, StillChanging
-        Nothing is left behind.
+    Raises `PblError` UPLOAD_REFUSED; OSError and StillChanging: nothing is left behind.
     """
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, upload.name.parts[0])
@@ -309,10 +304,7 @@ def _set_aside(
 ) -> None:
     """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
 
-    Raises
-    ------
-    OSError
-        It cannot be moved: it stays in the drop folder.
+    Raises OSError if it cannot be moved: it stays in the drop folder.
     """
     name = given[0].name
     folder = folder_of(archive, REFUSED, name.parts[0])

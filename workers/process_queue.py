@@ -80,12 +80,8 @@ class Work:
 class ProcessQueue:
     """Runs tasks one after the other, and keeps what the last ones produced until it is closed.
 
-    Parameters
-    ----------
-    most
-        Number of tasks that may wait.
-    kept
-        Number of works that are kept; the oldest that have ended are forgotten, with their files.
+    `most`: number of tasks that may wait. `kept`: number of works that are kept; the oldest that have ended are
+    forgotten, with their files.
     """
 
     def __init__(self, most: int, kept: int) -> None:

@@ -86,10 +86,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
 
     Returns None while another process is looking.
 
-    Parameters
-    ----------
-    everything
-        Look at all rows; None where the last such look is an hour ago, or where there are few videos.
+    `everything`: look at all rows; None where the last such look is an hour ago, or where there are few videos.
     """
     server = video.Video.connection
     with alone("refresh", server) as had:

@@ -27,10 +27,7 @@ def check(tables: Sequence[Any]) -> None:
     """Write and read the store, and do known jobs of the resource classes that are served: real ones then find the
     networks loaded and the programs of that size compiled.
 
-    Raises
-    ------
-    SelfTestFailed
-        With what was expected and found.
+    Raises SelfTestFailed with the expected and found values.
     """
     served = {registry.stage_of(t).resource for t in tables}
     _store()

@@ -95,12 +95,8 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
 
     Returns the number of deleted rows by table.
 
-    Parameters
-    ----------
-    events
-        Time (s), side and kind of all events that there are now.
-    seen
-        `Shown.state` of the page on which they were set.
+    `events`: time (s), side and kind of all current events. `seen`: `Shown.state` of the page on which they
+    were set.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
 

@@ -85,12 +85,8 @@ def decide_person(
 
     Returns the number of deleted rows by table, which the next populate computes anew.
 
-    Parameters
-    ----------
-    tracking_method
-        Tracking in which the person has this number; needed where several methods track the video.
-    seen
-        `person_state` of the page on which it was decided; None where nothing was shown.
+    `tracking_method`: tracking in which the person has this number; needed where several methods track the video.
+    `seen`: `person_state` of the page on which it was decided; None where nothing was shown.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
@@ -124,12 +120,8 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     Raises `PblError` USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
     DECIDED_MEANWHILE where `seen` is another state than the tables'.
 
-    Parameters
-    ----------
-    reason, note
-        One of `words.UNUSABLE`, and more in free words (no names), which "other" asks for.
-    seen
-        `usable_state` of the page on which it was decided; None: whatever it is.
+    `reason`, `note`: one of `words.UNUSABLE`, and more in free words (no names), which "other" asks for. `seen`:
+    `usable_state` of the page on which it was decided; None: whatever it is.
     """
     note = " ".join(note.split())[:500]
     if reason not in UNUSABLE or (reason == "other" and not note):
@@ -188,12 +180,7 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
     Raises `PblError` DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without
     a reason or with one of more than 500 characters.
 
-    Parameters
-    ----------
-    key, number
-        Key of SessionQc and `qc_no` of the check.
-    by, reason
-        Who accepts it, and why (no names).
+    `key`, `number`: key of SessionQc and `qc_no` of the check. `by`, `reason`: who accepts it, and why (no names).
     """
     reason = " ".join(reason.split())
     if not 0 < len(reason) <= 500:

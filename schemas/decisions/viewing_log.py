@@ -11,12 +11,8 @@ from ..transactions import in_transaction, next_id
 def record_viewing(of: str, number: int, what: str, by: str) -> None:
     """Insert a row of Viewing. An unknown number inserts nothing.
 
-    Parameters
-    ----------
-    of, number
-        "video_id" or "session_id", and which.
-    what
-        Part of it that is viewed, such as "video" or "report".
+    `of`, `number`: "video_id" or "session_id", and which. `what`: part of it that is viewed, such as "video" or
+    "report".
     """
     table = {"video_id": video.Video, "session_id": session.Session}[of]
     if not table & {of: number}:

@@ -170,10 +170,7 @@ def begin(phone: Phone, stated: object) -> Sent:
     Raises `PblError` UPLOAD_REFUSED for a statement that cannot be, a recording that is too long, or too many of them;
     USAGE for a text with control characters or too long.
 
-    Parameters
-    ----------
-    stated
-        "sha256", "video_bytes", "log_bytes", and what `TEXTS` and `NUMBERS` name. Anything may stand there.
+    `stated`: "sha256", "video_bytes", "log_bytes", and what `TEXTS` and `NUMBERS` name. Not trusted.
     """
     if not isinstance(stated, dict):
         raise upload_refused("no statement of a recording")

@@ -48,12 +48,8 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (also what the readers raise).
 
-    Parameters
-    ----------
-    source
-        Instrument; None: as the file states. A fit without a camera comes from markers, one with cameras from several.
-    shift_s
-        Added to its time stamps (s), so that they are on the clock of the video.
+    `source`: instrument; None: as the file states. A fit without a camera comes from markers, one with cameras from
+    several. `shift_s`: added to its time stamps (s), so that they are on the clock of the video.
     """
     from pbl_pipeline import validation as lib
 
@@ -125,13 +121,8 @@ def add_reference(
     Raises `PblError` DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long,
     and what `read_reference` raises.
 
-    Parameters
-    ----------
-    about
-        Number, path or unique file name of the video.
-    dataset, source, origin
-        Collection it is reported with (None: as it was, else "unnamed"), instrument (None: as the file states),
-        origin (None: the path).
+    `about`: number, path or unique file name of the video. `dataset`, `source`, `origin`: collection it is reported
+    with (None: as it was, else "unnamed"), instrument (None: as the file states), origin (None: the path).
     """
     from pbl_pipeline.video import sha256_of
 
@@ -184,12 +175,8 @@ def add_trial(
     Raises `PblError` DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several
     fits; what `add_reference` raises.
 
-    Parameters
-    ----------
-    trial
-        Number of the trial of several cameras, or of the marker recording.
-    fit_method
-        Key of the fit's method, where the trial was fitted by several.
+    `trial`: number of the trial of several cameras, or of the marker recording. `fit_method`: key of the fit's method,
+    where the trial was fitted by several.
     """
     trial = fit.trial_of(trial)
     current = fit.current().proj() * fit.FitSet.proj("fit_set_kind")

@@ -35,16 +35,9 @@ from .records import (
     set_population,
 )
 
-#: Key of a selection or plan -> field of `Methods` that names it.
-METHOD_FIELDS = {
-    "tracking_method": "tracking",
-    "keypoint_method": "keypoint",
-    "fit_method": "fit",
-    "gait_method": "gait",
-    "gdi_method": "gdi",
-    "norm": "norm",
-    "kinetics_method": "kinetics",
-}
+#: Keys of selections and plans that name a method: fields of `Methods` with this ending.
+_ENDING = "_method"
+METHOD_KEYS = ("norm", *(f"{name}{_ENDING}" for name in ("tracking", "keypoint", "fit", "gait", "gdi", "kinetics")))
 #: Method of the fit that markers get where none is named (`pbl_pipeline.fit.default_fit`).
 DEFAULT_MARKER_FIT = "markers"
 
@@ -77,7 +70,7 @@ def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
 
 def plan_all(videos: Sequence[int], sessions: Collection[int], chosen: Mapping[str, str]) -> None:
     """Enter new recordings into the selections and plans of all their methods (keys, from `resolve`)."""
-    for table, rows in _selections(videos, sessions, chosen, set(METHOD_FIELDS)):
+    for table, rows in _selections(videos, sessions, chosen, set(METHOD_KEYS)):
         table.insert(rows, skip_duplicates=True)  # the session may have its plans already
 
 
@@ -160,7 +153,7 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     for recording in recordings:
         recording.check(named)
     chosen = {markers: resolve(named, markers) for markers in {r.markers for r in recordings}}
-    keys = {key for key, field in METHOD_FIELDS.items() if getattr(named, field) is not None}
+    keys = {key for key in METHOD_KEYS if getattr(named, key.removesuffix(_ENDING)) is not None}
     done: list[Registered] = []
     for recording in recordings:
         try:

@@ -106,12 +106,8 @@ class Folder:
     def open(self, upload: Upload) -> Iterator[BinaryIO]:
         """Open a file for reading.
 
-        Raises
-        ------
-        PblError
-            UPLOAD_REFUSED: it is not a regular file of the folder's owner, or too large.
-        StillChanging
-            The file is not the one that was listed.
+        Raises `PblError` UPLOAD_REFUSED: it is not a regular file of the folder's owner, or too large; StillChanging:
+        the file is not the one that was listed.
         """
         with contextlib.ExitStack() as stack:
             try:
@@ -173,10 +169,7 @@ class Folder:
         """Move a file out of the drop folder without opening it. An entry that is not a regular file, or has another
         name, is removed.
 
-        Raises
-        ------
-        OSError
-            It cannot be moved: another disk, no right.
+        Raises OSError if it cannot be moved (another disk, no right).
         """
         with self._open(upload.name.parts[:-1]) as handle:
             about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)

@@ -59,13 +59,8 @@ class SeveralCameras(Recording):
         """Read the calibration, the bytes and first picture of each video, and the time stamps of its container: videos
         that were not started together are refused.
 
-        Raises
-        ------
-        PblError
-            CAMERA_INVALID (calibration, or files that are not one of each camera), FIT_INPUT (fewer than two, or other
-            frames or times), USAGE.
-        RefusedFile
-            One of the videos cannot be read.
+        Raises `PblError` CAMERA_INVALID (calibration, or files that are not one of each camera), FIT_INPUT (fewer than
+        two, or other frames or times), USAGE; RefusedFile: one of the videos cannot be read.
         """
         from pbl_pipeline.keypoints import cameras_of_files, check_same_times
         from pbl_pipeline.video import load_camera_poses, packet_times, sha256_of
@@ -258,10 +253,7 @@ def ingest(
     Raises `PblError` USAGE for the number of a person with several videos, or sensor files of some of them; what
     `register` raises. Errors of single files are in the result.
 
-    Parameters
-    ----------
-    files
-        Sensor files of each path, in their order; empty for none at all.
+    `files`: sensor files of each path, in their order; empty for none at all.
     """
     if files and len(files) != len(paths):
         raise usage(

@@ -98,10 +98,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     when the database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
     account may not alter tables.
 
-    Parameters
-    ----------
-    dry_run
-        Change nothing, return what would be done.
+    `dry_run`: change nothing, return what would be done.
     """
     refuse_newer()
     if dry_run:

@@ -181,10 +181,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
     Raises `PblError` BACKUP_INVALID; STORE_UNAVAILABLE; DB_REFUSED if this prefix has tables already, PBL_DB_PREFIX
     differs from the backup's, or a file of the store from the backup's.
 
-    Parameters
-    ----------
-    again
-        After an interrupted restore: remove the tables it left, then start again.
+    `again`: after an interrupted restore: remove the tables it left, then start again.
     """
     manifest = check(folder, say)
     connection.connect(start=True)  # a new place has no server yet

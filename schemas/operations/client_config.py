@@ -29,12 +29,7 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
     Raises `PblError` FILE_UNWRITABLE: it exists already, or cannot be written; DB_MIGRATION for tables of another
     version; what `connection.connect` raises.
 
-    Parameters
-    ----------
-    folder
-        Made if it is missing.
-    overwrite
-        Replace the files of an earlier call; without it they are left.
+    `folder`: made if it is missing. `overwrite`: replace the files of an earlier call; without it they are left.
     """
     connection.connect()
     refuse_other_version()

@@ -20,10 +20,7 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
 def write_text(path: Path, content: str | bytes, mode: int = 0o600) -> None:
     """Write a file with these permissions, atomically: no reader, and no power cut, leaves half of it.
 
-    Raises
-    ------
-    OSError
-        It cannot be written; the file that was there is unchanged.
+    Raises OSError if it cannot be written; the file that was there is unchanged.
     """
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -85,10 +82,7 @@ def private_folder(path: Path) -> Path:
 
     An existing folder is not changed: its maker decided who may read it.
 
-    Raises
-    ------
-    OSError
-        It cannot be made.
+    Raises OSError if it cannot be made.
     """
     if not path.is_dir():
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -172,10 +172,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     Raises `PblError` DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken
     over, or without the right to delete; STORE_UNAVAILABLE.
 
-    Parameters
-    ----------
-    videos
-        Also delete the video files that are unchanged since registration.
+    `videos`: also delete the video files that are unchanged since registration.
     """
     try:
         with worker.alone(archive.LOCK, connection.connect()) as obtained:

@@ -151,13 +151,8 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
 
     Raises `PblError` USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
 
-    Parameters
-    ----------
-    chosen
-        `session_id` of each, and which of its results (the order of `visit_list.results_of`); None: by the chain of
-        methods that most of the visits have.
-    reference
-        One of `chosen`; None: the earliest.
+    `chosen`: `session_id` of each, and which of its results (the order of `visit_list.results_of`); None: by the chain
+    of methods that most of the visits have. `reference`: one of `chosen`; None: the earliest.
     """
     chosen = list(dict.fromkeys(chosen))
     if not FEWEST <= len(chosen) <= MOST:

@@ -74,13 +74,9 @@ def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     is in the study, measures and index of the current set, and every clinical score as a column of its instrument's
     name.
 
-    Parameters
-    ----------
-    restriction
-        Of the visits: `study.Visit`, subject, session label and date, population.
-    chain
-        Of the methods and the kind, such as `{"fit_method": "blazepose-v5", "fit_set_kind": "single"}`, where the
-        tables hold several chains.
+    `restriction` of the visits: `study.Visit`, subject, session label and date, population. `chain` of the methods
+    and the kind, such as `{"fit_method": "blazepose-v5", "fit_set_kind": "single"}`, where the tables hold several
+    chains.
     """
     visits = study.Visit * _sessions() & restriction
     sets = newest_sets()

@@ -147,7 +147,11 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     )
     if not results:
         return about
-    key = _key_of(session_id, results[shown])
+    names = ("fit_method", "gait_method", "gdi_method", "norm")
+    chain = dict(zip(names, results[shown].methods, strict=True))
+    # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
+    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": results[shown].kind}).proj()
+    key = dict((gdi.SessionGdi.proj() & (fit.current().proj() * sets).proj() & chain).keys()[0])
     of_result = {"session_id": session_id, **key, "fit_set_kind": results[shown].kind}
     return dataclasses.replace(
         about,
@@ -220,15 +224,6 @@ def computations(video_id: int) -> tuple[Any, ...]:
     events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
     correction = None if found is None else gait.correction_of(found)
     return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, correction)))
-
-
-def _key_of(session_id: int, result: Result) -> dict[str, Any]:
-    names = ("fit_method", "gait_method", "gdi_method", "norm")
-    chain = dict(zip(names, result.methods, strict=True))
-    # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
-    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": result.kind}).proj()
-    current = fit.current().proj() * sets
-    return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
 
 
 def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]]:

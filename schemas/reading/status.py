@@ -134,13 +134,9 @@ class Status:
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     """Query the state of all computed tables. `schemas.activate()` must have been called.
 
-    Parameters
-    ----------
-    exact
-        Also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000 videos).
-        None: where there are fewer than `SMALL` videos.
-    most
-        Errors, empty, waiting and not usable rows that are listed, each; the counts are of all.
+    `exact`: also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000
+    videos). None: where there are fewer than `SMALL` videos. `most`: errors, empty, waiting and not usable rows that
+    are listed, each; the counts are of all.
     """
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact

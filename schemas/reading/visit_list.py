@@ -151,10 +151,7 @@ class Page:
 def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int = PAGE) -> Page:
     """A page of the visits that `wanted` lets through, newest day first, then highest number.
 
-    Parameters
-    ----------
-    after
-        `Page.after` of the page before: a day (ISO) and a number. None: the first page.
+    `after`: `Page.after` of the page before: a day (ISO) and a number. None: the first page.
     """
     joins, where, args = _asked(wanted)
     if after is not None:
@@ -199,12 +196,8 @@ def judged(
 ) -> Change:
     """Judge a change.
 
-    Parameters
-    ----------
-    errors
-        Standard deviation of the error, and minimal detectable change, of both values; None where one is not known.
-    differs
-        What was not alike (`not_alike`).
+    `errors`: standard deviation of the error, and minimal detectable change, of both values; None where one is not
+    known. `differs`: what was not alike (`not_alike`).
     """
     from pbl_pipeline.gait import Z90, chances, change_sd
 

@@ -128,12 +128,8 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     Raises `PblError` DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds
     of recordings or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
 
-    Parameters
-    ----------
-    restriction
-        Subject, session, methods (short names too), `fit_set_kind`.
-    slice_name
-        The visits that count in this slice alone, with the sets and methods that it was frozen with.
+    `restriction`: subject, session, methods (short names too), `fit_set_kind`. `slice_name`: the visits that count in
+    this slice alone, with the sets and methods that it was frozen with.
     """
     sets: Any = fit.current()
     restriction = with_keys(restriction)

@@ -20,7 +20,7 @@ from ..intake.records import replace_height, replace_mass, set_condition, set_po
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
-from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, import_rows
+from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, check_role, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
 NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
@@ -84,10 +84,7 @@ def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict
 
     Returns the number of the visit, None where nothing was written; errors by field, "" for what is wrong with several.
 
-    Parameters
-    ----------
-    values
-        Text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
+    `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
     given = {name: text for name, text in _stripped(values).items() if text}
     return in_transaction(lambda: _register(given, by))
@@ -102,7 +99,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": lambda text: check_label("visit", text, NEW["visit"]),
         "date": lambda text: date_of(Row("date", {"date": text}), "date"),
-        "role": _check_role,
+        "role": lambda text: check_role(text, "role"),
         "population": lambda text: check_label("population", text, NEW["population"]),
         "height_m": _height,
     }
@@ -305,12 +302,6 @@ def _check(given: Mapping[str, str], checks: Mapping[str, Callable[[str], Any]],
 
 def _label(name: str, longest: int) -> Callable[[str], None]:
     return lambda text: check_label(name, text, longest)
-
-
-def _check_role(text: str) -> None:
-    if not study.is_role(text):
-        expected = "baseline, pre, 6_weeks, 3_months, or a word of small letters, digits and _"
-        raise refused(repr(text[:40]), expected, "write it so", "role")
 
 
 def _height(text: str) -> float:

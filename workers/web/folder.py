@@ -52,13 +52,8 @@ class ResultsFolder:
 
     Raises `PblError` FILE_MISSING where no results are in it.
 
-    Parameters
-    ----------
-    path
-        Of `pbl run --out`, or a folder of such folders.
-    videos
-        Where the recordings are looked for, by their names: the results hold none. None: beside the results and in the
-        folder above.
+    `path`: of `pbl run --out`, or a folder of such folders. `videos`: folder of the recordings, which are found by
+    their names (None: beside the results and in the folder above).
     """
 
     def __init__(self, path: Path, videos: Path | None = None) -> None:

@@ -90,10 +90,7 @@ def server_account(data: Path) -> Account:
 
     Raises `PblError` DB_UNAVAILABLE when the caller is root and the system has no unprivileged account to drop to.
 
-    Parameters
-    ----------
-    data
-        The data folder. For root, the owner of an existing one.
+    `data`: the data folder. For root, the owner of an existing one.
     """
     import pwd  # here, because Windows has none and also imports this module
 

@@ -176,10 +176,7 @@ def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = Fals
 
     Returns whether one was running. Raises `PblError` DB_REFUSED if it does not end within a minute.
 
-    Parameters
-    ----------
-    on_demand
-        Let the next connection start it again (`starts_on_demand`), until it is stopped without this.
+    `on_demand`: let the next connection start it again (`starts_on_demand`), until it is stopped without this.
     """
     folder = folder or Folder.default()
     if not folder.initialised():
