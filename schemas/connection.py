@@ -191,9 +191,7 @@ def _tls() -> bool | dict[str, Any] | None:
 
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
     """Return a connection of the driver with the login of the tables, for statements that are not queries of a table.
-
-    Raises what `connect` raises.
-    """
+    Raises what `connect` raises."""
     target = _target(start=False)
     _check_answers(target)
     tls: dict[str, Any] = {"ssl_disabled": True} if target["use_tls"] is False else {"ssl": target["use_tls"]}

@@ -402,10 +402,8 @@ def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
 
 
 def norm_keys(name: str) -> list[str]:
-    """Return the keys of the normative sets that a key (`name-v2`) or a name means, the newest version first.
-
-    Raises `PblError` NORM_UNKNOWN.
-    """
+    """Return the keys of the normative sets that a key (`name-v2`) or a name means, the newest version first. Raises
+    `PblError` NORM_UNKNOWN."""
     rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
     found = [row["norm"] for row in rows if name in (row["norm"], row["norm_name"])]
     if found:
@@ -444,10 +442,8 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
 
 
 def resolve(model: str | None, norm: str | None) -> dict[str, str]:
-    """Keys of the index and the normative set by name; a set left out is the index's own.
-
-    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has.
-    """
+    """Keys of the index and the normative set by name; a set left out is the index's own. Raises `PblError`
+    SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has."""
     from pbl_pipeline import gait as lib
 
     method = resolve_method(GdiModel, model or lib.GDI_METHODS.default)

@@ -28,11 +28,8 @@ def method_columns(prefix: str) -> str:
 
 
 def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
-    """Insert the methods that the table lacks. A row is never edited.
-
-    Raises `PblError` FILE_FORMAT when code holds other parameters under a name and version that the table already
-    knows.
-    """
+    """Insert the methods that the table lacks. A row is never edited. Raises `PblError` FILE_FORMAT when code holds
+    other parameters under a name and version that the table already knows."""
     prefix = _prefix(table)
     for method in found:
         row = {
@@ -85,9 +82,7 @@ def stored_key(table: Any, name: str) -> str:
 
 def register(table: Any, offered: methods.Method[Any]) -> tuple[str, bool]:
     """Key of the row with these parameters under this name, and whether it is new: then as the name's next version.
-
-    Raises what `insert_methods` raises.
-    """
+    Raises what `insert_methods` raises."""
     prefix, stage = _prefix(table), methods.of_stage(table.stage)
     rows = (table & {f"{prefix}_method_name": offered.name}).to_dicts(order_by=f"{prefix}_method_version")
     versions = [row[f"{prefix}_method_version"] for row in rows]

@@ -35,10 +35,8 @@ class InputChanged(PblError):
 
 
 def one(query: Any, *columns: str) -> Any:
-    """`query.fetch1(*columns)` for what a computation reads.
-
-    Raises InputChanged if there is no such row (any longer).
-    """
+    """`query.fetch1(*columns)` for what a computation reads. Raises InputChanged if there is no such row (any
+    longer)."""
     try:
         return query.fetch1(*columns)
     except dj.DataJointError:
@@ -57,10 +55,8 @@ def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
-    """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it.
-
-    Raises `PblError` DB_NOT_FOUND for none, USAGE for several.
-    """
+    """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it. Raises `PblError`
+    DB_NOT_FOUND for none, USAGE for several."""
     found = rows(table, key)
     if len(found) == 1:
         return found[0]
@@ -157,10 +153,8 @@ _DELETES = 5
 
 @columns_read_once()
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Delete the rows with these keys and all that was computed from them, in one transaction.
-
-    Returns table name to number of deleted rows, empty when there was nothing.
-    """
+    """Delete the rows with these keys and all that was computed from them, in one transaction. Returns table name to
+    number of deleted rows, empty when there was nothing."""
     if not keys:
         return {}
     # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").

@@ -142,9 +142,7 @@ def check_store(backend: Any, create: bool = False) -> None:
 
 def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
     """Return the files below a folder of the store (a path in it; default: all) with what the store knows of each.
-
-    Raises `PblError` as `store_errors`.
-    """
+    Raises `PblError` as `store_errors`."""
     with store_errors():
         base = full_path(backend, "")
         found = backend.fs.find(full_path(backend, folder), detail=True)
@@ -153,9 +151,7 @@ def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
 
 def purge(fs: Any, folder: str) -> None:
     """Remove everything below a folder of a bucket (`bucket/path`), including older versions and unfinished uploads.
-
-    Raises `PblError` as `store_errors`.
-    """
+    Raises `PblError` as `store_errors`."""
     name, _, path = folder.partition("/")
     where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}
     with store_errors():

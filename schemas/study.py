@@ -82,10 +82,8 @@ class ClinicalScore(dj.Manual):
     """
 
     def insert(self, rows: Any, *args: Any, **options: Any) -> None:
-        """DataJoint's own, after every value was compared with the range of its instrument.
-
-        Raises `PblError` SCORE_RANGE; then nothing is inserted. An instrument that is unknown is DataJoint's error.
-        """
+        """DataJoint's own, after every value was compared with the range of its instrument. Raises `PblError`
+        SCORE_RANGE; then nothing is inserted. An instrument that is unknown is DataJoint's error."""
         rows = self._dicts(rows)
         check_scores(rows)
         super().insert(rows, *args, **options)

@@ -234,10 +234,7 @@ def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
 # ---------------------------------------------------------------------------------------------- override and effects
 def set_override(key: Mapping[str, Any], person_id: int) -> None:
     """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes results that
-    contradict it.
-
-    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
-    """
+    contradict it. Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person."""
     key = {"video_id": key["video_id"], "tracking_method": key["tracking_method"]}
     if Tracking & key:
         persons = sorted(int(p) for p in (Tracking.Person & key).to_arrays("person_id"))

@@ -311,10 +311,8 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def present_file(video_id: int) -> Path:
-    """Return the file of a video if it is there; its bytes are not compared with those that were registered.
-
-    Raises `PblError` DB_NOT_FOUND, VIDEO_MISSING.
-    """
+    """Return the file of a video if it is there; its bytes are not compared with those that were registered. Raises
+    `PblError` DB_NOT_FOUND, VIDEO_MISSING."""
     path = Path(registered_video(video_id)["video_path"])
     if not path.is_file():
         raise _missing(path, {"video_id": video_id})
@@ -339,10 +337,8 @@ def unknown_video(video_id: int) -> PblError:
 
 
 def registered_file(path: str, sha256: str, key: dict) -> Path:
-    """The video file, after checking that it is still the one that was registered.
-
-    Raises `PblError` VIDEO_MISSING, VIDEO_CHANGED.
-    """
+    """The video file, after checking that it is still the one that was registered. Raises `PblError` VIDEO_MISSING,
+    VIDEO_CHANGED."""
     from pbl_pipeline.video import sha256_of
 
     if not Path(path).is_file():

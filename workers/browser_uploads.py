@@ -53,11 +53,8 @@ def place(session_id: int) -> Place:
 
 
 class Arriving:
-    """A file that arrives: written under a new name in the person's folder of the archive, and hashed.
-
-    Raises `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes;
-    OSError.
-    """
+    """A file that arrives: written under a new name in the person's folder of the archive, and hashed. Raises
+    `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes; OSError."""
 
     def __init__(self, to: Place, name: str) -> None:
         self.name = plain_name(PurePosixPath(name.replace("\\", "/")).name)

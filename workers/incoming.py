@@ -203,10 +203,8 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
 
 
 def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> Copy:
-    """Copy into the archive under a new name, on disk when this returns.
-
-    Raises `PblError` UPLOAD_REFUSED; OSError and StillChanging: nothing is left behind.
-    """
+    """Copy into the archive under a new name, on disk when this returns. Raises `PblError` UPLOAD_REFUSED; OSError and
+    StillChanging: nothing is left behind."""
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, upload.name.parts[0])
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
@@ -251,11 +249,8 @@ def check_room(n_bytes: int, next_step: str) -> None:
 
 
 def check_opens(path: Path, expected: str, next_step: str) -> None:
-    """Decode the first picture of a file in a process with limits.
-
-    Raises `PblError` VIDEO_...: what is wrong with it; VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the
-    limits.
-    """
+    """Decode the first picture of a file in a process with limits. Raises `PblError` VIDEO_...: what is wrong with it;
+    VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the limits."""
     try:
         limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
     except LimitExceeded as error:
@@ -303,9 +298,7 @@ def _set_aside(
     drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[Copy], archive: Path, why: PblError
 ) -> None:
     """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
-
-    Raises OSError if it cannot be moved: it stays in the drop folder.
-    """
+    Raises OSError if it cannot be moved: it stays in the drop folder."""
     name = given[0].name
     folder = folder_of(archive, REFUSED, name.parts[0])
     mark = copies[0].sha256 if copies else hashlib.sha256(os.fsencode(str(name))).hexdigest()

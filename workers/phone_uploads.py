@@ -50,10 +50,8 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
 
 
 def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -> None:
-    """Write a part to the archive, on disk when this returns.
-
-    Raises `PblError` UPLOAD_REFUSED where the bytes are not those that the phone sent; OSError if it cannot be written.
-    """
+    """Write a part to the archive, on disk when this returns. Raises `PblError` UPLOAD_REFUSED where the bytes are not
+    those that the phone sent; OSError if it cannot be written."""
     if hashlib.sha256(body).hexdigest() != sha256:
         raise upload_refused(f"part {number} with another SHA-256 than was sent", "it is sent again")
     here = folder(phone, sent)

@@ -105,10 +105,8 @@ class ProcessQueue:
                 del self._works[key]
 
     def begin(self, key: Hashable, task: Task) -> Work:
-        """Return the work of a key: the earlier one where it waits, runs or has a file, else a new one.
-
-        Raises `PblError` USAGE where too many wait.
-        """
+        """Return the work of a key: the earlier one where it waits, runs or has a file, else a new one. Raises
+        `PblError` USAGE where too many wait."""
         with self._lock:
             earlier = self._works.pop(key, None)
             if earlier is None or (earlier.ended and earlier.path is None):
@@ -147,10 +145,8 @@ class ProcessQueue:
 
 
 def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | None:
-    """Run a task to its end; return the file that it made, if it makes one.
-
-    Raises the error that the function raised, `task.broken`, or INTERNAL for any other exception.
-    """
+    """Run a task to its end; return the file that it made, if it makes one. Raises the error that the function raised,
+    `task.broken`, or INTERNAL for any other exception."""
     folder = root / secrets.token_hex(8)
     folder.mkdir()
     part = folder / f"part-{task.file}"

@@ -52,10 +52,8 @@ def free_dead(table: Any) -> int:
 
 
 def crashed(job: Claim, reason: str) -> bool:
-    """Count a crash of the job's process: put it back, or make an error row of it the third time (`CRASHES`).
-
-    Returns whether the job was still that process's.
-    """
+    """Count a crash of the job's process: put it back, or make an error row of it the third time (`CRASHES`). Returns
+    whether the job was still that process's."""
     n = job.attempts + 1
     if n < CRASHES:
         return queue.put_back(job, f"its process died ({reason})", 1.0, attempts=n)

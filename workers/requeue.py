@@ -34,10 +34,7 @@ def retry(
     key: Mapping[str, Any] | None = None,
 ) -> dict[str, int]:
     """Make error rows pending again, of one code, one table, one video, one key of that table if asked; table -> how
-    many.
-
-    Raises `PblError` USAGE for an unknown table or code.
-    """
+    many. Raises `PblError` USAGE for an unknown table or code."""
     tables = [table_named(table)] if table else computed_tables()
     out = {}
     for one in tables:
@@ -128,10 +125,7 @@ def plan_again(
     before: datetime.datetime | None = None,
 ) -> Reprocess:
     """Return the results of a table that would be deleted and computed again: of a method, computed since or before a
-    time.
-
-    Raises `PblError` USAGE for an unknown table.
-    """
+    time. Raises `PblError` USAGE for an unknown table."""
     one = table_named(table)
     rows = one()
     prefix = next(n.removesuffix("_computed") for n in one.heading.names if n.endswith("_computed"))

@@ -25,10 +25,7 @@ class SelfTestFailed(Exception):
 
 def check(tables: Sequence[Any]) -> None:
     """Write and read the store, and do known jobs of the resource classes that are served: real ones then find the
-    networks loaded and the programs of that size compiled.
-
-    Raises SelfTestFailed with the expected and found values.
-    """
+    networks loaded and the programs of that size compiled. Raises SelfTestFailed with the expected and found values."""
     served = {registry.stage_of(t).resource for t in tables}
     _store()
     if registry.FIT in served:

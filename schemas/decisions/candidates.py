@@ -32,10 +32,8 @@ class Candidates:
 
 
 def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
-    """Return the people who can be chosen in a video, once for each tracking method (or for one of them).
-
-    Raises `PblError` DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
-    """
+    """Return the people who can be chosen in a video, once for each tracking method (or for one of them). Raises
+    `PblError` DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN."""
     key, name = _key(video_id, tracking_method), video.registered_video(video_id)["video_name"]
     out, found = [], (tracking.Tracking & key).keys()
     for tracked in found:
@@ -117,11 +115,8 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
 
 
 def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
-    """Return the key of the only TrackingSelection that matches.
-
-    Raises `PblError` DB_NOT_FOUND for a video that is not registered, SOLVER_UNKNOWN; USAGE where several methods track
-    the video and none is named, or another one.
-    """
+    """Return the key of the only TrackingSelection that matches. Raises `PblError` DB_NOT_FOUND for a video that is not
+    registered, SOLVER_UNKNOWN; USAGE where several methods track the video and none is named, or another one."""
     selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
     if len(selections) == 1:
         return dict(selections[0])

@@ -120,10 +120,8 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
 
 
 def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
-    """Go back to the detected events of a trial, with a row of Decision. Without a correction nothing happens.
-
-    Raises `PblError` DECIDED_MEANWHILE, DB_NOT_FOUND.
-    """
+    """Go back to the detected events of a trial, with a row of Decision. Without a correction nothing happens. Raises
+    `PblError` DECIDED_MEANWHILE, DB_NOT_FOUND."""
     return _decide(_must_be_shown(video_id), None, by, seen)
 
 

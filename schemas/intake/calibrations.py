@@ -103,9 +103,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
 
 def remove_calibration(camera_id: int) -> list[Change]:
     """Withdraw a calibration from the devices that it is registered for. Videos that have it as their own keep it.
-
-    Raises `PblError` DB_NOT_FOUND: no device has this calibration.
-    """
+    Raises `PblError` DB_NOT_FOUND: no device has this calibration."""
     rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
     if not rows:
         there = sorted({int(n) for n in lab.DeviceCalibration.to_arrays("camera_id")})

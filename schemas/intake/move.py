@@ -47,11 +47,8 @@ class Move:
 
 
 def plan_move(video_id: int, subject: str, session_label: str) -> Move:
-    """Return what `carry_out` would do; change nothing.
-
-    Raises `PblError` DB_NOT_FOUND for a number that no video has; USAGE for a subject code that could be a name, a
-    label too long, or the visit that the video is in already.
-    """
+    """Return what `carry_out` would do; change nothing. Raises `PblError` DB_NOT_FOUND for a number that no video has;
+    USAGE for a subject code that could be a name, a label too long, or the visit that the video is in already."""
     check_subject(subject, "pass --to SUBJECT/SESSION with such a code")
     check_label("session", session_label, 64, 1)
     rows = (video.Video * session.Session.proj("subject", "session_label") & {"video_id": video_id}).to_dicts()

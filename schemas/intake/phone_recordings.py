@@ -70,10 +70,8 @@ class Sent:
 
 # --------------------------------------------------------------------------------------------------------------- links
 def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | None = None) -> tuple[int, str]:
-    """Insert a link for a visit; return its number and its key, which is kept nowhere.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit or protocol, USAGE for a time that is too long.
-    """
+    """Insert a link for a visit; return its number and its key, which is kept nowhere. Raises `PblError` DB_NOT_FOUND
+    for an unknown visit or protocol, USAGE for a time that is too long."""
     session.registered_visit(session_id)
     if protocol is not None and not Protocol & {"protocol": protocol}:
         raise PblError(

@@ -39,10 +39,8 @@ class Step:
 
 
 def read_protocol(path: Path) -> list[Step]:
-    """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`.
-
-    Raises `PblError` FILE_MISSING, SHEET_FORMAT.
-    """
+    """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`. Raises `PblError`
+    FILE_MISSING, SHEET_FORMAT."""
     (sheet,) = read_sheets(path)[:1] or [None]
     steps = []
     for number, row in enumerate(sheet.rows if sheet else (), 1):

@@ -43,10 +43,8 @@ DEFAULT_MARKER_FIT = "markers"
 
 
 def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
-    """Return the keys of the method rows of a video, or of laboratory markers, with defaults filled in.
-
-    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN.
-    """
+    """Return the keys of the method rows of a video, or of laboratory markers, with defaults filled in. Raises
+    `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
 
     def key(table: Any, name: str | None) -> str:
         return resolve_method(table, name or of_stage(table.stage).default)

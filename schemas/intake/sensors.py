@@ -40,10 +40,8 @@ class Sensors:
         return self.attitude is not None and str(self.attitude) != NONE
 
     def read(self) -> PhoneLog | None:
-        """Read the log, if there is one, and check that the other files exist.
-
-        Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
-        """
+        """Read the log, if there is one, and check that the other files exist. Raises `PblError` FILE_MISSING,
+        PHONE_LOG; FILE_FORMAT for a file without bytes."""
         from pbl_pipeline.video import read_phone_log
 
         for path in (self.depth, *self.imu):

@@ -104,11 +104,8 @@ class Folder:
 
     @contextlib.contextmanager
     def open(self, upload: Upload) -> Iterator[BinaryIO]:
-        """Open a file for reading.
-
-        Raises `PblError` UPLOAD_REFUSED: it is not a regular file of the folder's owner, or too large; StillChanging:
-        the file is not the one that was listed.
-        """
+        """Open a file for reading. Raises `PblError` UPLOAD_REFUSED: it is not a regular file of the folder's owner, or
+        too large; StillChanging: the file is not the one that was listed."""
         with contextlib.ExitStack() as stack:
             try:
                 handle = stack.enter_context(self._open(upload.name.parts[:-1]))
@@ -167,10 +164,7 @@ class Folder:
 
     def move(self, upload: Upload, to: Path) -> None:
         """Move a file out of the drop folder without opening it. An entry that is not a regular file, or has another
-        name, is removed.
-
-        Raises OSError if it cannot be moved (another disk, no right).
-        """
+        name, is removed. Raises OSError if it cannot be moved (another disk, no right)."""
         with self._open(upload.name.parts[:-1]) as handle:
             about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
             if stat.S_ISREG(about.st_mode) and about.st_nlink == 1:

@@ -35,9 +35,7 @@ def archive_dir() -> Path:
 
 def folder_of(archive: Path, part: str, subject: str) -> Path:
     """Return the folder of a person in a part of the archive ("", `REFUSED`, `PHONE`, `COPIES`); made if missing.
-
-    Raises OSError if it cannot be made.
-    """
+    Raises OSError if it cannot be made."""
     private_folder(archive)
     return private_folder(private_folder(archive / part) / (subject if SUBJECT_CODE.fullmatch(subject) else "_"))
 
@@ -81,10 +79,8 @@ def load_seen(archive: Path) -> dict[str, list[Any]]:
 
 
 def save_seen(archive: Path, seen: dict[str, list[Any]]) -> None:
-    """Write the files of the drop folder: name -> size, stamp, time when it was first seen like this (s).
-
-    Raises OSError if it cannot be written.
-    """
+    """Write the files of the drop folder: name -> size, stamp, time when it was first seen like this (s). Raises
+    OSError if it cannot be written."""
     private_folder(archive)
     write_json(private_folder(archive / COPIES) / _SEEN, seen)
 

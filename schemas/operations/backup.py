@@ -135,10 +135,8 @@ def backup(
 
 
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
-    """Compare every byte of a backup with its checksums; return the manifest.
-
-    Raises `PblError` BACKUP_INVALID, which names the missing or changed files.
-    """
+    """Compare every byte of a backup with its checksums; return the manifest. Raises `PblError` BACKUP_INVALID, which
+    names the missing or changed files."""
     try:
         manifest = read_json(folder / "manifest.json")
         parts = dict(manifest["sha256"])

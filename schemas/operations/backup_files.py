@@ -218,10 +218,8 @@ def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str
 
 
 def restore_recordings(folder: Path) -> Recordings:
-    """Copy the recordings of a backup back to where they were registered. Existing files are never changed.
-
-    Raises `PblError` FILE_UNWRITABLE.
-    """
+    """Copy the recordings of a backup back to where they were registered. Existing files are never changed. Raises
+    `PblError` FILE_UNWRITABLE."""
     done = Recordings()
     if not (folder / f"{RECORDINGS}.sha256").exists():
         return done

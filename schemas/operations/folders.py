@@ -18,10 +18,8 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
 
 
 def write_text(path: Path, content: str | bytes, mode: int = 0o600) -> None:
-    """Write a file with these permissions, atomically: no reader, and no power cut, leaves half of it.
-
-    Raises OSError if it cannot be written; the file that was there is unchanged.
-    """
+    """Write a file with these permissions, atomically: no reader, and no power cut, leaves half of it. Raises OSError
+    if it cannot be written; the file that was there is unchanged."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as out:

@@ -146,10 +146,8 @@ def manifest_path(subject: str) -> Path:
 
 
 def find(subject: str) -> tuple[Ids, Found]:
-    """Return all that is stored of a person; change nothing.
-
-    Raises `PblError` DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
-    """
+    """Return all that is stored of a person; change nothing. Raises `PblError` DB_NOT_FOUND when neither the database
+    nor a list of an earlier run knows the subject."""
     ids, earlier = _identities(subject), read_manifest(subject)
     parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)  # copies are of a killed import
     recordings = [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))

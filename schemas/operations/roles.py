@@ -117,10 +117,8 @@ def _own(name: str) -> str:
 
 
 def password_file(folder: Path, account: Account) -> Path:
-    """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600).
-
-    Raises `PblError` FILE_UNWRITABLE, FILE_MISSING.
-    """
+    """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600). Raises
+    `PblError` FILE_UNWRITABLE, FILE_MISSING."""
     path = folder / account.user
     expected, next_step = "a folder for passwords that you may write to", "pass another folder with --secrets"
     with os_errors_as("FILE_UNWRITABLE", expected, next_step, path), contextlib.suppress(FileExistsError):
@@ -148,10 +146,8 @@ def read_password(path: Path) -> str:
 
 
 def apply(accounts: Sequence[tuple[Account, str]], require_tls: bool = False) -> None:
-    """Create the accounts or bring them to these passwords and the rights of their roles.
-
-    Raises `PblError` DB_REFUSED when the login (DJ_USER) may not manage accounts; what `connection.connect` raises.
-    """
+    """Create the accounts or bring them to these passwords and the rights of their roles. Raises `PblError` DB_REFUSED
+    when the login (DJ_USER) may not manage accounts; what `connection.connect` raises."""
     _run([s for account, password in accounts for s in statements(account, password, require_tls)])
 
 

@@ -124,10 +124,7 @@ def looks(restriction: Any = True) -> pd.DataFrame:
 
 def method_rows(stage: str | None = None) -> pd.DataFrame:
     """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
-    stage's default.
-
-    Raises `PblError` SOLVER_UNKNOWN for an unknown stage.
-    """
+    stage's default. Raises `PblError` SOLVER_UNKNOWN for an unknown stage."""
     import pandas as pd
 
     tables = {table.stage: table for table in METHOD_TABLES}

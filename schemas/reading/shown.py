@@ -125,10 +125,8 @@ def _problem(video_id: int) -> str:
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
-    """Return a visit by its number; `shown`: which of its results.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit or result.
-    """
+    """Return a visit by its number; `shown`: which of its results. Raises `PblError` DB_NOT_FOUND for an unknown visit
+    or result."""
     of_person = visits_of(str(session.registered_visit(session_id)["subject"]))
     results = tuple(results_of([session_id])[session_id])
     if not 0 <= shown < max(1, len(results)):
@@ -180,10 +178,8 @@ def computed_visit(session_id: int, shown: int) -> ShownVisit:
 
 
 def shown_recording(video_id: int) -> ShownRecording:
-    """Return a recording by its number, without opening its arrays.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown number.
-    """
+    """Return a recording by its number, without opening its arrays. Raises `PblError` DB_NOT_FOUND for an unknown
+    number."""
     recording = load_recording(video_id)
     visits = video.Video.proj("session_id") * session.Session.proj("subject", "session_label")
     named = (visits & {"video_id": video_id}).fetch1()
@@ -211,10 +207,8 @@ def video_facts(recording: Recording) -> dict[str, Any]:
 
 
 def computations(video_id: int) -> tuple[Any, ...]:
-    """Return the identity of the computations of the shown fit of a recording and its events.
-
-    Raises as `ShownRecording.fitted`.
-    """
+    """Return the identity of the computations of the shown fit of a recording and its events. Raises as
+    `ShownRecording.fitted`."""
     key = fit.trial_key(video_id)
     if key is None:
         shown_recording(video_id).fitted()

@@ -58,10 +58,8 @@ class Trend:
 
 
 def trend_of(session_id: int, measure: str = INDEX) -> Trend:
-    """Return all visits of the person of a visit.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an unknown measure.
-    """
+    """Return all visits of the person of a visit. Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an
+    unknown measure."""
     from pbl_pipeline.gait import TASK_MEASURES
 
     subject = str(session.registered_visit(session_id)["subject"])

@@ -101,10 +101,8 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
 
 
 def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:
-    """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`.
-
-    Raises what `load_visit` raises, and `PblError` DB_NOT_FOUND where it is not computed yet.
-    """
+    """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`. Raises what
+    `load_visit` raises, and `PblError` DB_NOT_FOUND where it is not computed yet."""
     visit = load_visit(restriction, measures=gait)
     if visit.solution is None or (whole and visit.measures is None):
         problems = "; ".join(f"{r.name}: {r.problem}" for r in visit.left_out if r.problem)

@@ -55,10 +55,8 @@ class Why:
 
 
 def why(video_id: int) -> Why:
-    """Return the state of a registered video in every table. `schemas.activate()` must have been called.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown video.
-    """
+    """Return the state of a registered video in every table. `schemas.activate()` must have been called. Raises
+    `PblError` DB_NOT_FOUND for an unknown video."""
     row = video.registered_video(video_id)
     # One of several cameras: from the fit on the trial counts, before it every camera.
     trial = fit.trial_of(video_id)

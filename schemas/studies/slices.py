@@ -183,10 +183,8 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
 
 
 def changes(name: str) -> list[str]:
-    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown slice.
-    """
+    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out. Raises
+    `PblError` DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     rows = _frozen(about)
     out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]

@@ -196,10 +196,8 @@ def enter(
 
 
 def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str], seen: str) -> Form:
-    """Return what is stored, which is what the form showed.
-
-    Raises `PblError` DB_NOT_FOUND, USAGE, DECIDED_MEANWHILE.
-    """
+    """Return what is stored, which is what the form showed. Raises `PblError` DB_NOT_FOUND, USAGE,
+    DECIDED_MEANWHILE."""
     session.lock(session_id)  # a concurrent entry waits here
     now = read(session_id)
     if unknown := sorted(set(given) - set(now.values)):

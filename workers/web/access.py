@@ -266,11 +266,8 @@ class Refused(Exception):
 
 
 async def form_of(request: Request) -> Mapping[str, str]:
-    """The fields of a form whose token is that of its sender's session.
-
-    Raises Refused: another token or none, a body that is too long, broken off or no form; `PblError` USAGE for a text
-    with control or invisible characters.
-    """
+    """The fields of a form whose token is that of its sender's session. Raises Refused: another token or none, a body
+    that is too long, broken off or no form; `PblError` USAGE for a text with control or invisible characters."""
     fields = await read_form(request)
     check_token(request, fields.pop("token", "") or request.headers.get("x-token", ""))
     check_fields(fields)

@@ -161,10 +161,8 @@ class Accounts:
 
 
 def hashed(password: str, log_n: int | None = None) -> str:
-    """A salted hash of a password, with what it takes to compare another one with it.
-
-    Raises `PblError` WEB_ACCOUNT for one that is too short or long. The password is in no error.
-    """
+    """A salted hash of a password, with what it takes to compare another one with it. Raises `PblError` WEB_ACCOUNT for
+    one that is too short or long. The password is in no error."""
     if not SHORTEST <= len(password) <= LONGEST:
         raise _refused(
             f"a password of {len(password)} characters",

@@ -22,9 +22,7 @@ class Looks:
 
     async def record(self, session: Session, of: str, number: int, what: str) -> None:
         """Insert a row for what is looked at, one in `AGAIN_S` for all but a page; `of`: "video_id" or "session_id".
-
-        Raises `PblError` where it cannot be written.
-        """
+        Raises `PblError` where it cannot be written."""
         key, now = (of, str(number), what), self._clock()
         if what != "page" and now - session.looked.get(key, -AGAIN_S) < AGAIN_S:
             return

@@ -26,9 +26,7 @@ LINGER_S = 1.0
 
 def customer(address: str) -> str:
     """Return the IPv4 address, also of one written as IPv6; of IPv6 the /64 network, all of which one customer has.
-
-    Raises ValueError if the text is not an address.
-    """
+    Raises ValueError if the text is not an address."""
     at = ip_address(address)
     if isinstance(at, IPv6Address):
         return str(at.ipv4_mapped or IPv6Address(int(at) >> 64 << 64))

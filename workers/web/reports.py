@@ -89,9 +89,7 @@ def state(work: Work | None) -> Response:
 # ------------------------------------------------------------------------------------ asked in the thread of the tables
 def overlay_key(video_id: int) -> tuple[Any, ...]:
     """Return the dependencies of the overlay of a recording, which change with new results and with hidden heads.
-
-    Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit.
-    """
+    Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit."""
     about = reading.shown_recording(video_id)
     if not about.recording.fitted or about.recording.path is None:
         raise PblError(

@@ -35,11 +35,8 @@ class Videos:
         self._lock = threading.Lock()
 
     def path(self, video_id: int) -> Path:
-        """Return the file to show. Reads tables.
-
-        Raises `PblError` DB_NOT_FOUND for an unknown video or one without the copy that is asked for, HEAD_NOT_FOUND,
-        VIDEO_MISSING.
-        """
+        """Return the file to show. Reads tables. Raises `PblError` DB_NOT_FOUND for an unknown video or one without the
+        copy that is asked for, HEAD_NOT_FOUND, VIDEO_MISSING."""
         with self._lock:
             if video_id in self._open:
                 self._open.move_to_end(video_id)

@@ -152,10 +152,8 @@ def find_server() -> Binaries | None:
 
 
 def check_obtainable() -> None:
-    """Check that the server can be started or fetched; nothing is made or fetched.
-
-    Raises `PblError` DB_UNAVAILABLE with the reason and alternatives.
-    """
+    """Check that the server can be started or fetched; nothing is made or fetched. Raises `PblError` DB_UNAVAILABLE
+    with the reason and alternatives."""
     if not hasattr(os, "geteuid"):
         raise _unavailable("the embedded database needs the accounts and file locks of Linux or macOS", install=False)
     if find_server() is not None:
@@ -167,10 +165,8 @@ def check_obtainable() -> None:
 
 
 def get_server(say: Say = silent) -> Binaries:
-    """Return the server of this machine, fetched with apt if it is absent.
-
-    Raises `PblError` DB_UNAVAILABLE with the reason and the remedy.
-    """
+    """Return the server of this machine, fetched with apt if it is absent. Raises `PblError` DB_UNAVAILABLE with the
+    reason and the remedy."""
     found = find_server()
     if found:
         return found

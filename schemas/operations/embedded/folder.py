@@ -37,10 +37,8 @@ def port_free(port: int) -> bool:
 
 
 def free_port() -> int:
-    """Return a random free port, so that several databases on one machine rarely collide.
-
-    Raises `PblError` DB_UNAVAILABLE when 200 tries find none.
-    """
+    """Return a random free port, so that several databases on one machine rarely collide. Raises `PblError`
+    DB_UNAVAILABLE when 200 tries find none."""
     for port in random.sample(PORTS, 200):
         if port_free(port):
             return port
@@ -114,10 +112,8 @@ def server_account(data: Path) -> Account:
 
 
 def check_enterable(folder: Path, account: Account) -> None:
-    """Check as `account` that it can enter `folder`: permission bits alone do not decide.
-
-    Raises `PblError` DB_UNAVAILABLE, which names the first closed folder on the way, and the remedy.
-    """
+    """Check as `account` that it can enter `folder`: permission bits alone do not decide. Raises `PblError`
+    DB_UNAVAILABLE, which names the first closed folder on the way, and the remedy."""
     if not account.popen():
         return
     if _can_enter(folder, account):
@@ -190,10 +186,8 @@ class Folder:
         return self.credentials_file.exists()
 
     def create(self, account: Account) -> None:
-        """Make the folders; `account` owns those of the server.
-
-        Raises `PblError` DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
-        """
+        """Make the folders; `account` owns those of the server. Raises `PblError` DB_UNAVAILABLE when they cannot be
+        made, or when `account` cannot enter them."""
         try:
             missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
@@ -209,10 +203,8 @@ class Folder:
 
     @contextmanager
     def locked(self, timeout_s: float = 120.0) -> Iterator[None]:
-        """Hold the folder's lock; another command that starts or stops the server waits.
-
-        Raises `PblError` DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
-        """
+        """Hold the folder's lock; another command that starts or stops the server waits. Raises `PblError`
+        DB_UNAVAILABLE when another command holds it for longer than `timeout_s`."""
         with ExitStack() as stack:
             try:
                 stack.enter_context(one_process(self.path / "lock", timeout_s))
@@ -229,11 +221,8 @@ class Folder:
             yield
 
     def credentials(self) -> Credentials:
-        """Return the stored passwords.
-
-        Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read;
-        FILE_FORMAT for one that is damaged.
-        """
+        """Return the stored passwords. Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED
+        when the file may not be read; FILE_FORMAT for one that is damaged."""
         try:
             with _undamaged(
                 self.credentials_file, "restore it from a copy of the folder: nothing else has the passwords"

@@ -45,10 +45,8 @@ def buffer_pool_mb() -> int:
 
 
 def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
-    """Start the server as a separate process that outlives this one, and wait until it answers.
-
-    Raises `PblError` DB_UNAVAILABLE with the server's last lines and the remedy.
-    """
+    """Start the server as a separate process that outlives this one, and wait until it answers. Raises `PblError`
+    DB_UNAVAILABLE with the server's last lines and the remedy."""
     port = folder.state().get("port")
     for attempt in range(5):
         if port is None or attempt > 0 or not port_free(port):
@@ -95,10 +93,8 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
 
 
 def wait_until_answers(folder: Folder) -> None:
-    """Wait until an administrator can log in.
-
-    Raises `PblError` DB_UNAVAILABLE when the process ends, or does not answer within a minute (it goes on then).
-    """
+    """Wait until an administrator can log in. Raises `PblError` DB_UNAVAILABLE when the process ends, or does not
+    answer within a minute (it goes on then)."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:

@@ -34,10 +34,8 @@ DROP_EVERY_ACCOUNT = (
 
 
 def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
-    """Fill `folder.data` and write the credentials, which mark the set-up as complete.
-
-    Raises `PblError` DB_UNAVAILABLE for too little space, or with the output of the program that failed.
-    """
+    """Fill `folder.data` and write the credentials, which mark the set-up as complete. Raises `PblError` DB_UNAVAILABLE
+    for too little space, or with the output of the program that failed."""
     free_mb = shutil.disk_usage(folder.path).free // 2**20
     if free_mb < NEEDED_MB:
         raise PblError(
@@ -240,10 +238,8 @@ def status(folder: Folder | None = None) -> Status:
 
 
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
-    """Grant the application access to the schemas `<prefix>_...`, and record it in `server.json`.
-
-    Raises `PblError` USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer.
-    """
+    """Grant the application access to the schemas `<prefix>_...`, and record it in `server.json`. Raises `PblError`
+    USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer."""
     folder = folder or Folder.default()
     if prefix in folder.state().get("prefixes", []):
         return
