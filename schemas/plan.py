@@ -86,12 +86,12 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     failed = queues_before_fit()
     made = []
     for session_id in to_plan:
-        made += _plan_alone(session_id, failed)
+        made += _plan_locked(session_id, failed)
     return made
 
 
 @repeated
-def _plan_alone(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
+def _plan_locked(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
     with locked(session_id):
         return plan_anew(session_id, failed)
 

@@ -65,7 +65,7 @@ class Turn(dj.Manual):
 
 
 @contextmanager
-def alone(work: str, server: Any) -> Iterator[bool]:
+def installation_lock(work: str, server: Any) -> Iterator[bool]:
     """Hold an installation-wide lock for some work: only one process on any machine has it.
 
     Yields whether it was obtained; never waits. It ends with the process or its connection, as the server's named locks

@@ -37,7 +37,7 @@ def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup
 
     Raises what `schemas.operations.backup.backup` raises; nothing is removed then.
     """
-    with worker.alone("backup", connection.connect()) as obtained:
+    with worker.installation_lock("backup", connection.connect()) as obtained:
         if not obtained:
             return None
         before = sorted(p for p in root.glob("*") if _PATTERN.fullmatch(p.name))

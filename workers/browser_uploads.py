@@ -19,7 +19,7 @@ from schemas.intake import Registered, VisitRecord
 from schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import VIDEO_ENDINGS, Copy, check_opens, take_in
+from .incoming import VIDEO_ENDINGS, Copy, check_opens, register_copies
 
 #: Age at which the rest of a broken upload is removed (s).
 _REST_S = 86_400.0
@@ -122,7 +122,7 @@ def register(
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             return None
         place(to.session_id)  # a visit that was removed is not made again
@@ -130,7 +130,7 @@ def register(
         for one, copy in arrived:
             if not one.is_log:
                 log = logs.pop(PurePosixPath(one.name).stem, None)
-                out.append(_take_in(visit, one.name, [copy, log] if log else [copy], by))
+                out.append(_register_copies(visit, one.name, [copy, log] if log else [copy], by))
     expected, next_step = "the video of the same name with it", "send both together"
     out += [
         Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused("a sensor log alone", expected, next_step, stem))
@@ -140,9 +140,9 @@ def register(
     return out
 
 
-def _take_in(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
+def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
     try:
-        result: Registered = take_in(visit, name, copies, archive_dir())
+        result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
         if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
             raise

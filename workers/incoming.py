@@ -62,7 +62,7 @@ _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 
 
 @dataclasses.dataclass
-class Taken:
+class Imports:
     """The outcome of a run, by the names of the uploads."""
 
     registered: list[str] = dataclasses.field(default_factory=list)
@@ -82,9 +82,9 @@ class Copy:
     sha256: str
 
 
-def take_over(
+def import_uploads(
     url: str | None = None, archive: Path | None = None, settled_s: float = SETTLED_S, run_s: float = RUN_S
-) -> Taken | None:
+) -> Imports | None:
     """Import the complete uploads of the drop folder. Safe to interrupt and to repeat.
 
     Returns None if another process is importing.
@@ -93,10 +93,10 @@ def take_over(
     Uploads that were not imported until then stay in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             return None
-        out = Taken()
+        out = Imports()
         try:
             remove_copies(archive)
             whole = _listed(drop, archive, settled_s, out)
@@ -108,13 +108,13 @@ def take_over(
             if time.monotonic() > end:
                 out.later = len(whole) - i
                 break
-            _take(drop, recording, logs, archive, out)
+            _import_upload(drop, recording, logs, archive, out)
     out.registered.sort()
     return out
 
 
 # ------------------------------------------------------------------------------------------------------------- listing
-def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) -> list[tuple[Upload, list[Upload]]]:
+def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Imports) -> list[tuple[Upload, list[Upload]]]:
     """Recordings that have not changed for `settled_s`, each with its logs."""
     seen, now = load_seen(archive), time.time()
     still: dict[str, list] = {}
@@ -165,7 +165,7 @@ def _misplaced(upload: Upload) -> str:
 
 
 # -------------------------------------------------------------------------------------------------------------- taking
-def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive: Path, out: Taken) -> None:
+def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive: Path, out: Imports) -> None:
     """Copy, check, register, remove; what is refused is moved aside with its reason."""
     name, given, copies = str(recording.name), [recording, *logs], []
     try:
@@ -175,7 +175,7 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
                 copies.append(_copy(drop, upload, archive, end))
             subject, session, file = recording.name.parts
             check_subject(subject, "rename the folder and upload again", recording.name)
-            registered = take_in(VisitRecord(subject, session), file, copies, archive)
+            registered = register_copies(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
         except Exception as error:  # whatever it is, one upload never stops the others
@@ -259,7 +259,7 @@ def check_opens(path: Path, expected: str, next_step: str) -> None:
         ) from error
 
 
-def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
+def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
     """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
     them; return the outcome. `file`: the name that the recording came with.
 

@@ -145,7 +145,7 @@ class Worker:
                 self.heartbeat.doing(f"waits for the database: {error}")
                 event(log, logging.WARNING, "database away", error=str(error)[:200])
                 run_job.wait_for_database(self.stop, pause=not run_job.is_gone(error))
-                queue.let_go_all()  # what was reserved for later; a job in hand has waited for the database itself
+                queue.release_all()  # what was reserved for later; a job in hand has waited for the database itself
                 self._refreshed = -1e9
                 continue
             troubled = 0
@@ -159,7 +159,7 @@ class Worker:
                 quiet = 0 if self.siblings and queue.anything_reserved_here() else quiet + 1
                 if quiet > self.siblings:
                     return
-            self._let_go()
+            self._forget_recording()
             self.heartbeat.doing("waits for a recording of a phone" if self.phone else "idle")
             # Not all at the same moment: workers that were started together would go on asking together.
             self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
@@ -234,7 +234,7 @@ class Worker:
         if job.table.__name__ == "VideoInfo":
             self._in_hand = int(job.key["video_id"])
         elif job.table.__name__ == "Keypoints":
-            self._let_go()
+            self._forget_recording()
         self.done += good
         self.failed += outcome.what == run_job.FAILED
         self.heartbeat.count(job.table.__name__, int(good), int(outcome.what == run_job.FAILED), outcome.seconds)
@@ -246,7 +246,7 @@ class Worker:
             self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
         return outcome
 
-    def _let_go(self) -> None:
+    def _forget_recording(self) -> None:
         self._in_hand = None
         release_frames()
 

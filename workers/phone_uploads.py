@@ -21,7 +21,7 @@ from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remo
 from schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_opens, take_in
+from .incoming import Copy, check_opens, register_copies
 from .registry import FIRST
 
 
@@ -101,7 +101,7 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     """
     stated = {name: sent.about[name] for name in ("activity", "pace") if name in sent.about}
     visit = VisitRecord(phone.subject, phone.label, **stated)
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             raise PblError(
                 "DB_REFUSED",
@@ -118,7 +118,7 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
                 expected="a recording of this visit",
                 next_step="film again; who runs the server can find and move it (`pbl move`)",
             )
-        result = take_in(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
+        result = register_copies(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
     phone_recordings.received(sent.number, result.video_id)
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)

@@ -90,7 +90,7 @@ def fill(
     # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
     # outside: names are DataJoint's own, quoted by its adapter.
     statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
-    return _alone(table.connection, lambda: int(table.connection.query(statement).rowcount))
+    return _committed(table.connection, lambda: int(table.connection.query(statement).rowcount))
 
 
 def _is_long(keys: Any) -> str:
@@ -103,7 +103,7 @@ def _is_long(keys: Any) -> str:
 
 
 @repeated
-def _alone(connection: Any, statement: Callable[[], int]) -> int:
+def _committed(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
     connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
@@ -117,7 +117,7 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
     for needless in (table.proj(), dj.Not(keys_of(table).proj())):
         if jobs := jobs_of(table) & which:  # most often there are none
             gone = jobs.restrict(needless, semantic_check=False)
-            n += int(_alone(table.connection, functools.partial(gone.delete_quick, get_count=True)))
+            n += int(_committed(table.connection, functools.partial(gone.delete_quick, get_count=True)))
     return n
 
 
@@ -161,7 +161,7 @@ def anything_reserved_here() -> bool:
 def finish(job: Claim) -> None:
     """Delete the row of a finished job, if it is still ours."""
     _mine(job).delete_quick()
-    let_go(job)
+    release(job)
 
 
 def fail(job: Claim, message: str, stack: str = "") -> bool:
@@ -169,7 +169,7 @@ def fail(job: Claim, message: str, stack: str = "") -> bool:
     ours = len(_mine(job)) == 1
     if ours:
         jobs_of(job.table).error(job.key, error_message=message, error_stack=stack or None)
-    let_go(job)
+    release(job)
     return ours
 
 
@@ -177,16 +177,16 @@ def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, **counts: int) 
     """Make the job pending again, earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
     columns of `schemas.jobs.COUNTS`. Return whether it was ours."""
     ours = reset(_mine(job), reason, delay_s, **counts) == 1
-    let_go(job)
+    release(job)
     return ours
 
 
-def let_go(job: Claim) -> None:
+def release(job: Claim) -> None:
     """Forget the job: another worker has it."""
     _held.discard((job.table.__name__, job.hash))
 
 
-def let_go_all() -> None:
+def release_all() -> None:
     """Forget all jobs. Remaining reservations are freed like those of a dead process."""
     _held.clear()
 
@@ -207,7 +207,7 @@ def reset_to_new(jobs: Any) -> int:
     return reset(jobs, "", 0.0, **dict.fromkeys(COUNTS, 0))
 
 
-def wake(table: Any) -> int:
+def advance_delayed(table: Any) -> int:
     """Make jobs ready that would wait for longer than any is put back for: the server's clock was set back."""
     jobs = jobs_of(table)
     cursor = jobs.connection.query(
@@ -227,7 +227,7 @@ class ReservationLost(Exception):
     """Raised if another worker holds the job by now: its result must not be written twice."""
 
 
-def hold(job: Claim) -> float:
+def lock_reservation(job: Claim) -> float:
     """Inside the transaction that inserts: go on only while the reservation is ours, and let no other worker take it;
     returns when the job was queued (s since 1970).
 

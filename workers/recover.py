@@ -38,7 +38,7 @@ def free_dead(table: Any) -> int:
     was seen for `DEAD_AFTER_S`; one that never had a heartbeat (a populate by hand) when its reservation is older than
     the time limit of its table. A job whose processes died `DEATHS` times becomes an error row.
     """
-    jobs, n = jobs_of(table), queue.wake(table)
+    jobs, n = jobs_of(table), queue.advance_delayed(table)
     for row in jobs.reserved.to_dicts():
         if not _alive(row, table):
             key = {k: row[k] for k in jobs.primary_key}

@@ -9,7 +9,7 @@ from typing import Any
 
 from schemas import chain, fit, review, tracking, video, worker
 from schemas.reading.visit_progress import Scope, of_visit
-from schemas.worker import alone
+from schemas.worker import installation_lock
 
 from . import queue, recover
 from .queue import Claim
@@ -89,7 +89,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
     `everything`: look at all rows; None where the last such look is an hour ago, or where there are few videos.
     """
     server = video.Video.connection
-    with alone("refresh", server) as had:
+    with installation_lock("refresh", server) as had:
         if not had:
             return None
         if everything is None:
@@ -97,7 +97,7 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         lately = None if everything else recent()
         if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
             lately = None
-        out = _look(lately)
+        out = _queue_missing(lately)
         if lately is None:
             _note_full_look()
         return out
@@ -117,7 +117,7 @@ def recent() -> Scope:
 def refresh_scope(scope: Scope) -> Refreshed:
     """Refresh some recordings alone, also while another process looks at all: queue what can be computed of them, and
     remove obsolete jobs of them."""
-    return _look(scope, own=True)
+    return _queue_missing(scope, own=True)
 
 
 def queue_visit(session_id: int) -> None:
@@ -130,7 +130,7 @@ def queue_visit_of(video_id: int) -> None:
     queue_visit(int((video.Video & {"video_id": video_id}).fetch1("session_id")))
 
 
-def _look(scope: Scope | None, own: bool = False) -> Refreshed:
+def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
     """Queue what can be computed of a scope (None: of all). `own`: other recordings stay untouched; otherwise outdated
     choices are dropped, and all queues are swept."""
     from schemas.tracking import drop_outdated_choices

@@ -88,11 +88,11 @@ def run(
     `computed`: a result from a batch; it is used if the inputs are still those it was computed from. `waiting`: called
     again and again while the job waits for the database.
 
-    A result is inserted only while the reservation is ours (`queue.hold`), so that a job which two processes were given
-    leaves one row. Where the database goes away after the computation, or its disk is full, the result is kept and
-    inserted when it is back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for
-    `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of these
-    make an error row.
+    A result is inserted only while the reservation is ours (`queue.lock_reservation`), so that a job which two
+    processes were given leaves one row. Where the database goes away after the computation, or its disk is full, the
+    result is kept and inserted when it is back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job
+    back for `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of
+    these make an error row.
 
     KeyboardInterrupt and SystemExit put the job back and go on up.
     """
@@ -111,7 +111,7 @@ def run(
                 kept = repeated * DATABASE_PAUSE_S < DATABASE_WAIT_S
                 if kept and wait_for_database(stop, waiting, pause=not is_gone(error)):
                     continue
-                queue.let_go(job)  # its reservation is that of a dead process, and is freed as such
+                queue.release(job)  # its reservation is that of a dead process, and is freed as such
                 outcome = _outcome(job, LATER, error)
             elif number_of(error) in REPEAT and repeated < REPEATS:
                 continue
@@ -139,7 +139,7 @@ class _Attempt:
         if self.computed is None or not self.computed.of(fetched):
             self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
         with table.connection.transaction:
-            queued_s = queue.hold(self.job)
+            queued_s = queue.lock_reservation(self.job)
             if not self.computed.of(table.make_fetch(dict(key))):
                 raise InputChanged("other rows than before the computation", self.job)
             remove_left_over(table, key, queued_s)
@@ -166,7 +166,7 @@ def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
 def _settle(job: Claim, error: Exception) -> Outcome:
     """End the reservation of a job that failed, by what kind of error it was."""
     if isinstance(error, ReservationLost):
-        queue.let_go(job)
+        queue.release(job)
         return Outcome(job, LOST)
     if isinstance(error, DuplicateError) and job.key in job.table():
         queue.finish(job)

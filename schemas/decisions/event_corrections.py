@@ -31,7 +31,7 @@ _SAME_S = 0.0015
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class ShownEvents:
     """The events of a trial that the page shows, and where they come from."""
 
     #: Key of the row of GaitEvents.
@@ -59,7 +59,7 @@ class Shown:
         return self.detected if self.hand is None else self.hand
 
 
-def shown(video_id: int) -> Shown | None:
+def shown_events(video_id: int) -> ShownEvents | None:
     """Return the events of a recording; None before any were detected in a current fit."""
     trial = fit.trial_key(fit.trial_of(video_id))
     key = None if trial is None else gait.newest_events(trial)
@@ -71,7 +71,7 @@ def shown(video_id: int) -> Shown | None:
     hand = [] if counts is None else (gait.EventCorrection.Event & counts).to_dicts(order_by="corrected_no")
     last = (Decision & {"video_id": key["video_id"], "decision_what": "events"}).to_arrays("decision_id")
     computed = (gait.GaitEvents & key).fetch1("events_computed")
-    return Shown(
+    return ShownEvents(
         key=key,
         detected=tuple(tuple(e[f"event_{k}"] for k in _COLUMNS) for e in detected),
         hand=None if counts is None else tuple(tuple(e[f"corrected_{k}"] for k in _COLUMNS) for e in hand),
@@ -95,7 +95,7 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
 
     Returns the number of deleted rows by table.
 
-    `events`: time (s), side and kind of all current events. `seen`: `Shown.state` of the page on which they
+    `events`: time (s), side and kind of all current events. `seen`: `ShownEvents.state` of the page on which they
     were set.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
@@ -126,7 +126,7 @@ def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
 
 
 @repeated
-def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
+def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
     trial = int(before.key["video_id"])
     with locked(int((video.Video & {"video_id": trial}).fetch1("session_id"))):
         now = _must_be_shown(trial)
@@ -199,8 +199,8 @@ def _listed(events: Sequence[Event]) -> list[list[Any]]:
     return [[round(t, 4), side, kind] for t, side, kind, _ in events]
 
 
-def _must_be_shown(video_id: int) -> Shown:
-    found = shown(video_id)
+def _must_be_shown(video_id: int) -> ShownEvents:
+    found = shown_events(video_id)
     if found is None:
         raise PblError(
             "DB_NOT_FOUND",

@@ -124,7 +124,7 @@ def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
     if not kept:
         yield plan.files
         return
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             raise _kept("uploads are being taken over now", next_step="repeat this in a minute", key=kept[0])
         names: dict[Path, Path] = {}

@@ -22,7 +22,8 @@ from pbl_pipeline import settings
 from ..subject_codes import SUBJECT_CODE
 from .folders import private_folder, remove_empty, write_json
 
-#: Name of the installation-wide lock that every process holds while it changes the archive (`worker.alone`).
+#: Name of the installation-wide lock that every process holds while it changes the archive
+#: (`worker.installation_lock`).
 LOCK = "incoming"
 REFUSED, COPIES, PHONE = "_refused", ".incoming", "_phone"
 _SEEN = "seen.json"
@@ -40,7 +41,7 @@ def folder_of(archive: Path, part: str, subject: str) -> Path:
     return private_folder(private_folder(archive / part) / (subject if SUBJECT_CODE.fullmatch(subject) else "_"))
 
 
-def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED, PHONE)) -> list[Path]:
+def files_of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED, PHONE)) -> list[Path]:
     """Return all files in the folders of a person, by default without `COPIES`; links are listed, not followed."""
     folders = [archive / part / subject for part in parts]
     return sorted(

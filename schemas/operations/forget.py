@@ -84,7 +84,7 @@ def delete_uploads(subject: str) -> list[str]:
 def delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
     """Delete the person's files in the archive; return deleted paths, and path -> reason of those kept."""
     gone, kept = [], {}
-    for path in archive.of_person(archive_dir(), subject):
+    for path in archive.files_of_person(archive_dir(), subject):
         if video.Video & {"video_path": str(path)}:  # a file that was moved here
             kept[str(path)] = "another row names this path"
             continue
@@ -150,7 +150,9 @@ def find(subject: str) -> tuple[Ids, Found]:
     nor a list of an earlier run knows the subject."""
     ids, earlier = _identities(subject), read_manifest(subject)
     parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)  # copies are of a killed import
-    recordings = [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
+    recordings = [str(p) for p in archive.files_of_person(archive_dir(), subject, parts)] + list(
+        _uploads(_drop(), subject)
+    )
     if not lab.Subject & {"subject": subject} and not earlier and not recordings:
         raise PblError(
             "DB_NOT_FOUND",
@@ -173,7 +175,7 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     `videos`: also delete the video files that are unchanged since registration.
     """
     try:
-        with worker.alone(archive.LOCK, connection.connect()) as obtained:
+        with worker.installation_lock(archive.LOCK, connection.connect()) as obtained:
             if not obtained:
                 raise PblError(
                     "DB_REFUSED",

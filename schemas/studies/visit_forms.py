@@ -119,13 +119,13 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         return None, {"": error.with_key(None)}
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)
-    now = facts(number)
+    now = facts_form(number)
     if "height_m" in given and not now.same("height_m", given["height_m"]):
         _write(now, {"height_m": given["height_m"]}, by, "")
     return number, {}
 
 
-def facts(session_id: int) -> Form:
+def facts_form(session_id: int) -> Form:
     """Return what can be stated of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
     visit = session.registered_visit(session_id)
     person = (lab.Subject & {"subject": visit["subject"]}).fetch1()
@@ -147,7 +147,7 @@ def facts(session_id: int) -> Form:
     return Form(session_id, visit["subject"], visit["session_label"], values, recordings=names)
 
 
-def entry(session_id: int) -> Form:
+def scores_form(session_id: int) -> Form:
     """Return role and scores of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
     visit = session.registered_visit(session_id)
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
@@ -163,7 +163,7 @@ def instruments() -> dict[str, dict[str, Any]]:
     return {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
 
 
-def correct(
+def correct_facts(
     session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = ""
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
     """Bring what is stored of a visit, its person and its recordings to what was entered, all of it or nothing.
@@ -185,14 +185,18 @@ def correct(
     seen
         `Form.seen` of the form that was filled in.
     """
-    return in_transaction(lambda: _correct(_locked(facts, session_id, values, seen), _stripped(values), by, reason))
+    return in_transaction(
+        lambda: _correct(_locked(facts_form, session_id, values, seen), _stripped(values), by, reason)
+    )
 
 
-def enter(
+def enter_scores(
     session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = ""
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
-    """Bring role and scores of a visit to what was entered, all of it or nothing: as `correct`, of `entry`."""
-    return in_transaction(lambda: _enter(_locked(entry, session_id, values, seen), _stripped(values), by, reason))
+    """Bring role and scores of a visit to what was entered, all of it or nothing: as `correct_facts`, of
+    `scores_form`."""
+    given = _stripped(values)
+    return in_transaction(lambda: _enter(_locked(scores_form, session_id, values, seen), given, by, reason))
 
 
 def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str], seen: str) -> Form:

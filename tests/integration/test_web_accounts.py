@@ -151,7 +151,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
         answer = sign_in(client, name, password)
         assert answer.status_code == 401
         assert "do not belong together" in answer.text
-        client.app.state.way_in.attempts._failures.clear()  # type: ignore[attr-defined]
+        client.app.state.sign_in.attempts._failures.clear()  # type: ignore[attr-defined]
     answer = sign_in(client)
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     cookie = answer.headers["set-cookie"].lower()

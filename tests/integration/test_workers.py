@@ -163,7 +163,7 @@ def test_nobody_takes_a_job_over_while_its_result_is_inserted(tables: None, tmp_
         cursor.execute("SET SESSION innodb_lock_wait_timeout = 1")
         take = f"UPDATE {jobs.full_table_name} SET host = 'another-host'"
         with jobs.connection.transaction:
-            queue.hold(job)
+            queue.lock_reservation(job)
             with pytest.raises(pymysql.err.OperationalError) as waited:
                 cursor.execute(take)
             assert waited.value.args[0] == 1205  # waited for the lock in vain

@@ -35,12 +35,12 @@ def import_(settled_s: float) -> None:
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
     import schemas
-    from workers.incoming import take_over
+    from workers.incoming import import_uploads
 
     signal.alarm(AT_MOST_S)
     try:
         schemas.activate()
-        taken = take_over(settled_s=settled_s)
+        taken = import_uploads(settled_s=settled_s)
     finally:
         signal.alarm(0)
     if taken is None:

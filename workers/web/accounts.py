@@ -267,7 +267,7 @@ AT_ONCE = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class WayIn:
+class SignIn:
     """Ways to sign in. accounts: None if links open the page."""
 
     sessions: Sessions
@@ -276,7 +276,7 @@ class WayIn:
     attempts: Attempts
 
 
-def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
+def routes(pages: Pages, way: SignIn, used: object = None) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
 

@@ -39,7 +39,7 @@ from . import (
     trend,
     visits,
 )
-from .accounts import Accounts, Attempts, WayIn
+from .accounts import Accounts, Attempts, SignIn
 from .accounts import routes as sign_in_routes
 from .address import OPEN, Address, own_address
 from .computing import Target, compute_visit
@@ -82,7 +82,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     if sessions is None and accounts is not None:
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    way = WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    way = SignIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
     visits_queue = ProcessQueue(most=50, kept=50)
 
@@ -181,7 +181,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         ],
         lifespan=life,
     )
-    app.state.sessions, app.state.way_in = sessions, way
+    app.state.sessions, app.state.sign_in = sessions, way
     app.state.computing, app.state.phones = visits_queue, phones
     app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
     app.router.default, app.router.redirect_slashes = unknown, False

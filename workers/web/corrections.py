@@ -29,7 +29,7 @@ class Judged:
     mark: not_usable.Unusable | None
     usable_state: str
     views: int
-    events: event_corrections.Shown | None
+    events: event_corrections.ShownEvents | None
     reasons: tuple[str, ...] = tuple(UNUSABLE)
 
 
@@ -37,7 +37,7 @@ def judged(video_id: int) -> Judged:
     """Return the decisions about a registered recording. Reads tables."""
     views = fit.videos_of(fit.trial_of(video_id))
     mark = not_usable.unusable([video_id]).get(video_id)
-    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown(video_id))
+    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown_events(video_id))
 
 
 def routes(tables: Tables) -> list[Address]:

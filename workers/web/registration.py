@@ -77,7 +77,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
-        stored, language = await tables.ask(visit_forms.facts, number_of(request)), reader_language(request)
+        stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
         numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
         return pages.show(
             request,
@@ -93,7 +93,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def correct(request: Request) -> Response:
         fields = dict(await form_of(request))
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_forms.correct, number, fields, sender(request), seen, reason)
+        changed, errors = await tables.ask(visit_forms.correct_facts, number, fields, sender(request), seen, reason)
         if errors:
             return await facts_page(request, fields, errors)
         if changed:

@@ -131,7 +131,7 @@ class TablesSource:
         return found, [review_decisions.person_state(about.number, c.key["tracking_method"]) for c in found]
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
-        from schemas.studies.visit_forms import entry
+        from schemas.studies.visit_forms import scores_form
 
         number = about.row.session_id
         film = phone_recordings.filming(number)
@@ -140,6 +140,6 @@ class TablesSource:
         return {
             "decisions": review_decisions.decisions(number),
             "accepted": review_decisions.accepted(about.key) if about.key else {},
-            "entry": entry(number),
+            "entry": scores_form(number),
             "film": film,
         }
