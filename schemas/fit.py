@@ -291,7 +291,7 @@ class SessionFit(dj.Computed):
     def make_computes(
         self, keys: Sequence[dict], fetched: Sequence[tuple]
     ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
-        """Several sets in one call of the library: for each what `make_compute` returns, None where it would raise.
+        """Several sets in one call of the library: for each what `make_compute` returns, None if it would raise.
 
         A worker with a GPU fits a batch so, and hands each result to the table's own make.
         """
@@ -459,7 +459,7 @@ def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
 
 
 def trial_key(video_id: int) -> dict[str, Any] | None:
-    """Key of the fit of a recording: of its current sets the one that was computed last; None where there is none."""
+    """Key of the fit of a recording: of its current sets the one that was computed last; None if there is none."""
     trials = SessionFit.Trial.proj() * SessionFit.proj("fit_computed") * current().proj() & {"video_id": video_id}
     rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
     return {k: rows[0][k] for k in SessionFit.Trial.primary_key} if rows else None
@@ -472,7 +472,7 @@ def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
 
 
 def median(values: np.ndarray) -> float | None:
-    """Median of the values that are there; None where none is."""
+    """Median of the values that are there; None if none is."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
 

@@ -89,7 +89,7 @@ class EventCorrection(dj.Manual):
 
 def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
     """Key of the correction that counts of the events of a trial (key of GaitEvents): the last one of the person who is
-    measured in its set; None where there is none or the last one was withdrawn.
+    measured in its set; None if there is none or the last one was withdrawn.
 
     Waits for a decision that is being written, and inside a transaction keeps others waiting until its end, so that
     what is computed from these rows and what is decided about them never cross.
@@ -107,7 +107,7 @@ def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def accepted_cadence(key: Mapping[str, Any]) -> float | None:
-    """Return the cadence (steps/min) of a trial (key of GaitEvents) that a person accepted last; None where no one did.
+    """Return the cadence (steps/min) of a trial (key of GaitEvents) that a person accepted last; None if no one did.
 
     `decisions.review_decisions.accept_check` writes it. Call it after `correction_of`, which waits for a decision that
     is being written.
@@ -121,7 +121,7 @@ def accepted_cadence(key: Mapping[str, Any]) -> float | None:
 
 def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
     """Key of the events of a fitted trial (key of SessionFit.Trial) that are shown: corrected ones before others, then
-    those that were detected last; None where none were detected yet."""
+    those that were detected last; None if none were detected yet."""
     rows = (GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
     keys = [{k: row[k] for k in GaitEvents.primary_key} for row in rows]
     return next((k for k in keys if correction_of(k) is not None), keys[0] if keys else None)
@@ -429,7 +429,7 @@ _MEASURE_PARTS = (
 
 
 def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
-    """The library's `Measure` of a row of `measure_columns(prefix)`, None where it is not known."""
+    """The library's `Measure` of a row of `measure_columns(prefix)`, None if it is not known."""
     from pbl_pipeline.gait import Measure
 
     if row[f"{prefix}_mean"] is None:
@@ -441,7 +441,7 @@ def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
 
 
 def mean_of(measure: lib.Measure | None) -> float | None:
-    """The mean of a library `Measure`, None where there is none."""
+    """The mean of a library `Measure`, None if there is none."""
     return None if measure is None else number(measure.mean)
 
 

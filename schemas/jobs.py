@@ -62,7 +62,7 @@ def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
 
 
 def _kept(made: dict[Any, Any], table: Any, make: Callable[[], Any]) -> Any:
-    """Return the cached object of a table, made anew if the tables have another connection since."""
+    """Return the cached object of a table, made again if the tables have another connection since."""
     if table not in made or made[table].connection is not table().connection:
         made[table] = make()
     return made[table]

@@ -230,7 +230,7 @@ class _Walk:
 
 
 def stated_of(session_id: int) -> tuple[float | None, str]:
-    """Return body mass (kg) and walking aid as stated of a visit, None and "" where nothing is.
+    """Return body mass (kg) and walking aid as stated of a visit, None and "" if nothing is.
 
     A locking read, which sees what is committed whenever this transaction began (as `gait.correction_of`).
     """

@@ -25,7 +25,7 @@ GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_
 
 def default_fit(keypoint_method: str) -> str:
     """Return the key of the fit method for keypoints of this method (a key) where none is named: as `pbl run` chooses.
-    Raises `PblError` MODEL_MISSING, MODEL_INVALID where the method's model is not registered on this machine."""
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID if the method's model is not registered on this machine."""
     from pbl_pipeline.fit import default_fit as suited
 
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})

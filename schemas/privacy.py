@@ -110,7 +110,7 @@ class Deidentified(dj.Computed):
 @contextlib.contextmanager
 def shown(video_id: int) -> Iterator[Path | None]:
     """The recording whose pictures overlays and reports show: the de-identified copy where PBL_DEIDENTIFY asks for it,
-    None where it does not.
+    None if it does not.
 
     Raises `PblError` DB_NOT_FOUND: such a copy does not exist yet. HEAD_NOT_FOUND: nothing was covered in it.
     """

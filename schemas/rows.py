@@ -1,4 +1,4 @@
-"""Values of columns, quality checks as rows, and rows that go with all that was computed from them."""
+"""Values of columns, quality checks as rows, and rows that go with all dependent results."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def utc_now() -> datetime.datetime:
 
 
 def number(value: Any) -> float | None:
-    """A float for a nullable column: None where the value is missing or not finite."""
+    """A float for a nullable column: None if the value is missing or not finite."""
     if value is None:
         return None
     value = float(value)
@@ -147,13 +147,13 @@ def counted(deleted: Mapping[str, int]) -> str:
     return ", ".join(f"{n} of {name}" for name, n in deleted.items())
 
 
-#: Times that a cascade is begun anew where another process inserts below it, or holds its locks, meanwhile.
+#: Times that a cascade is begun again where another process inserts below it, or holds its locks, meanwhile.
 _DELETES = 5
 
 
 @columns_read_once()
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Delete the rows with these keys and all that was computed from them, in one transaction. Returns table name to
+    """Delete the rows with these keys and all dependent results, in one transaction. Returns table name to
     number of deleted rows, empty when there was nothing."""
     if not keys:
         return {}
@@ -172,7 +172,7 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
             # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
                 raise
-            if target.connection.in_transaction:  # it goes on seeing the tables as they were
+            if target.connection.in_transaction:  # it keeps seeing the tables as they were
                 raise pymysql.err.OperationalError(REPEAT[0], str(error)) from error
     return counts
 

@@ -44,7 +44,7 @@ def store_spec() -> dict[str, Any]:
     """Return the store for DataJoint's configuration. Makes the folder; asks no object store yet (`check_store` does).
 
     Raises `PblError` DB_REFUSED for a folder that cannot be used, USAGE for settings of an object store that cannot
-    work, STORE_UNAVAILABLE where the package for object stores is missing.
+    work, STORE_UNAVAILABLE if the package for object stores is missing.
     """
     if is_remote():
         return _bucket_spec()

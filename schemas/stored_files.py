@@ -24,7 +24,7 @@ def stored_file(ref: Mapping[str, Any]) -> Iterator[Path]:
 
     For a store in a folder it is the file itself, for a remote one a copy that is removed afterwards.
 
-    Raises `PblError` FILE_FORMAT where the store has no such file, another size of it, or what reads it cannot.
+    Raises `PblError` FILE_FORMAT if the store has no such file, another size of it, or what reads it cannot.
     """
     backend = backend_of(ref.get("store") or connection.STORE)
     if backend.protocol == "file":

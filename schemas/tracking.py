@@ -264,12 +264,12 @@ def choose_command(key: Mapping[str, Any], persons: str) -> str:
 
 def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
     """Delete choices that contradict the overrides (another person was chosen, or the override was withdrawn), and all
-    that was computed from them, in one transaction.
+    dependent results, in one transaction.
 
     An override that confirms the automatic choice changes nothing that was computed: the choice becomes MANUAL and
     stays.
 
-    Returns the number of deleted rows by table, empty if nothing was outdated. The next populate computes them anew.
+    Returns the number of deleted rows by table, empty if nothing was outdated. The next populate recomputes them.
     """
     decided = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
     confirmed = decided & "choice_status != 'MANUAL' and chosen_person_id = override_person_id" & restriction

@@ -291,7 +291,7 @@ def condition(video_id: int, rows: Rows = stored_rows) -> Condition:
 
 def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
     """The calibration that counts for a video, by its joined row of Video and VideoInfo: its own, else that of the
-    phone which recorded it; None where there is neither.
+    phone which recorded it; None if there is neither.
 
     A row of CameraCalibration, and `turn_deg`: how far its picture has to be turned clockwise to be this video's.
     """

@@ -30,7 +30,7 @@ def backup_folder() -> Path:
 
 
 def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup | None:
-    """Save everything into a new folder of `root`, then remove all but the `keep` newest; None where another process
+    """Save everything into a new folder of `root`, then remove all but the `keep` newest; None if another process
     is doing this.
 
     Recordings that the newest one has are linked: they take room once. The remains of an interrupted run are removed.

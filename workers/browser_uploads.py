@@ -118,7 +118,7 @@ def register(
     """Register files that arrived whole; a sensor log goes with the video of its name. One outcome for each video and
     each log without a video; None, with nothing done, while the drop folder is being taken over or a person removed.
 
-    Raises `PblError` DB_NOT_FOUND where the visit is gone, DB_..., FILE_UNWRITABLE.
+    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., FILE_UNWRITABLE.
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []

@@ -151,7 +151,7 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Imports
 
 
 def _misplaced(upload: Upload) -> str:
-    """Return why an entry of the drop folder is not a recording in its place; "" where it is one, or a log."""
+    """Return why an entry of the drop folder is not a recording in its place; "" if it is one, or a log."""
     name = upload.name
     if any(part.startswith((".", "_")) for part in name.parts):
         return "a name that begins with . or _, as what is still being written has"

@@ -48,7 +48,7 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
                 for job, made in zip(batch, result.result(), strict=True):
                     left.remove(job)
                     ended.append(worker.one(job, made))
-            except BaseException:  # told to end at once, or the database does not answer
+            except BaseException:  # told to end immediately, or the database does not answer
                 device.shutdown(wait=False, cancel_futures=True)
                 for job in left:
                     worker.report(job, Outcome(job, run_job.LATER))
@@ -215,7 +215,7 @@ class Worker:
         try:
             while left and not self.stop.is_set():
                 ended.append(self.one(left.pop(0)))
-        finally:  # also where we are told to end at once
+        finally:  # also where we are told to end immediately
             for job in left:
                 queue.put_back(job)
         self.follow(ended)

@@ -50,7 +50,7 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
 
 
 def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -> None:
-    """Write a part to the archive, on disk when this returns. Raises `PblError` UPLOAD_REFUSED where the bytes are not
+    """Write a part to the archive, on disk when this returns. Raises `PblError` UPLOAD_REFUSED if the bytes are not
     those that the phone sent; OSError if it cannot be written."""
     if hashlib.sha256(body).hexdigest() != sha256:
         raise upload_refused(f"part {number} with another SHA-256 than was sent", "it is sent again")
@@ -96,8 +96,8 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
 def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     """Register a recording that was put together, have it computed first, and remove its parts; return its video_id.
 
-    Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND where the
-    visit is gone; VIDEO_DUPLICATE where another visit has the recording; what is wrong with it.
+    Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND if the
+    visit is gone; VIDEO_DUPLICATE if another visit has the recording; what is wrong with it.
     """
     stated = {name: sent.about[name] for name in ("activity", "pace") if name in sent.about}
     visit = VisitRecord(phone.subject, phone.label, **stated)

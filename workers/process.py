@@ -31,7 +31,7 @@ QUERY_S = 30.0
 
 def given_gpus() -> tuple[str, ...]:
     """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
-    none where there is no NVIDIA driver."""
+    none if there is no NVIDIA driver."""
     listed = os.environ.get(VISIBLE)
     if listed is None:
         query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]

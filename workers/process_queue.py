@@ -92,7 +92,7 @@ class ProcessQueue:
         self._lock, self._stop = threading.Lock(), threading.Event()
 
     def find(self, key: Hashable) -> Work | None:
-        """Return the work of a key; None where nothing was begun, or it is no longer kept."""
+        """Return the work of a key; None if nothing was begun, or it is no longer kept."""
         with self._lock:
             if key in self._works:
                 self._works.move_to_end(key)

@@ -80,13 +80,13 @@ def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
 def refresh(everything: bool | None = None) -> Refreshed | None:
     """Look for computable keys: free dead reservations, drop results that a decision made outdated, queue missing ones.
 
-    Followers of finished jobs are queued at once (`after`), so a look is for changes from outside: new recordings,
+    Followers of finished jobs are queued immediately (`after`), so a look is for changes from outside: new recordings,
     choices, methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the
     recordings that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
 
     Returns None while another process is looking.
 
-    `everything`: look at all rows; None where the last such look is an hour ago, or where there are few videos.
+    `everything`: look at all rows; None if the last such look is an hour ago, or where there are few videos.
     """
     server = video.Video.connection
     with installation_lock("refresh", server) as had:
@@ -121,7 +121,7 @@ def refresh_scope(scope: Scope) -> Refreshed:
 
 
 def queue_visit(session_id: int) -> None:
-    """Queue what a decision made computable of a visit, so that pages and workers see it at once."""
+    """Queue what a decision made computable of a visit, so that pages and workers see it immediately."""
     refresh_scope(of_visit(session_id))
 
 
@@ -149,7 +149,7 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
             out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
             out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
         elif not own:
-            out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
+            out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go immediately
     return out
 
 
@@ -158,7 +158,7 @@ def _few(server: Any) -> bool:
 
 
 def _age_of_full_look() -> float:
-    """Seconds since the last look at all rows; infinite where there was none."""
+    """Seconds since the last look at all rows; infinite if there was none."""
     table = worker.Look.full_table_name
     row = video.Video.connection.query(
         f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608

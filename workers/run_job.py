@@ -30,7 +30,7 @@ DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "another worker ha
 VANISHED = "no longer asked for"
 
 #: Exceptions of the driver and DataJoint about the database: where it is away, full or read-only the computed result is
-#: kept and written later; at most `REPEATS` times the same statement is tried again at once.
+#: kept and written later; at most `REPEATS` times the same statement is tried again immediately.
 DATABASE_ERRORS = (
     LostConnectionError,
     pymysql.err.OperationalError,
@@ -129,7 +129,7 @@ class _Attempt:
     computed: Computed | None = None
 
     def make(self) -> str:
-        """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any more); raises what goes wrong."""
+        """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any longer); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
         if key in table:
             return ALREADY
@@ -207,7 +207,7 @@ def cause_outside(error: BaseException) -> str | None:
 
 
 def number_of(error: BaseException) -> int:
-    """The server's number of an error, 0 where there is none."""
+    """The server's number of an error, 0 if there is none."""
     first = error.args[0] if isinstance(error, DATABASE_ERRORS) and error.args else 0
     return first if isinstance(first, int) else 0
 

@@ -129,7 +129,7 @@ class Supervisor:
         return _Child(process, here, time.monotonic(), number=number)
 
     def _serve_long(self) -> None:
-        """Start the process for long recordings that a lone process asked for, where there is none."""
+        """Start the process for long recordings that a lone process asked for, if there is none."""
         number, asked = self.options.processes + 1, self._long_waits and self.options.lone and not self._stopping
         if asked and all(c.number != number for c in self._children):
             self._children.append(self._launch(number))

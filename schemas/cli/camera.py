@@ -27,7 +27,7 @@ def camera() -> None:
 def add(file: Path, like: Path | None) -> None:
     """Register the calibration in FILE, in the place of an older one of the same lens, size and rate.
 
-    What was computed with another calibration than now counts is deleted and listed; `pbl populate` computes it anew.
+    What was computed with another calibration than now counts is deleted and listed; `pbl populate` recomputes it.
     """
     import schemas
     from schemas.intake import calibrations as cameras

@@ -35,7 +35,7 @@ def choose(
 ) -> None:
     """Measure PERSON of video VIDEO_ID, or leave the video out. The choice overrides the automatic one.
 
-    What was computed for another person is deleted and listed; `pbl populate` computes it anew. Without PERSON nothing
+    What was computed for another person is deleted and listed; `pbl populate` recomputes it. Without PERSON nothing
     changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of
     them is written. A video that is --not-usable takes part in no fit; its visit is computed without it, and what was
     computed with it comes back with --usable.

@@ -13,8 +13,8 @@ def move(video_id: int, target: str, yes: bool) -> None:
     """Put video VIDEO_ID, registered for the wrong person or visit, where it belongs.
 
     Where several cameras filmed the trial, all of its videos go. Keypoints stay. Fits that hold them are deleted with
-    all that was computed from them; `pbl populate` fits the rest of the old visit, and the new one. A person or
-    visit that is new is made.
+    all dependent results; `pbl populate` fits the rest of the old visit, and the new one. A person or visit that is new
+    is made.
 
     \b
     Example: pbl move 17 --to P018/2026-03-01

@@ -167,7 +167,8 @@ def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
 
 
 def load_slice(name: str, curves: bool = True) -> StudyData:
-    """The `StudyData` of a slice; what changed since it was frozen is said on stderr. Raises as `slices.study_data`."""
+    """The `StudyData` of a slice; what changed since it was frozen is printed on stderr. Raises as
+    `slices.study_data`."""
     import schemas
     from schemas.studies import slices
 

@@ -37,7 +37,7 @@ class ShownEvents:
     #: Key of the row of GaitEvents.
     key: Mapping[str, Any]
     detected: tuple[Event, ...]
-    #: The events as a person set them; None where no one corrected any of the person who is measured.
+    #: The events as a person set them; None if no one corrected any of the person who is measured.
     hand: tuple[Event, ...] | None
     #: Who corrected, when (UTC), and how many events.
     by: str

@@ -76,17 +76,17 @@ def person_state(video_id: int, tracking_method: str) -> str:
 def decide_person(
     video_id: int, person: int, tracking_method: str | None = None, by: str = "", seen: str | None = None
 ) -> dict[str, int]:
-    """Measure `person` of a video: write the override, delete what was computed for another person, add a Decision.
+    """Measure `person` of a video: write the override, delete the results of another person, add a Decision.
 
     All in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
 
-    Raises `PblError` DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
+    Raises `PblError` DECIDED_MEANWHILE if the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
     `selection_of` raises.
 
-    Returns the number of deleted rows by table, which the next populate computes anew.
+    Returns the number of deleted rows by table, which the next populate recomputes.
 
     `tracking_method`: tracking in which the person has this number; needed where several methods track the video.
-    `seen`: `person_state` of the page on which it was decided; None where nothing was shown.
+    `seen`: `person_state` of the page on which it was decided; None if nothing was shown.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
@@ -118,7 +118,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     brings back what was computed; frozen slices stay as they are.
 
     Raises `PblError` USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
-    DECIDED_MEANWHILE where `seen` is another state than the tables'.
+    DECIDED_MEANWHILE if `seen` is another state than the tables'.
 
     `reason`, `note`: one of `words.UNUSABLE`, and more in free words (no names), which "other" asks for. `seen`:
     `usable_state` of the page on which it was decided; None: whatever it is.
@@ -138,7 +138,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
 def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
     """Use a recording again that was marked as not usable, with a row of Decision: one transaction.
 
-    The session is planned with it again; what was computed with it before is there at once. Not marked: nothing
+    The session is planned with it again; what was computed with it before is there immediately. Not marked: nothing
     happens. Raises `PblError` as `mark_not_usable`.
     """
     _decide_usable(video_id, None, by, seen)
@@ -174,10 +174,10 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
     """Accept a check of a visit that asks for attention, with one's name and a reason.
 
     It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
-    An unusual cadence is accepted although it failed: the cycles that it left out are deleted with what was computed
-    from them, and the next populate uses them; it holds while the recordings have this cadence.
+    An unusual cadence is accepted although it failed: the cycles that it left out are deleted with their dependent
+    results, and the next populate uses them; it holds while the recordings have this cadence.
 
-    Raises `PblError` DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without
+    Raises `PblError` DB_NOT_FOUND if there is no such check (any longer), USAGE for one that is not WARN, and without
     a reason or with one of more than 500 characters.
 
     `key`, `number`: key of SessionQc and `qc_no` of the check. `by`, `reason`: who accepts it, and why (no names).

@@ -42,7 +42,7 @@ class Move:
     new_subject: bool  # whether it is to be made
     new_session: bool
     sets: tuple[dict[str, Any], ...]  # keys of the sets of the old visit that hold one of them: deleted
-    deleted: dict[str, int]  # rows by table, with all that was computed from these sets
+    deleted: dict[str, int]  # rows by table, with all dependent results
     left: int  # videos that the old visit keeps
 
 
@@ -87,8 +87,8 @@ def carry_out(plan: Move) -> None:
     """Move the video into its new visit, with the plans of its methods.
 
     Detection and keypoints stay: they depend on the video alone. The sets of fits that hold it are deleted with all
-    that was computed from them; the rest of the old visit, and the new one, are fitted by the next populate. A
-    recording in the archive goes to the folder of its new person, so that `pbl forget` finds it there.
+    dependent results; the rest of the old visit, and the new one, are fitted by the next populate. A recording in the
+    archive goes to the folder of its new person, so that `pbl forget` finds it there.
 
     Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
     cannot be moved, or another process is changing the archive. Nothing is changed then.

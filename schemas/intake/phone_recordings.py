@@ -120,7 +120,7 @@ def end_link(session_id: int, number: int) -> None:
 
 
 def use_link(key: str, cookie: str) -> str | None:
-    """Open a link by its key; return the cookie that the phone gets, None where it already has the right one.
+    """Open a link by its key; return the cookie that the phone gets, None if it already has the right one.
 
     The phone that opens a link first is the only one that it opens for. Raises `PblError` PHONE_LINK.
     """
@@ -139,7 +139,7 @@ def use_link(key: str, cookie: str) -> str | None:
 
 
 def phone_of(cookie: str) -> Phone:
-    """Return the phone with a cookie. Raises `PblError` PHONE_LINK where its link has ended or never was."""
+    """Return the phone with a cookie. Raises `PblError` PHONE_LINK if its link has ended or never was."""
     link = _valid(PhoneLink & {"link_phone_sha256": hashed(cookie)})
     visit = (session.Session & {"session_id": link["session_id"]}).fetch1()
     number = int(link["session_id"])

@@ -28,7 +28,7 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     returns what changed, in words.
 
     Where a session's measures pool the video now and did not before, or the other way round, they are deleted, so that
-    the next populate computes them anew; likewise the measures of a video that is or was one of a task. Call it inside
+    the next populate recomputes them; likewise the measures of a video that is or was one of a task. Call it inside
     a transaction.
 
     Raises `PblError` DB_NOT_FOUND for an unknown number; USAGE for labels of more than 32 characters.
@@ -294,8 +294,8 @@ def set_population(subject: str, population: str | None) -> list[str]:
 def set_height(subject: str, height_m: float | None) -> list[str]:
     """State the body height (m) of a registered person (None: as it is); returns what changed, in words.
 
-    Fits of videos of one camera that were told another height are deleted with what was computed from them, so that the
-    next populate computes them anew. Call it inside a transaction.
+    Fits of videos of one camera that were told another height are deleted with their dependent results, so that the
+    next populate recomputes them. Call it inside a transaction.
     """
     return [] if height_m is None else replace_height(subject, height_m)
 
@@ -316,7 +316,7 @@ def replace_height(subject: str, height_m: float | None) -> list[str]:
 def set_mass(session_id: int, mass_kg: float | None) -> list[str]:
     """State the body mass (kg) of the person at a visit (None: as it is); returns what changed, in words.
 
-    Forces that were told another mass are deleted, so that the next populate computes them anew. Call it inside a
+    Forces that were told another mass are deleted, so that the next populate recomputes them. Call it inside a
     transaction.
     """
     return [] if mass_kg is None else replace_mass(session_id, mass_kg)

@@ -172,7 +172,7 @@ def add_trial(
     """Register the current fit of another recording in the tables, of several cameras or laboratory markers, as the
     reference of a video, by `add_reference`. The reference stays unchanged when that fit is redone.
 
-    Raises `PblError` DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several
+    Raises `PblError` DB_NOT_FOUND if it has no current fit; USAGE where it is a video of one camera, or has several
     fits; what `add_reference` raises.
 
     `trial`: number of the trial of several cameras, or of the marker recording. `fit_method`: key of the fit's method,

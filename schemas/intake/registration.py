@@ -184,7 +184,7 @@ def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
 
 
 def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise `PblError` VIDEO_DUPLICATE where the bytes of a file are registered (`known`) for another subject."""
+    """Raise `PblError` VIDEO_DUPLICATE if the bytes of a file are registered (`known`) for another subject."""
     visit = one.visit
     for file in one.files:
         row = known.get(file.sha256)

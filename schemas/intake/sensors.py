@@ -132,7 +132,7 @@ def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[
 
 
 def delete_keypoints(video_id: int) -> str:
-    """Delete the keypoints of a video with what was computed from them; returns it in words, "" for none."""
+    """Delete the keypoints of a video with their dependent results; returns it in words, "" for none."""
     key = {"video_id": video_id}
     rows = counted(delete_below(keypoints.Keypoints, (keypoints.Keypoints & key).keys()))
     return f", and what depends on it was deleted: {rows}" if rows else ""

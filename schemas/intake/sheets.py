@@ -125,7 +125,7 @@ def similar_codes(stated: Iterable[str], registered: Iterable[str]) -> dict[str,
 
 
 def needed(row: Row, column: str) -> str:
-    """The cell of a row in a column. Raises `PblError` SHEET_FORMAT where it is empty."""
+    """The cell of a row in a column. Raises `PblError` SHEET_FORMAT if it is empty."""
     if column not in row.cells:
         raise refused(f"no {column}", f"a value in the column {column}", "write it, or remove the row", row.where)
     return row.cells[column]

@@ -248,7 +248,7 @@ def ingest(
     """Register videos of one visit: `register` for a list of paths. At most one picture of each is decoded.
 
     Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
-    with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
+    with a code and a next step. Missing and empty files are refused immediately; the other files are still registered.
 
     Raises `PblError` USAGE for the number of a person with several videos, or sensor files of some of them; what
     `register` raises. Errors of single files are in the result.

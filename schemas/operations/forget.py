@@ -286,7 +286,7 @@ def personal_tables() -> list[tuple[str, str, list[Column]]]:
 
 
 def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
-    """Return an SQL condition for the person's rows, and its values; empty where the table can hold none."""
+    """Return an SQL condition for the person's rows, and its values; empty if the table can hold none."""
     names = {c.name for c in columns}
     parts, values = [], []
     for name in IDENTITIES:
@@ -391,7 +391,7 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def read_manifest(subject: str) -> dict[str, Any]:
-    """Return the list that an earlier run wrote; empty where there is none."""
+    """Return the list that an earlier run wrote; empty if there is none."""
     try:
         found = json.loads(manifest_path(subject).read_text(encoding="utf-8"))
         kinds = {"ids": dict, "files": list, "videos": list, "rows": dict}

@@ -31,7 +31,7 @@ def values_by(old: str, new: str) -> tuple[list[pd.DataFrame], pd.DataFrame]:
     """Return index and measures of the current results by each of two methods, whose other methods are the same, as
     `validation.bridge_pairs` takes them, and the comparisons of visits that the change touches (`validation.touched`).
 
-    old, new: keys of methods, such as "blazepose-v6". Raises `PblError` SOLVER_UNKNOWN where no column has both.
+    old, new: keys of methods, such as "blazepose-v6". Raises `PblError` SOLVER_UNKNOWN if no column has both.
     """
     import pandas as pd
 
@@ -105,7 +105,7 @@ class Cycle:
 @dataclasses.dataclass(frozen=True)
 class Score:
     """A clinical score. change: against the reference; important: whether that is at least the minimal important change
-    of the instrument for a score like that of the reference, None where none is taken over."""
+    of the instrument for a score like that of the reference, None if none is taken over."""
 
     value: float
     change: float | None
@@ -126,7 +126,7 @@ class Side:
 
     @property
     def far_leg(self) -> str:
-        """The leg whose curves are less certain, as one camera saw it behind the other; empty where there is none."""
+        """The leg whose curves are less certain, as one camera saw it behind the other; empty if there is none."""
         filming = None if self.about.result is None else self.about.result.filming
         return "" if filming is None else filming.far_leg
 

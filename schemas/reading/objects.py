@@ -108,7 +108,7 @@ def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
-    computed anew but the checks of a trial's cycles."""
+    recomputed but the checks of a trial's cycles."""
     from pbl_pipeline import gait as lib
     from pbl_pipeline.gait.metrics_file import INDEX_CHECKS
 
@@ -220,7 +220,7 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
 
 
 def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics | None:
-    """The library's `Kinetics` of one row of SessionGdi, of several methods the one that was computed last; None where
+    """The library's `Kinetics` of one row of SessionGdi, of several methods the one that was computed last; None if
     there are none."""
     from pbl_pipeline import kinetics as lib
 

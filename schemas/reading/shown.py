@@ -45,7 +45,7 @@ class ShownVisit:
 
     row: VisitRow  # its line in the list of visits
     recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
-    load_visit: Callable[[], Visit] | None = None  # loads `visit`; None where nothing is computed yet
+    load_visit: Callable[[], Visit] | None = None  # loads `visit`; None if nothing is computed yet
     results: tuple[Result, ...] = ()  # by every chain of methods
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
@@ -97,7 +97,7 @@ class ShownRecording:
     lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
 
     def fitted(self) -> Recording:
-        """Return the recording, which has a fit. Raises `PblError` DB_NOT_FOUND where it has none."""
+        """Return the recording, which has a fit. Raises `PblError` DB_NOT_FOUND if it has none."""
         if self.recording.fitted:
             return self.recording
         raise PblError(
@@ -165,7 +165,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
 
 
 def computed_visit(session_id: int, shown: int) -> ShownVisit:
-    """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND where it has none."""
+    """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND if it has none."""
     about = shown_visit(session_id, shown)
     if about.load_visit is None:
         raise PblError(
@@ -200,7 +200,7 @@ def shown_recording(video_id: int) -> ShownRecording:
 
 
 def video_facts(recording: Recording) -> dict[str, Any]:
-    """Return duration (s), number of frames, width and height (px) of a recording's video; empty where not known."""
+    """Return duration (s), number of frames, width and height (px) of a recording's video; empty if not known."""
     info = recording.video
     names = ("duration_s", "n_frames", "width_px", "height_px")
     return {} if info is None else {name: getattr(info, name) for name in names}

@@ -21,7 +21,7 @@ INDEX = "gdi"
 class Point:
     """The value of a visit.
 
-    value: None where it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
+    value: None if it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
     least, its minimal detectable change, are known, else of the spread of its cycles or repetitions alone. before: the
     change since the visit before with a value; first: since the first one.
     """

@@ -62,7 +62,7 @@ class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
     sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
-    outcome: worst check, empty before the checks are computed, ACCEPTED where a person accepted every one that asked
+    outcome: worst check, empty before the checks are computed, ACCEPTED if a person accepted every one that asked
     for attention; worst: the names of those that no one accepted. corrected: a person corrected events.
     """
 
@@ -76,7 +76,7 @@ class Result:
     outcome: str
     worst: tuple[str, ...]
     corrected: bool = False
-    filming: Filming | None = None  # how it was filmed; None where it was not looked up
+    filming: Filming | None = None  # how it was filmed; None if it was not looked up
 
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
@@ -89,8 +89,8 @@ class Change:
     """Change of a value against that of another result.
 
     real: probability that the true change goes the same way; important: that it does by at least the minimal important
-    change, None where there is none for the value. Both are None where the change cannot be judged. sure: whether it is
-    at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike in the two results:
+    change, None if there is none for the value. Both are None if the change cannot be judged. sure: whether it is
+    at least `least`, None if it cannot be judged. differs: why it cannot, with what is not alike in the two results:
     "checks" (one is not to be used, or in doubt by `DOUBTS`), "methods", "corrected" (events), "error" (not known), or
     what `filming.differences` finds; with a verdict it is at most the view, by which `least` is that of visits filmed
     from other sides.
@@ -175,7 +175,7 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
 
 
 def change_since(result: Result, before: Result) -> Change | None:
-    """The change of the index from one result to another; None where one of them has no index.
+    """The change of the index from one result to another; None if one of them has no index.
 
     Filmed alike, a change is more than chance from the larger of the two minimal changes on. Filmed from other sides,
     the errors of the two views do not cancel: from Z90 sqrt(sd1^2 + sd2^2) on, of the sds of their whole errors.
@@ -196,7 +196,7 @@ def judged(
 ) -> Change:
     """Judge a change.
 
-    `errors`: standard deviation of the error, and minimal detectable change, of both values; None where one is not
+    `errors`: standard deviation of the error, and minimal detectable change, of both values; None if one is not
     known. `differs`: what was not alike (`not_alike`).
     """
     from pbl_pipeline.gait import Z90, chances, change_sd

@@ -1,4 +1,4 @@
-"""Visits from the tables as the library's `Visit`, and their reports; nothing is computed anew."""
+"""Visits from the tables as the library's `Visit`, and their reports; nothing is recomputed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
-    """Return everything that the tables hold of one visit. Arrays are loaded when they are asked for.
+    """Return everything that the tables hold of one visit. Arrays are loaded on first access.
 
     Raises `PblError` DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN
     and NORM_UNKNOWN for unknown methods.
@@ -102,7 +102,7 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
 
 def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:
     """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`. Raises what
-    `load_visit` raises, and `PblError` DB_NOT_FOUND where it is not computed yet."""
+    `load_visit` raises, and `PblError` DB_NOT_FOUND if it is not computed yet."""
     visit = load_visit(restriction, measures=gait)
     if visit.solution is None or (whole and visit.measures is None):
         problems = "; ".join(f"{r.name}: {r.problem}" for r in visit.left_out if r.problem)
@@ -199,7 +199,7 @@ def load_recording(video_id: int) -> Recording:
     events = None if key is None else gait.newest_events(key)
     if events is None:
         return recording
-    # Corrected events at once, before anything is computed from them.
+    # Corrected events immediately, before anything is computed from them.
     counting = gait.events_of(row_of(gait.GaitEvents, events), gait.correction_of(events))
     cycles = load_cycles(events, recording.name) if gait.GaitCycle & events else ()
     return dataclasses.replace(recording, events=counting, cycles=tuple(cycles))
@@ -257,7 +257,7 @@ def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Row
 
 
 def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows) -> Recording:
-    """Return a recording: row of its video, and key of its fit, None where it has none."""
+    """Return a recording: row of its video, and key of its fit, None if it has none."""
     from pbl_pipeline.visit import Recording
 
     number = int(row["video_id"])
@@ -321,7 +321,7 @@ def _problem(video_id: int, choice: SubjectChoice | None) -> str:
 
 
 def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a key belongs to a table; empty where it lacks a part."""
+    """Return what of a key belongs to a table; empty if it lacks a part."""
     found = {name: key[name] for name in table.primary_key if name in key}
     return found if len(found) == len(table.primary_key) else {}
 
@@ -344,7 +344,7 @@ def _single(rows: list[dict], what: str, columns: Sequence[str]) -> dict:
 
 def write_visit(restriction: Any, out: Path, language: str = LANGUAGES[0]) -> list[Path]:
     """Write the files of `pbl_pipeline.pipeline.write_results` for one visit, the report in a language; nothing is
-    computed anew.
+    recomputed.
 
     Raises `PblError` DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what
     `to_show` raises; VIDEO_MISSING when a recording is no longer where it was.
@@ -360,7 +360,7 @@ def to_show(visit: Visit, open_files: contextlib.ExitStack) -> Visit:
     """Return a visit of the tables with the recordings whose pictures may be shown.
 
     `open_files` holds the de-identified copies where PBL_DEIDENTIFY is set: close it when all is drawn. Raises, where
-    it is set, `PblError` DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND where nothing was covered in it.
+    it is set, `PblError` DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND if nothing was covered in it.
     """
     recordings = tuple(
         dataclasses.replace(r, shown=open_files.enter_context(privacy.shown(r.number)))

@@ -183,7 +183,7 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
 
 
 def changes(name: str) -> list[str]:
-    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out. Raises
+    """Return in words which rows of a slice changed since it was frozen; empty if the same frames come out. Raises
     `PblError` DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     rows = _frozen(about)
@@ -262,7 +262,7 @@ def _decided(visits: Any, chain: Mapping[str, str | None], cohort: str | None) -
 
 
 def _absent(visits: Any, cohort: str | None) -> str:
-    """A sentence on the people of a cohort who have none of the visits; "" where there are none."""
+    """A sentence on the people of a cohort who have none of the visits; "" if there are none."""
     members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
     there = set(visits["subject"])
     absent = [m for m in members if m["subject"] not in there]

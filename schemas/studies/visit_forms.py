@@ -56,7 +56,7 @@ class Form:
     session_id: int
     subject: str
     label: str
-    values: dict[str, str]  # by field, empty where nothing is stored
+    values: dict[str, str]  # by field, empty if nothing is stored
     recordings: dict[int, str] = dataclasses.field(default_factory=dict)  # of the facts: name by video_id
     instruments: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)  # of the scores: rows by name
 
@@ -67,7 +67,7 @@ class Form:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def stored(self, name: str, text: str) -> Any:
-        """Return what is stored of a field with this text, None where there is nothing."""
+        """Return what is stored of a field with this text, None if there is nothing."""
         numeric = name in _NUMBERS or name in self.instruments
         return number_of(Row(name, {}), name, text[:40]) if text and numeric else text or None
 
@@ -82,7 +82,7 @@ class Form:
 def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
     """Register a visit, and its person where the code is new.
 
-    Returns the number of the visit, None where nothing was written; errors by field, "" for what is wrong with several.
+    Returns the number of the visit, None if nothing was written; errors by field, "" for what is wrong with several.
 
     `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
@@ -171,7 +171,7 @@ def correct_facts(
     What was computed with another height, mass or walking aid, or pools other recordings now, is deleted and pending
     again.
 
-    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored
+    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE if another value was stored
     meanwhile.
 
     Returns the fields that were changed; the errors by field, with any of which nothing was written.

@@ -30,7 +30,7 @@ def import_(settled_s: float) -> None:
     """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
 
     Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now. After
-    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run goes on.
+    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run continues.
 
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """

@@ -103,7 +103,7 @@ class Session:
         return self.searches.index(text) + 1
 
     def search_text(self, number: int) -> str:
-        """The text of a number, empty where there is none."""
+        """The text of a number, empty if there is none."""
         return self.searches[number - 1] if 0 < number <= len(self.searches) else ""
 
 
@@ -149,7 +149,7 @@ class Sessions:
         return cookie
 
     def find(self, cookie: str) -> Session | None:
-        """The session of a cookie, None where it ended or never was."""
+        """The session of a cookie, None if it ended or never was."""
         session, now = self._sessions.get(hashed(cookie)), self._clock()
         if session is None or not self._lasts(session, now):
             return None

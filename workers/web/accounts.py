@@ -123,7 +123,7 @@ class Accounts:
             known[name] = dataclasses.replace(self._named(known, name), password=hashed(password), changed=_now())
 
     def remove(self, name: str) -> None:
-        """Remove an account; its sessions end. Raises `PblError` WEB_ACCOUNT where there is none."""
+        """Remove an account; its sessions end. Raises `PblError` WEB_ACCOUNT if there is none."""
         with self._changing() as known:
             del known[self._named(known, name).name]
 

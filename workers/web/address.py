@@ -33,7 +33,7 @@ class Address(Route):
         Of `access.RIGHTS`; "" for any session, `OPEN` without one, `FILM` for phones.
     look
         What is looked at of the recording (`{video_id:int}` in the path) or visit (`{session_id:int}`), such as
-        "video": a row of `schemas.review.Viewing` before it is shown. Empty where no person is looked at.
+        "video": a row of `schemas.review.Viewing` before it is shown. Empty if no person is looked at.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ def shown_of(request: Request) -> int:
 
 
 def interval(result: Result) -> str:
-    """Return the 90 % interval of an index as numbers, "78 to 87"; empty where its error is not known."""
+    """Return the 90 % interval of an index as numbers, "78 to 87"; empty if its error is not known."""
     from pbl_pipeline.gait import interval_90
 
     bounds = interval_90(result.index, result.sd)

@@ -63,7 +63,7 @@ _KEEP = "public, max-age=31536000, immutable"
 class Options:
     """Options of the page. hosts: names in a Host header that are answered; name and roles: of the person who opens a
     link; on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None
-    where links open the page; secure: browsers reach it by TLS; folder: results that are shown instead of the tables;
+    if links open the page; secure: browsers reach it by TLS; folder: results that are shown instead of the tables;
     target: what the process runs that computes a visit."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})

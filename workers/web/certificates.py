@@ -47,7 +47,7 @@ def own_names() -> tuple[str, ...]:
 
 
 def server_certificate(names: Collection[str]) -> tuple[Path, Path]:
-    """Return the files of a certificate for these names and of its key, made and signed where there is none, where it
+    """Return the files of a certificate for these names and of its key, made and signed if there is none, where it
     is for other names, or ends soon. Raises OSError."""
     here = folder()
     cert, key = here / "server.crt", here / "server.key"

@@ -120,7 +120,7 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
 
 
 def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
-    """The interval of a measure if it is that of the spread of its cycles alone; None where it has none."""
+    """The interval of a measure if it is that of the spread of its cycles alone; None if it has none."""
     value, _ = one.about.all_measures.get(name, (None, ""))
     return None if value is None or value.error_sd is not None else value.interval
 

@@ -71,12 +71,12 @@ class Told:
     """Progress of a visit."""
 
     progress: Progress
-    state: str  # "running" or "waiting" here, or "" where it was not asked for
+    state: str  # "running" or "waiting" here, or "" if it was not asked for
     error: PblError | None  # what ended its last process before it was done
 
     @property
     def busy(self) -> bool:
-        """True where it changes by itself: the page asks again."""
+        """True if it changes by itself: the page asks again."""
         return bool(self.state or self.progress.running)
 
 

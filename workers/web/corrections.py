@@ -24,7 +24,7 @@ _EVENTS = {"d": "foot_down", "u": "foot_up"}
 @dataclasses.dataclass(frozen=True)
 class Judged:
     """Decisions about a recording, and the state in which the page shows it. views: videos of its trial, which are
-    marked together; events: those that count, None where none were searched."""
+    marked together; events: those that count, None if none were searched."""
 
     mark: not_usable.Unusable | None
     usable_state: str

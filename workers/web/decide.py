@@ -75,7 +75,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
 
     async def people(request: Request) -> Response:
-        """The picture of the numbered people. It is of the original: none where heads are to be hidden."""
+        """The picture of the numbered people. It is of the original: none if heads are to be hidden."""
         number, which = number_of(request), _number(request.query_params.get("method", "0"))
 
         def picture() -> bytes:

@@ -50,7 +50,7 @@ class _Place:
 class ResultsFolder:
     """Visits below a folder, each a folder with a `session.json` or, of a run that was ended, with fits alone.
 
-    Raises `PblError` FILE_MISSING where no results are in it.
+    Raises `PblError` FILE_MISSING if no results are in it.
 
     `path`: of `pbl run --out`, or a folder of such folders. `videos`: folder of the recordings, which are found by
     their names (None: beside the results and in the folder above).
@@ -119,7 +119,7 @@ class ResultsFolder:
         return str(path), path.stat().st_mtime_ns
 
     def video(self, number: int) -> Path:
-        """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING where it is not found.
+        """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING if it is not found.
 
         Also where only pictures with hidden heads may be shown (PBL_DEIDENTIFY).
         """
@@ -151,7 +151,7 @@ class ResultsFolder:
         return path
 
     def report(self, number: int) -> Path:
-        """Return the report. Raises `PblError` DB_NOT_FOUND where there is none."""
+        """Return the report. Raises `PblError` DB_NOT_FOUND if there is none."""
         path = self._place(number).path / REPORT
         if not path.is_file():
             raise _unknown("report of visit", number)

@@ -245,7 +245,7 @@ def verdict(language: str, judged: Usable | None) -> str:
 
 
 def next_words(language: str, more: Next | None) -> str:
-    """Return what one more pass would bring, in two sentences; empty where that is not known."""
+    """Return what one more pass would bring, in two sentences; empty if that is not known."""
     if more is None:
         return ""
     now = texts.text(language, "capture.index", now=f"{more.now:.0f}")

@@ -172,7 +172,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 async def _receive(
     request: Request, to: Place, arriving: list[Arriving]
 ) -> tuple[dict[str, str], list[Outcome], list[tuple[Arriving, Copy]]]:
-    """Return the fields of a form, the files that are refused at once, and those that are on disk.
+    """Return the fields of a form, the files that are refused immediately, and those that are on disk.
 
     `arriving` gets every file that was begun. Nothing is written before the form's token was read.
 

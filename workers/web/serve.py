@@ -125,7 +125,7 @@ def serve(
     sign in with accounts (`pbl web account`).
 
     Raises what `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more
-    than this machine may see; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the port is
+    than this machine may see; WEB_ACCOUNT if people sign in and there are no accounts; WEB_PORT if the port is
     taken.
 
     Parameters

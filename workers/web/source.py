@@ -80,7 +80,7 @@ class Source(Protocol):
         ...
 
     def to_export(self, number: int, result: int) -> Visit:
-        """Return a computed visit. Raises `PblError` DB_NOT_FOUND where it has no result."""
+        """Return a computed visit. Raises `PblError` DB_NOT_FOUND if it has no result."""
         ...
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:

@@ -45,8 +45,8 @@ class Tables:
         self._declared = False
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
-        """The answer of a function that reads or writes tables. Raises what the function raises; DB_NOT_RUNNING where
-        the database is away, DB_REFUSED with the server's words for its other errors, STORE_FULL."""
+        """The answer of a function that reads or writes tables. Raises what the function raises; DB_NOT_RUNNING
+        if the database is away, DB_REFUSED with the server's words for its other errors, STORE_FULL."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, question, args)
 
     def _answer(self, question: Callable[..., T], args: tuple[Any, ...]) -> T:

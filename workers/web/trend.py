@@ -45,7 +45,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
 
 def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None:
-    """Return the values over the days of their visits; None where fewer than two days with a value are known."""
+    """Return the values over the days of their visits; None if fewer than two days with a value are known."""
     known = [(p.day, p.value, p) for p in points if p.day is not None and p.value is not None]
     if len(known) < 2:
         return None

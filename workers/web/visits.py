@@ -49,7 +49,7 @@ SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
-    """The angles of a visit. far: the leg that was behind the other, empty where both were seen alike. adults: ranges
+    """The angles of a visit. far: the leg that was behind the other, empty if both were seen alike. adults: ranges
     of adults beside the children's bands."""
 
     angles: tuple[CycleCurve, ...]

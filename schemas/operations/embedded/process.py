@@ -94,7 +94,7 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
 
 def wait_until_answers(folder: Folder) -> None:
     """Wait until an administrator can log in. Raises `PblError` DB_UNAVAILABLE when the process ends, or does not
-    answer within a minute (it goes on then)."""
+    answer within a minute (it continues then)."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:
