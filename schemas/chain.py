@@ -70,7 +70,7 @@ def before(table: Any) -> tuple[Any, ...]:
 
 def needs(table: Any) -> list[Any]:
     """The computed tables that this one reads: those that its foreign keys name, and those of its parts. A row of them
-    can make a key of this one computable, and takes what was computed from it along when it is deleted."""
+    can make a key of this one computable, and its deletion also deletes dependent rows."""
     found = tables()
     name = next(n for n, cls in found.items() if cls is table)
     parts = [n for n in found if n == name or n.startswith(f"{name}.")]

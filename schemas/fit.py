@@ -1,4 +1,4 @@
-"""The session fit: which trials are fitted together, and the movement that comes out."""
+"""The session fit: sets of trials that are fitted together, and the resulting movement."""
 
 from __future__ import annotations
 
@@ -472,12 +472,12 @@ def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
 
 
 def median(values: np.ndarray) -> float | None:
-    """Median of the values that are there; None if none is."""
+    """Return the median of the finite values; None without any."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:
-    """The trial with float32 arrays, time stamps excepted: what the store keeps."""
+    """Return the trial with float32 arrays except for time stamps, for the store."""
     wide = [f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)]
     return dataclasses.replace(trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide if n != "time_s"})

@@ -13,7 +13,7 @@ from .chain import computed_tables
 from .datajoint_setup import AccessError
 from .job_errors import error_code
 
-#: Columns that DataJoint's job table lacks, 0 for each new job, and what they count.
+#: Additional columns of DataJoint's job table, 0 for each new job, with their meaning.
 COUNTS = {
     "attempts": "how often its inputs changed or it took its process down",
     "deaths": "how often the worker that held it died, whatever the reason",

@@ -1,4 +1,4 @@
-"""Values of columns, quality checks as rows, and rows that go with all dependent results."""
+"""Values of columns, quality checks as rows, and deletion of rows with their dependent results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def one(query: Any, *columns: str) -> Any:
 
 
 def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The rows of a table that agree with a key, in the order of the table's own key."""
+    """Return the rows of a table that agree with a key, in the order of its primary key."""
     columns = table.heading.attributes.values()
     if any(c.codec or c.json or c.uuid for c in columns):
         return (table & key).to_dicts(order_by="KEY")
@@ -55,8 +55,8 @@ def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
-    """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it. Raises `PblError`
-    DB_NOT_FOUND for none, USAGE for several."""
+    """Return the only row of a table that agrees with a key, or with a query where `stored_rows` reads it. Raises
+    `PblError` DB_NOT_FOUND for none, USAGE for several."""
     found = rows(table, key)
     if len(found) == 1:
         return found[0]
@@ -105,13 +105,12 @@ class ReadAhead:
 
 
 def utc_now() -> datetime.datetime:
-    """Now in UTC by the clock of the database server, whole seconds, without zone: what a datetime column takes. One
-    clock for every row, whatever those of the machines say."""
+    """Return the time in UTC by the clock of the database server for a datetime column: one clock for all machines."""
     return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
 def number(value: Any) -> float | None:
-    """A float for a nullable column: None if the value is missing or not finite."""
+    """Return a float for a nullable column: None if the value is missing or not finite."""
     if value is None:
         return None
     value = float(value)
@@ -124,7 +123,7 @@ def or_nan(value: float | None) -> float:
 
 
 def plain(value: Any) -> Any:
-    """Mappings and tuples as dicts and lists of plain numbers: what a json column takes."""
+    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -137,7 +136,7 @@ def plain(value: Any) -> Any:
 
 
 def inside(column: str, values: Iterable[str | int]) -> Any:
-    """A restriction to values that hold no quotes (codes and numbers), quick for thousands."""
+    """Return a restriction to values without quotes (codes and numbers), quick for thousands."""
     listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
     return f"{column} IN ({listed})" if listed else False
 

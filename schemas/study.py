@@ -1,4 +1,4 @@
-"""Studies: what a visit is in a study, clinical scores, cohorts, and slices that freeze what a figure was made of."""
+"""Studies: roles of visits, clinical scores, cohorts, and slices that freeze the data of figures."""
 
 from __future__ import annotations
 

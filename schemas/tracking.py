@@ -99,7 +99,7 @@ class Tracking(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only what a probe could read: a file that is not a video has one error row, in VideoInfo."""
+        """Files that could be probed: one that is not a video has a single error row, in VideoInfo."""
         return TrackingSelection.proj() * video.VideoInfo.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:

@@ -1,4 +1,4 @@
-"""Recordings and what a probe finds in them."""
+"""Recordings and the properties of their files."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ class VideoInfo(dj.Computed):
                 "n_frames": info.n_frames,
                 "n_frames_announced": info.n_frames_announced,
                 "variable_frame_rate": info.variable_frame_rate,
-                # Tags of the file: anything may stand there.
+                # Tags of the file, which are not trusted.
                 "recorded_utc": _cut(info.recorded_utc, 40),
                 "phone_make": _cut(info.make, 64),
                 "phone_model": _cut(info.model, 64),

@@ -98,7 +98,7 @@ class Arriving:
         return Copy(self.path, self._sum.hexdigest())
 
     def discard(self) -> None:
-        """Remove it; what was taken into the archive has another name and stays."""
+        """Remove the file; one that was registered has another name and stays."""
         self._file.close()
         self.path.unlink(missing_ok=True)
 

@@ -178,7 +178,7 @@ def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload],
             registered = register_copies(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
-        except Exception as error:  # whatever it is, one upload never stops the others
+        except Exception as error:  # one upload never stops the others
             coded = _named(name, error)
             if coded.code in _OURS:
                 raise
@@ -297,8 +297,8 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
 def _set_aside(
     drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[Copy], archive: Path, why: PblError
 ) -> None:
-    """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
-    Raises OSError if it cannot be moved: it stays in the drop folder."""
+    """Move a refused upload into the archive's folder for it, the reason first. A copy is moved instead of the
+    original. Raises OSError if it cannot be moved: it stays in the drop folder."""
     name = given[0].name
     folder = folder_of(archive, REFUSED, name.parts[0])
     mark = copies[0].sha256 if copies else hashlib.sha256(os.fsencode(str(name))).hexdigest()
@@ -331,7 +331,7 @@ def _unwritable(archive: Path, error: OSError) -> PblError:
 
 
 def _named(name: str, error: Exception) -> PblError:
-    """The coded error about what was uploaded, by its name there and not by that of our copy."""
+    """Return the coded error about an upload, under its original name instead of that of our copy."""
     if isinstance(error, PblError):
         return error if error.code == "UPLOAD_REFUSED" else error.with_key(name)
     return PblError(

@@ -111,7 +111,7 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
             )
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
         if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
-            # Without whose: the phone is told, and has the right to its own visit alone.
+            # Without the owner: the phone has the right to its own visit alone.
             raise PblError(
                 "VIDEO_DUPLICATE",
                 found="this recording is registered in another visit",

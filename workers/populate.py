@@ -74,7 +74,10 @@ def populate(
         session_id of the visit of which alone is computed, its usable recordings and current sets; jobs of it that
         other workers hold are waited for. None: everything.
     """
-    for name in ("datajoint", "pbl.worker"):  # they would print into the bar what the summary and `pbl status` say
+    for name in (
+        "datajoint",
+        "pbl.worker",
+    ):  # they would print into the bar; the summary and `pbl status` report the same
         logging.getLogger(name).setLevel(logging.CRITICAL)
     wanted = {table_named(n) for n in tables or ()}
     chosen = [t for t in computed_tables() if not tables or t in wanted]

@@ -78,7 +78,7 @@ class Work:
 
 
 class ProcessQueue:
-    """Runs tasks one after the other, and keeps what the last ones produced until it is closed.
+    """Runs tasks one after the other, and keeps the files of the last ones until it is closed.
 
     `most`: number of tasks that may wait. `kept`: number of works that are kept; the oldest that have ended are
     forgotten, with their files.
@@ -171,7 +171,7 @@ def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | Non
 
 
 def _reporting(done: Any, function: Callable[..., object], args: tuple[Any, ...]) -> None:
-    """Run in the process: call the function; what `progress.track` counts goes into `done`."""
+    """Call the function, in the process; `done` gets the fraction that `progress.track` counts."""
 
     def tell(n: int, total: int | None) -> None:
         done.value = n / total if total else 0.0

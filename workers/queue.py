@@ -71,7 +71,7 @@ def fill(
 ) -> int:
     """Queue every key that can be computed and has neither a result nor a job, in one statement; returns how many.
 
-    `keys`: only what belongs to these (keys of a table above); `where`: only what a condition on the key holds for.
+    `keys`: restriction to these (keys of a table above); `where`: a condition on the key.
     `priority`: that of a short recording; jobs of a long one get `registry.LONG` instead.
     DataJoint's own refresh inserts row by row.
     """

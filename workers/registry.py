@@ -10,7 +10,7 @@ from schemas import computed_tables
 
 #: Resource classes: reading video, neural detectors on video, the session fit, and everything that takes milliseconds.
 DECODE, DETECTOR, FIT, LIGHT = "decode", "detector", "fit", "light"
-#: Names for what a machine is asked to serve.
+#: Groups of resource classes that a machine can serve.
 GROUPS: dict[str, tuple[str, ...]] = {
     "all": (DECODE, DETECTOR, FIT, LIGHT),
     "cpu": (DECODE, DETECTOR, LIGHT),

@@ -159,7 +159,7 @@ def _named(columns: Sequence[str], name: str) -> list[tuple[str, str]]:
 
 
 def carry_out(plan: Reprocess) -> Iterator[int]:
-    """Do what was planned, in small transactions, and queue it behind new work; yields how many are done so far."""
+    """Carry out a plan in small transactions, queued behind new work; yield how many are done so far."""
     one = table_named(plan.table)
     if plan.add:
         _, selection, _ = _SELECTIONS[plan.table]
@@ -191,7 +191,7 @@ def parse_time(text: str | None) -> datetime.datetime | None:
 
 
 def summary(plan: Reprocess) -> Sequence[str]:
-    """Return what a plan would do, in words."""
+    """Return the effects of a plan in words."""
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")

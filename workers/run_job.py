@@ -1,4 +1,4 @@
-"""One reserved job through the three parts of its make: computed once, inserted once, whatever happens in between."""
+"""Execution of one reserved job: computed once and inserted once, despite interruptions."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Outcome:
 
 @dataclasses.dataclass
 class Computed:
-    """A result that was computed before its insert, and what it was computed from."""
+    """A result that was computed before its insert, with its inputs."""
 
     fetched: tuple
     result: tuple
@@ -193,7 +193,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
 
 
 def cause_outside(error: BaseException) -> str | None:
-    """Return what the file system or the database said where the store or the server is at fault, not the job."""
+    """Return the message of the file system or the database if the store or the server is at fault, not the job."""
     if number_of(error) in REPEAT:
         return f"DATABASE: {type(error).__name__}: {error}"
     if isinstance(error, PblError) and error.code == "STORE_FULL":  # `schemas.origin.computes` gave it its code

@@ -1,4 +1,4 @@
-"""`pbl study import|slice|...`: what of a study needs the tables."""
+"""`pbl study import|slice|...`: commands of a study that need the tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="Write an empty sheet (.csv, .xlsx) of visits with all its columns and scores; nothing else is done.",
 )
-@click.option("--dry-run", is_flag=True, help="Change nothing; say row by row what would happen.")
+@click.option("--dry-run", is_flag=True, help="Change nothing; print the outcome row by row.")
 @click.option("--distinct-codes", is_flag=True, help="Codes such as P1 and P001 are different people.")
 def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, distinct_codes: bool) -> None:
     """Visits, clinical scores, cohorts, and activity and pace of videos from SHEETS (.csv, .xlsx).
@@ -77,7 +77,7 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
 @click.option("--index", "gdi_method", help="Method of the index, where the tables hold several.")
 @click.option("--norm", help="Normative set, where the tables hold several.")
 def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: str, note: str, **methods: str) -> None:
-    """Freeze visits and methods under NAME; for a slice that is there, say what changed since. Without NAME: the list.
+    """Freeze visits and methods under NAME; for an existing slice print the changes since. Without NAME list all.
 
     Methods are named by their key, such as blazepose-v5, or short, such as blazepose: the newest version with results.
     """
@@ -130,7 +130,7 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
 @click.group()
 def instrument() -> None:
-    """Clinical scores of your own, beside those that ship."""
+    """Custom clinical scores, in addition to those that ship."""
 
 
 @instrument.command(

@@ -17,7 +17,7 @@ from ..stored_files import file_ref, stored_file
 
 @dataclasses.dataclass(frozen=True)
 class Candidates:
-    """One tracked video: the persons with their scores, best first, and what was decided so far.
+    """One tracked video: the persons with their scores, best first, and the current decision.
 
     status "TRACKED" stands for a choice that is not computed yet; `chosen` is then the person of a decision that waits
     to be computed. `key` is that of the tracking.
@@ -120,7 +120,7 @@ def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str,
     selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
     if len(selections) == 1:
         return dict(selections[0])
-    # Each tracking method numbers the people anew: one number may mean two.
+    # Each tracking method numbers the people separately: a number is ambiguous.
     there = sorted((tracking.TrackingSelection & {"video_id": video_id}).to_arrays("tracking_method"))
     raise PblError(
         "USAGE",

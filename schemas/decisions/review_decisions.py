@@ -1,4 +1,4 @@
-"""Decisions of people who look at results, each with a row that says who decided, when, and what was before."""
+"""Decisions about results, each with a row of its author, time, and the previous state."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def decide_person(
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # who decides meanwhile waits here
+    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # concurrent decisions wait here
         if seen is not None and person_state(video_id, selection["tracking_method"]) != seen:
             raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
@@ -121,7 +121,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     DECIDED_MEANWHILE if `seen` is another state than the tables'.
 
     `reason`, `note`: one of `words.UNUSABLE`, and more in free words (no names), which "other" asks for. `seen`:
-    `usable_state` of the page on which it was decided; None: whatever it is.
+    `usable_state` of the page on which it was decided; None: not compared.
     """
     note = " ".join(note.split())[:500]
     if reason not in UNUSABLE or (reason == "other" and not note):

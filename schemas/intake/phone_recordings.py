@@ -25,7 +25,7 @@ HOURS, MOST_HOURS = 2.0, 24.0
 PART_BYTES, MOST_PARTS, MOST_LOG_BYTES = 2**20, 900, 32 * 2**20
 #: Recordings that one link takes.
 MOST_RECORDINGS = 100
-#: What a phone may state of a recording: the longest text of each (characters), and its whole numbers.
+#: Statements of a phone about a recording: longest text of each (characters), and whole numbers.
 TEXTS = {"activity": 32, "pace": 32, "aid": 64, "step": 64, "note": 500, "camera": 128, "sensor": 64}
 NUMBERS = ("frames", "dropped")
 _refused = functools.partial(
@@ -50,7 +50,7 @@ class Phone:
 
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """A recording that a phone sends. `about`: what the phone states of it; `error`: why it was refused, or empty."""
+    """A recording that a phone sends. `about`: statements of the phone; `error`: reason of a refusal, or empty."""
 
     number: int
     session_id: int

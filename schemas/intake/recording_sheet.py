@@ -158,7 +158,7 @@ def _check_day(one: OneCamera, line: Line) -> None:
     day = visit.date or day_of(visit.session_label)
     try:
         said = recorded_utc(one.files[0].path) if day else None
-    except PblError:  # what is wrong with the video stands in the table of the stage that meets it
+    except PblError:  # errors of the video appear in the table of the stage that reads it
         return
     if day and said:
         at = datetime.datetime.fromisoformat(said)

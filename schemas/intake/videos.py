@@ -195,7 +195,7 @@ class OneCamera(Recording):
         if self.sensors:
             done += in_transaction(lambda: self._new_sensors(row))
         if done:
-            forget_errors(int(row["video_id"]))  # what failed with the other camera or log may succeed with this one
+            forget_errors(int(row["video_id"]))  # a failure with the other camera or log may not recur
         return done
 
     def _new_camera(self, row: Mapping[str, Any]) -> list[str]:
@@ -247,7 +247,7 @@ def ingest(
 ) -> list[Registered]:
     """Register videos of one visit: `register` for a list of paths. At most one picture of each is decoded.
 
-    Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
+    Files that are not videos are also accepted: their error then appears in the table of the stage that reads them,
     with a code and a next step. Missing and empty files are refused immediately; the other files are still registered.
 
     Raises `PblError` USAGE for the number of a person with several videos, or sensor files of some of them; what

@@ -1,4 +1,4 @@
-"""Visits and recordings as pages show them: the library's `Visit` or `Recording` with what people decided around it."""
+"""Visits and recordings as pages show them: the library's `Visit` or `Recording` with the decisions about it."""
 
 from __future__ import annotations
 

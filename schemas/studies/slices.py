@@ -1,4 +1,4 @@
-"""Slices: the visits and methods that figures were made of, frozen, and their rows as the library's `StudyData`."""
+"""Slices: frozen visits and methods of figures, and their rows as the library's `StudyData`."""
 
 from __future__ import annotations
 
@@ -444,7 +444,7 @@ def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
     for name in ("visits", "measures", "scores", "cycles"):
         frame = frames[name]
         columns = sorted(set(frame.columns) - {"subject", "visit"})
-        # One text for a number, whatever type its column has while other rows are there or not.
+        # The same text for a number whatever the type of its column, which depends on other rows.
         plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
         for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
             lines[key].append("\t".join((name, *row)))

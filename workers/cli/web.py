@@ -113,7 +113,7 @@ def password(name: str) -> None:
 @account.command(epilog="Example: pbl web account remove R.Viewer")
 @click.argument("name")
 def remove(name: str) -> None:
-    """Remove an account. Its sessions end; what it decided stays."""
+    """Remove an account. Its sessions end; its decisions stay."""
     from workers.web.accounts import Accounts
 
     Accounts().remove(name)

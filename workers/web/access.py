@@ -22,7 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from pbl_pipeline.names import check_label
 from schemas.intake.phone_recordings import hashed
 
-#: Hours after which a session ends, whatever was done in it; and where people sign in, hours without a request.
+#: Hours after which a session ends in any case, and, where people sign in, hours without a request.
 HOURS, IDLE_HOURS = 12.0, 1.0
 #: Rights by role: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees queues,
 #: errors and disks and retries, without any view of a person. Several roles add up.
@@ -307,7 +307,8 @@ async def read_body(request: Request, most: int) -> bytes:
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, broken off or no form."""
+    """Return the fields of a form of any sender. Raises `Refused` for a body that is too long, broken off or no
+    form."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
         raise Refused("form")
     body = await read_body(request, BODY_BYTES)

@@ -49,7 +49,7 @@ from .tables import Asks, Files, Tables
 
 log = logging.getLogger(__name__)
 
-#: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
+#: Status of an answer by the code of its error; 409 for the others: the present data do not allow it.
 STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503} | {
     "PHONE_LINK": 403,
     "UPLOAD_REFUSED": 422,
@@ -64,7 +64,7 @@ class Options:
     """Options of the page. hosts: names in a Host header that are answered; name and roles: of the person who opens a
     link; on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None
     if links open the page; secure: browsers reach it by TLS; folder: results that are shown instead of the tables;
-    target: what the process runs that computes a visit."""
+    target: function that computes a visit in a process."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""

@@ -100,7 +100,7 @@ def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:
 
 
 def _whose(key: dict[str, Any]) -> dict[str, int]:
-    """The recording or visit that a job is of, so that the row goes with its person."""
+    """Return the recording or visit of a job, so that the row is deleted with its person."""
     if "video_id" in key:
         return {"video_id": int(key["video_id"])}
     return {"session_id": fit.session_of_set({"fit_set": key["fit_set"]})} if "fit_set" in key else {}

@@ -129,7 +129,7 @@ class Pages:
         headers: Mapping[str, str] | None = None,
         **values: Any,
     ) -> Response:
-        """Return a page, or what it shows as JSON where the address ends so. `values`: what its template names."""
+        """Return a page, or its values as JSON if the address ends so. `values`: variables of its template."""
         if as_json(request):
             shown = {name: plain(value) for name, value in values.items() if not callable(value)}
             return JSONResponse(shown, status, dict(headers or {}))
