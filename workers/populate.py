@@ -77,7 +77,7 @@ def populate(
     for name in (
         "datajoint",
         "pbl.worker",
-    ):  # they would print into the bar; the summary and `pbl status` report the same
+    ):  # the summary and `pbl status` report the same
         logging.getLogger(name).setLevel(logging.CRITICAL)
     wanted = {table_named(n) for n in tables or ()}
     chosen = [t for t in computed_tables() if not tables or t in wanted]
