@@ -78,8 +78,8 @@ def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams])
 
 
 def curve_params(method: Method[KeypointParams]) -> dict:
-    """What the confidence depends on: the parameters less the curve's own name, and less the grid of the crops, which
-    moves them by less than the next frame does."""
+    """Return the dependencies of the confidence: the parameters less the curve's own name, and less the grid of the
+    crops, which moves them by less than the next frame does."""
     params = json.loads(method.paramset.canonical_json)
     return {name: value for name, value in params.items() if name not in ("confidence_curve", "crop_step_px")}
 
@@ -138,7 +138,8 @@ class CurveScore:
 
 
 def leave_one_out(errors: Sequence[PointErrors], bound: float = BOUND_TRUNK) -> list[CurveScore]:
-    """For each dataset the score of a curve fitted to the others: recordings of one movement are not independent."""
+    """Return for each dataset the score of a curve fitted to the others: recordings of one movement are not
+    independent."""
     scores = []
     for dataset in dict.fromkeys(e.dataset for e in errors):
         curve = fit_curve([e for e in errors if e.dataset != dataset], "others", bound=bound)

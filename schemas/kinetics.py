@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -246,6 +245,5 @@ def stated_of(session_id: int) -> tuple[float | None, str]:
 def _aid_of_phones(videos: Sequence[Mapping[str, Any]]) -> str:
     """Return the first walking aid that the phones stated which filmed these videos."""
     sent = capture.PhoneRecording & [{"video_id": r["video_id"]} for r in videos]
-    about = [r["phone_about"] for r in sent.proj("phone_about").to_dicts(order_by="phone_recording")]
-    aids = [str((json.loads(a) if isinstance(a, str) else a).get("aid", "")) for a in about]
-    return next(filter(None, aids), "")
+    rows = sent.proj("phone_about").to_dicts(order_by="phone_recording")
+    return next(filter(None, (str(r["phone_about"].get("aid", "")) for r in rows)), "")

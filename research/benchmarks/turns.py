@@ -1,4 +1,4 @@
-"""Which cycles of a bent way count as walking, at slow and fast walks alike.
+"""Cycles of a bent path that count as walking, in slow and fast walks.
 
     python -m research.benchmarks.turns
     python -m research.benchmarks.turns --limit 0 --limit 20 --limit 30 --limit 40   # 0: by time, as version 1

@@ -241,7 +241,7 @@ def speed(keys: int, work_ms: float) -> None:
     from workers import queue
 
     def begin() -> None:
-        """All keys wait, nothing is done."""
+        """Let all keys wait, with nothing done."""
         for rows in (video.VideoInfo, tracking.Tracking.jobs, video.VideoInfo.jobs):
             rows.delete_quick()
         assert queue.fill(video.VideoInfo) == keys
@@ -397,7 +397,7 @@ def memory(jobs: int) -> None:
 @click.option("--processes", default=1, show_default=True)
 @click.option("--faster", default=100.0, show_default=True, help="Detection takes 1/N of the time that it would.")
 def long(videos: int, minutes: float, late: int, processes: int, faster: float) -> None:
-    """How long a recording waits behind another's video: the longest time in which no process took any job."""
+    """Waiting time of a recording behind another video: the longest time in which no process took any job."""
     from research.benchmarks.many_recordings import archived, register_many
     from schemas import tracking, video
     from schemas.intake import VisitRecord

@@ -1,4 +1,4 @@
-"""How a person walks or runs: angles over the phases of both legs, healthy and with impairments."""
+"""Gaits of walking and running: angles over the phases of both legs, healthy and with impairments."""
 
 from __future__ import annotations
 

@@ -11,12 +11,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.words import UNUSABLE
 
-from .. import fit, gait, qc, tracking, video
+from .. import fit, gait, qc, session, tracking, video
 from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
-from ..review import Decision
+from ..review import Decision, Viewing
 from ..rows import delete_below, utc_now
-from ..transactions import next_id, repeated
+from ..transactions import in_transaction, next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
@@ -276,6 +276,15 @@ def record(what: str, by: str, about: dict, before: dict, after: dict, reason: s
             "decision_reason": reason[:500],
         }
     )
+
+
+def record_viewing(of: str, number: int, what: str, by: str) -> None:
+    """Insert a row of Viewing, unless the number is unknown. `of`, `number`: "video_id" or "session_id", and which;
+    `what`: the viewed part of it, such as "video" or "report"."""
+    if not {"video_id": video.Video, "session_id": session.Session}[of] & {of: number}:
+        return
+    row = {of: number, "viewing_what": what[:16], "viewing_by": by[:64], "viewing_at": utc_now()}
+    in_transaction(lambda: Viewing.insert1({"viewing_id": next_id(Viewing, "viewing_id"), **row}))
 
 
 def _decided(row: Mapping[str, Any]) -> Decided:

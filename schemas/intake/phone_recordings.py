@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import functools
 import hashlib
-import json
 import secrets
 from collections.abc import Mapping
 from typing import Any
@@ -262,14 +261,13 @@ def upload_refused(found: str, next_step: str = "film again; if it happens again
 
 
 def _sent(row: Mapping[str, Any]) -> Sent:
-    about = row["phone_about"]
     return Sent(
         number=int(row["phone_recording"]),
         session_id=int(row["session_id"]),
         sha256=row["phone_sha256"],
         video_bytes=int(row["phone_video_size"]),
         log_bytes=int(row["phone_log_size"]),
-        about=json.loads(about) if isinstance(about, str) else about,
+        about=row["phone_about"],
         state=row["phone_state"],
         error=row["phone_error"],
         video_id=None if row["video_id"] is None else int(row["video_id"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from schemas.decisions.viewing_log import record_viewing
+from schemas.decisions.review_decisions import record_viewing
 
 from .access import Session
 from .tables import Tables
