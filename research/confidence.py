@@ -123,7 +123,7 @@ def fit_curve(
 
 @dataclasses.dataclass(frozen=True)
 class CurveScore:
-    """How well probabilities say what happens in a recording; lower is better.
+    """Score of probabilities against the outcome in a recording; lower is better.
 
     brier: mean squared difference of probability and outcome (0 or 1). gap: mean probability less the fraction within
     the bound. Of the stated confidence taken as a probability, and of a curve that never saw the recording.

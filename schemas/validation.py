@@ -111,7 +111,11 @@ class KinematicError(dj.Computed):
                 **origin.row("error"),
             }
         )
-        self.Joint.insert({**key, **joint_row(j)} for j in errors.joints)
+        joints = ({column: getattr(j, field) for field, column in JOINT_COLUMNS.items()} for j in errors.joints)
+        self.Joint.insert(
+            {**key, **{c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}}
+            for row in joints
+        )
 
 
 #: Field of the library's `JointError` -> column of KinematicError.Joint.
@@ -127,12 +131,6 @@ JOINT_COLUMNS = {
     "within_90": "joint_within_90",
     "normal_p": "joint_normal_p",
 }
-
-
-def joint_row(error: lib.JointError) -> dict[str, Any]:
-    """Return a library `JointError` as columns of KinematicError.Joint."""
-    row = {column: getattr(error, field) for field, column in JOINT_COLUMNS.items()}
-    return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
 
 
 def _fields(joint: Mapping[str, Any]) -> dict[str, Any]:

@@ -93,13 +93,18 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         if not had:
             return None
         if everything is None:
-            everything = _few(server) or _age_of_full_look() > ALL_EVERY_S
+            some = server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()  # noqa: S608
+            everything = len(some) < FEW or _age_of_full_look() > ALL_EVERY_S
         lately = None if everything else recent()
         if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
             lately = None
         out = _queue_missing(lately)
         if lately is None:
-            _note_full_look()
+            server.query(
+                f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
+                " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
+                args=(ALL,),
+            )
         return out
 
 
@@ -153,10 +158,6 @@ def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
     return out
 
 
-def _few(server: Any) -> bool:
-    return len(server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
-
-
 def _age_of_full_look() -> float:
     """Seconds since the last look at all rows; infinite if there was none."""
     table = worker.Look.full_table_name
@@ -165,11 +166,3 @@ def _age_of_full_look() -> float:
         args=(ALL,),
     ).fetchone()
     return float("inf") if row is None or row[0] < 0 else float(row[0])  # negative: the clock was set back
-
-
-def _note_full_look() -> None:
-    video.Video.connection.query(
-        f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
-        " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
-        args=(ALL,),
-    )

@@ -1,4 +1,4 @@
-"""On the device: from clean points of a sequence to what a detector, a fit or a laboratory makes of them.
+"""Clean points of a sequence as a detector, a fit or a laboratory would see them, computed on the device.
 
 Of each example: pace, view, mirror, where the markers sit, lean and its drift, noise (across and along the line of
 sight, with and without memory, at the frame rate of the recording), a wrong scale, exchanged legs, gross outliers,

@@ -78,7 +78,7 @@ def export(
     visit has a folder OUT/SUBJECT/SESSION; one that cannot be exported is named, the others are written, and the exit
     status is 1.
     """
-    from pbl_pipeline.export import ExportOptions, check_export, write_export
+    from pbl_pipeline.export import GAIT_FORMATS, ExportOptions, check_export, write_export
 
     many = every or slice_name is not None
     if not files and subject is None and not many:
@@ -98,7 +98,14 @@ def export(
     if many:
         _write_many(wanted, slice_name, formats, out, options)
         return
-    visit = _of_files(files, formats, attitude, marker_set) if files else _of_tables(wanted, formats)
+    if files:
+        visit = _of_files(files, formats, attitude, marker_set)
+    else:
+        import schemas
+        from schemas.reading import fitted_visit
+
+        schemas.activate(methods=False)
+        visit = fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
     for path in write_export(visit, formats, out, options):
         click.echo(path)
 
@@ -125,15 +132,6 @@ def _of_files(
             next_step="`pbl gait *.fit.npz --out metrics.json` in the folder of these fits, then export again",
         )
     return visit
-
-
-def _of_tables(wanted: dict[str, str], formats: tuple[str, ...]) -> Visit:
-    import schemas
-    from pbl_pipeline.export import GAIT_FORMATS
-    from schemas.reading import fitted_visit
-
-    schemas.activate(methods=False)
-    return fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
 
 
 def _write_many(

@@ -100,7 +100,11 @@ def tables(
     elif references or source or shift_s:
         raise click.UsageError("--reference, --source and --shift go with FITS; in the database: pbl validate add")
     else:
-        frame = _of_database()
+        import schemas
+        from schemas.reading.frames import validation_frame
+
+        schemas.activate(methods=False)
+        frame = validation_frame()
     for error in refused:
         click.echo(error.text(), err=True)
     if not frame.empty:
@@ -299,14 +303,6 @@ def add(
     click.echo(f"video_id {done.video_id}: reference {done.reference} {done.status} ({done.note})")
     if done.status in ("registered", "replaced"):
         click.echo("next: pbl populate")
-
-
-def _of_database() -> pd.DataFrame:
-    import schemas
-    from schemas.reading.frames import validation_frame
-
-    schemas.activate(methods=False)
-    return validation_frame()
 
 
 def _of_files(

@@ -106,12 +106,6 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
     return in_transaction(insert), key
 
 
-def open_links(session_id: int) -> list[dict[str, Any]]:
-    """Return the links of a visit that have not ended, the newest first."""
-    rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
-    return [row for row in rows if row["link_expires"] > utc_now()]
-
-
 def end_link(session_id: int, number: int) -> None:
     """End a link of a visit; one that has ended or that the visit does not have is left alone."""
     if PhoneLink & {"phone_link": number, "session_id": session_id} & "link_ended IS NULL":
@@ -229,7 +223,8 @@ def recordings(session_id: int) -> list[Sent]:
 def filming(session_id: int) -> dict[str, Any]:
     """Return how a visit is filmed with phones: "links" that are open, without their sums; the recordings "sent";
     "several", whether more than one phone sent some."""
-    links = open_links(session_id)
+    rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
+    links = [row for row in rows if row["link_expires"] > utc_now()]
     kept = ("phone_link", "link_by", "link_expires")
     sent = recordings(session_id)
     phones = {int(n) for n in (PhoneRecording & {"session_id": session_id}).to_arrays("phone_link")}

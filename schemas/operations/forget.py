@@ -27,7 +27,7 @@ from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
 from schemas.operations import archive
 from schemas.operations.archive import archive_dir
 from schemas.operations.folders import remove_empty, write_json
-from schemas.rows import delete_below
+from schemas.rows import delete_below, inside
 from schemas.store import files_below, purge, store_errors
 from schemas.subject_codes import check_subject
 
@@ -314,7 +314,7 @@ def _folders(ids: Ids) -> list[str]:
 
 
 def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
-    rows = (video.Video & [{"video_id": v} for v in ids["video_id"]]).to_dicts() if ids["video_id"] else []
+    rows = (video.Video & inside("video_id", ids["video_id"])).to_dicts()
     now = [{"path": r["video_path"], "sha256": r["video_sha256"], "size": int(r["video_size"])} for r in rows]
     return now + [v for v in earlier.get("videos", []) if v not in now]
 
@@ -322,7 +322,9 @@ def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
 # --------------------------------------------------------------------------------------------------------- removing
 def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     """Delete queued jobs first (no worker takes one then), the person with what depends on it, and the rest."""
-    cameras = _cameras(ids)
+    # Calibrations of the person's videos: their notes may name a file.
+    rows = video.Video & inside("video_id", ids["video_id"]) & "camera_id IS NOT NULL"
+    cameras = sorted({int(c) for c in rows.to_arrays("camera_id")})
     conn = connection.connect()
     tables = personal_tables()
     queues = [t for t in tables if t[1].startswith("~~")]
@@ -339,14 +341,6 @@ def _delete_where(conn: Any, tables: Sequence[tuple[str, str, list[Column]]], id
         where, values = _whose(columns, ids)
         if where:
             conn.query(f"DELETE FROM {quote(schema, table)} WHERE {where}", args=values)  # noqa: S608
-
-
-def _cameras(ids: Ids) -> list[int]:
-    """Return the calibrations of the person's videos, whose note may name a file."""
-    if not ids["video_id"]:
-        return []
-    rows = video.Video & [{"video_id": v} for v in ids["video_id"]] & "camera_id IS NOT NULL"
-    return sorted({int(c) for c in rows.to_arrays("camera_id")})
 
 
 def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:

@@ -38,8 +38,6 @@ class Chart:
 
 
 def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
-    """The addresses of this part."""
-
     async def show(request: Request) -> Response:
         from pbl_pipeline.gait import IMPORTANT_CHANGE
 

@@ -89,8 +89,6 @@ def told(request: Request, progress: Progress) -> Told:
 
 
 def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Address]:
-    """The addresses of this part."""
-
     async def compute(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)

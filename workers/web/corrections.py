@@ -41,8 +41,6 @@ def judged(video_id: int) -> Judged:
 
 
 def routes(tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def usable_or_not(request: Request) -> Response:
         fields = await form_of(request)
         number, seen = number_of(request), fields.get("seen", "")

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def person(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)

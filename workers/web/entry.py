@@ -20,8 +20,6 @@ _FIELD = "value:"
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     def page(
         request: Request, entry: visit_forms.Form, values: Mapping[str, str], errors: Mapping[str, PblError]
     ) -> Response:

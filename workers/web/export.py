@@ -22,8 +22,6 @@ FORMATS = ("csv", "trc", "mot")
 
 
 def routes(asks: Asks, source: Source) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def export(request: Request) -> Response:
         number, result = number_of(request), shown_of(request)
 

@@ -40,8 +40,6 @@ class Group:
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def show(request: Request) -> Response:
         state, jobs, server, free = await tables.ask(_state)
         return pages.show(

@@ -69,7 +69,6 @@ class Phones:
 
 
 def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue, target: Target) -> list[Address]:
-    """Return the addresses of this part."""
     finishing = asyncio.Lock()
 
     async def make(request: Request) -> Response:

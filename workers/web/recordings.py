@@ -26,8 +26,6 @@ _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4"
 
 
 def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def recording(request: Request) -> Response:
         about = await asks.ask(source.recording, number_of(request))
         problem: PblError | None = None

@@ -43,8 +43,6 @@ _no_file = functools.partial(
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def new(request: Request) -> Response:
         today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
         return await new_page(request, {"visit": today}, {})

@@ -30,8 +30,6 @@ SECONDS, N_BYTES = 3600.0, 8 * 2**30
 
 
 def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
-    """The addresses of this part."""
-
     async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: Any) -> Work:
         """The work that a request is about, begun where it was not. Raises what stopped it, once."""
         wanted = await tables.ask(key, *args)

@@ -18,8 +18,6 @@ from .tables import Tables
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """Return the address of this part."""
-
     async def trend(request: Request) -> Response:
         found = await tables.ask(trend_of, number_of(request), request.query_params.get("measure", INDEX))
         if as_json(request):
