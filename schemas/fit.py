@@ -269,7 +269,10 @@ class SessionFit(dj.Computed):
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
         people = session.Session.proj("subject") * lab.Subject.proj("subject_height")
         height_m = number(one(people & (FitSet & key).proj("session_id"), "subject_height"))
-        return trials, _marker_table(of_markers), height_m, method_row(FitMethod, key)
+        table = None
+        if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
+            table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
+        return trials, table, height_m, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -449,13 +452,6 @@ def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, marke
     if rig is None:
         return views[0]
     return MultiView.from_calibration(views, stack.enter_context(stored_file(rig[0])), rig[1])
-
-
-def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
-    """Name and file of the marker set of marker recordings, where it is the laboratory's own: one for a session."""
-    if not rows or rows[0]["marker_table_file"] is None:
-        return None
-    return rows[0]["recording_marker_set"], file_ref(rows[0]["marker_table_file"])
 
 
 def trial_key(video_id: int) -> dict[str, Any] | None:

@@ -310,16 +310,13 @@ class SessionGdi(dj.Computed):
         )
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
         rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
-        errors = [_measure_errors(measures.measures[row["session_measure"]]) for row in rows]
-        self.Measure.insert({**key, **row, **error} for row, error in zip(rows, errors, strict=True))
+        for row in rows:
+            own = measures.measures[row["session_measure"]]
+            row["session_measure_error"] = None if own is None else number(own.error_sd)
+            row["session_measure_minimal_change"] = None if own is None else number(own.minimal_change)
+        self.Measure.insert({**key, **row} for row in rows)
         self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
         self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
-
-
-def _measure_errors(measure: lib.Measure | None) -> dict[str, float | None]:
-    """The columns of a row of SessionGdi.Measure beside those of every measure."""
-    values = (None, None) if measure is None else (measure.error_sd, measure.minimal_change)
-    return dict(zip(("session_measure_error", "session_measure_minimal_change"), map(number, values), strict=True))
 
 
 #: End of a column of the index -> field of the library's `Gdi`.

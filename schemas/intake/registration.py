@@ -66,12 +66,6 @@ def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
     }
 
 
-def plan_all(videos: Sequence[int], sessions: Collection[int], chosen: Mapping[str, str]) -> None:
-    """Enter new recordings into the selections and plans of all their methods (keys, from `resolve`)."""
-    for table, rows in _selections(videos, sessions, chosen, set(METHOD_KEYS)):
-        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
-
-
 def plan_named(video_id: int, session_id: int, chosen: Mapping[str, str], named: Collection[str]) -> list[str]:
     """Enter a registered recording into those of the methods whose keys are `named`; return the additions in words."""
     added = []
@@ -218,7 +212,8 @@ def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Re
     for number, pace in paced:
         set_condition(number, pace=pace)
     notes = [one.insert(own) for one, _, own in new]
-    plan_all([n for own in numbers for n in own], {*of_session}, chosen)
+    for table, rows in _selections([n for own in numbers for n in own], {*of_session}, chosen, set(METHOD_KEYS)):
+        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
     for one, _, own in new:
         if one.visit.person is not None:
             tracking.set_override({"video_id": own[0], "tracking_method": chosen["tracking_method"]}, one.visit.person)

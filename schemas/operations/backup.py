@@ -203,7 +203,11 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
                 for statement in backup_files.read_lines(folder / "database.sql.gz"):
                     n = cursor.execute(statement)
                     update(n if statement.startswith("INSERT") else 0)
-            _check_rows(cursor, manifest["rows"])
+            for name, expected in manifest["rows"].items():
+                cursor.execute(f"SELECT COUNT(*) FROM {quote(*name.split('.', 1))}")  # noqa: S608
+                if (found := cursor.fetchone()[0]) != expected:
+                    said = f"{found} rows in {name} after the restore"
+                    raise _refused(said, f"{expected}", "run the same with --again")
             cursor.execute(f"DROP DATABASE {quote(f'{prefix}_{_MARKER}')}")
     except pymysql.err.Error as error:
         raise _refused(
@@ -326,15 +330,6 @@ def _restore_files(folder: Path) -> None:
                         f"the store has another {path}", "no such file, or the same", "restore into an empty store"
                     )
             update(1)
-
-
-def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
-    for name, expected in rows.items():
-        schema, table = name.split(".", 1)
-        cursor.execute(f"SELECT COUNT(*) FROM {quote(schema, table)}")  # noqa: S608
-        found = cursor.fetchone()[0]
-        if found != expected:
-            raise _refused(f"{found} rows in {name} after the restore", f"{expected}", "run the same with --again")
 
 
 # ------------------------------------------------------------------------------------------------------------ files

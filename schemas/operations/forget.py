@@ -161,8 +161,11 @@ def find(subject: str) -> tuple[Ids, Found]:
             expected="the code of a subject",
             next_step="the codes are in `schemas.lab.Subject`; they are case-sensitive",
         )
-    for name, values in _still_free(earlier.get("ids", {})).items():
-        ids[name] = list(dict.fromkeys([*ids[name], *values]))
+    owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
+    for name, values in earlier.get("ids", {}).items():
+        # In a rebuilt database numbers of an earlier run may be another person's.
+        free = [v for v in values if name not in owners or not owners[name] & {name: v}]
+        ids[name] = list(dict.fromkeys([*ids[name], *free]))
     return ids, _find(ids, earlier, recordings)
 
 
@@ -240,14 +243,6 @@ def _identities(subject: str) -> Ids:
         "session_id": sessions,
         "video_id": [int(v) for v in videos],
         "fit_set": [str(s) for s in sets],
-    }
-
-
-def _still_free(ids: Ids) -> Ids:
-    """Return the numbers of an earlier run that are unused: in a rebuilt database they may be another person's."""
-    owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
-    return {
-        name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
     }
 
 

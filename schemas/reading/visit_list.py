@@ -305,14 +305,6 @@ def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
     return found
 
 
-def _settled() -> set[int]:
-    """Return the visits in which a person accepted every check that asked for attention."""
-    asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
-    found = results_of(int(i) for i in asked.to_arrays("session_id"))
-    outcomes = {i: {r.outcome for r in results} for i, results in found.items()}
-    return {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
-
-
 # --------------------------------------------------------------------------------------------------------- the filter
 def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     """Joins, conditions and their arguments, in this order.
@@ -352,7 +344,11 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     if wanted.quality:
         only("j", f"{_judged()} WHERE q.qc_outcome = %s", "WARN" if wanted.quality == "ACCEPTED" else wanted.quality)
         if wanted.quality in ("WARN", "ACCEPTED"):
-            settled = _settled()
+            asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
+            of_visits = results_of(int(i) for i in asked.to_arrays("session_id"))
+            outcomes = {i: {r.outcome for r in results} for i, results in of_visits.items()}
+            # Visits in which a person accepted every check that asked for attention.
+            settled = {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
             if wanted.quality == "WARN":
                 outside(settled)
             else:

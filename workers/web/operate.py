@@ -16,7 +16,7 @@ from pbl_pipeline.names import whole_number
 from schemas import fit
 from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
-from schemas.reading.status import ErrorRow, Running, Status, pipeline_status, running, span
+from schemas.reading.status import ErrorRow, pipeline_status, running, span
 from schemas.transactions import in_transaction
 
 from ..requeue import retry
@@ -41,7 +41,9 @@ class Group:
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def show(request: Request) -> Response:
-        state, jobs, server, free = await tables.ask(_state)
+        state, jobs, server, free = await tables.ask(
+            lambda: (pipeline_status(most=MOST), running(MOST), database_status(), disks())
+        )
         return pages.show(
             request,
             "operate.html",
@@ -78,10 +80,6 @@ def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:
         found.setdefault((error.table, error.code), []).append(error)
     made = [Group(table, code, tuple(rows)) for (table, code), rows in found.items()]
     return sorted(made, key=lambda g: -len(g.errors))
-
-
-def _state() -> tuple[Status, list[Running], dict[str, Any], list[tuple[str, float, float]]]:
-    return pipeline_status(most=MOST), running(MOST), database_status(), disks()
 
 
 def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:

@@ -36,6 +36,9 @@ _unforeseen = functools.partial(
     expected="an answer",
     next_step="report the text in the terminal of `pbl web`",
 )
+_refusal = functools.partial(
+    PblError, "WEB_REFUSED", expected="a request of a person who is signed in and has the right"
+)
 _not_there = functools.partial(
     PblError,
     "DB_NOT_FOUND",
@@ -156,7 +159,8 @@ class Pages:
         name = "enter.title" if reason == "session" else f"enter.{reason}_title"
         text = "enter.text" if reason == "session" else f"enter.{reason}"
         if as_json(request):
-            return self.error(request, _refusal(texts.text("en", name), texts.text("en", text)), _REFUSED[reason])
+            error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
+            return self.error(request, error, _REFUSED[reason])
         if reason == "session" and self._sign_in:
             return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
@@ -176,11 +180,6 @@ class Pages:
         if as_json(request):
             return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
         return self.show(request, "unforeseen.html", 500, HEADERS)
-
-
-def _refusal(found: str, next_step: str) -> PblError:
-    expected = "a request of a person who is signed in and has the right"
-    return PblError("WEB_REFUSED", found=found, expected=expected, next_step=next_step)
 
 
 def in_field(language: str, number: str) -> str:

@@ -48,7 +48,14 @@ def unpack(folder: Path, say: Say) -> str | None:
         shutil.rmtree(work, ignore_errors=True)
         (work / "lists" / "partial").mkdir(parents=True)
         (work / "archives" / "partial").mkdir(parents=True)
-        failure = _download_and_unpack(work, say)
+        failure = _download(work, say)
+        if failure is not None:
+            say("  fetching a separate package list")
+            lists = f"Dir::State::Lists={work / 'lists'}"
+            own = ("-o", lists, "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
+            failure = _run(["apt-get", *own, "-q", "update"])[0] or _download(work, say, own)
+        for package in sorted((work / "archives").glob("*.deb")):
+            failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
         if failure is None:
             shutil.rmtree(folder, ignore_errors=True)
             (work / "root").rename(folder)
@@ -57,18 +64,6 @@ def unpack(folder: Path, say: Say) -> str | None:
         return f"{error.strerror or error} ({error.filename or work})"
     finally:
         shutil.rmtree(work, ignore_errors=True)
-
-
-def _download_and_unpack(work: Path, say: Say) -> str | None:
-    # The system's package lists are used if there are any; otherwise separate ones are fetched.
-    own_lists = ("-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
-    failure = _download(work, say)
-    if failure is not None:
-        say("  fetching a package list of our own")
-        failure = _run(["apt-get", *own_lists, "-q", "update"])[0] or _download(work, say, own_lists)
-    for package in sorted((work / "archives").glob("*.deb")):
-        failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
-    return failure
 
 
 def _download(work: Path, say: Say, options: Sequence[str] = ()) -> str | None:
