@@ -60,7 +60,7 @@ def populate(
     retry_errors: bool = False,
     visit: int | None = None,
 ) -> Run:
-    """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
+    """Compute missing results. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
     Raises `PblError` USAGE for an unknown table name.
 

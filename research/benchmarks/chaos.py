@@ -7,7 +7,7 @@ Faults, one every few seconds: kill -9 of working processes, of supervisors, and
 before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
 database; a full disk of the store and of the database. The supervisors act as separate machines, so that a paused
 process loses its job to another. Heavy stages give recorded results. The last lines compare what `pbl status` says with
-what is there, and count what was left behind; exit status 1 where anything is wrong.
+the results, and count the remains; exit status 1 where anything is wrong.
 """
 
 from __future__ import annotations
