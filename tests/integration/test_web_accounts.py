@@ -143,7 +143,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
     client = browser(known)
     assert client.get("/visits").status_code == 401
     assert "<form" in client.get("/visits").text
-    assert "that the terminal shows" not in client.get("/visits").text  # links are no way in here
+    assert "by the link in the terminal" not in client.get("/visits").text  # links are no way in here
     key = client.app.state.sessions.new_link("X", "reviewer")  # type: ignore[attr-defined]
     assert client.get(f"/enter?key={key}", follow_redirects=False).status_code == 200
     assert client.get("/visits").status_code == 401
