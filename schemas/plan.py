@@ -60,7 +60,7 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     """Make a FitSet for every session whose trials are all decided and not yet in a current set, one for its trials of
     several cameras, and one for its marker recordings (MarkerPlan): these are never fitted together.
 
-    A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
+    A trial is decided when it can be fitted (TrialInput), failed, shows no one, or waits for a person's choice. While
     another trial of the session is still being computed, nothing is planned: otherwise every video of a visit would
     trigger a separate fit. A later video (or choice) makes a new set; the old set and its fit stay, no longer
     current. A recording that is marked as not usable (`video.NotUsable`) takes no part, and sets with it cease to be

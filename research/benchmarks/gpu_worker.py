@@ -5,7 +5,7 @@
     python -m research.benchmarks.gpu_worker --seconds 8                      # trials of one length: fewer programs
     python -m research.benchmarks.gpu_worker --sessions 4 --warm-up 2 --batch 2 --alike   # to try it on a CPU
 
-A database of its own holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
+A separate database holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
 with new noise for each trial), as they lie there when detection is through. One worker fits all of them. The first ones
 (`--warm-up`) let it compile and are not counted; what is compiled after them is said.
 """
