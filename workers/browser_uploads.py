@@ -131,11 +131,13 @@ def register(
             if not one.is_log:
                 log = logs.pop(PurePosixPath(one.name).stem, None)
                 out.append(_register_copies(visit, one.name, [copy, log] if log else [copy], by))
-    expected, next_step = "the video of the same name with it", "send both together"
-    out += [
-        Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused("a sensor log alone", expected, next_step, stem))
-        for stem, copy in logs.items()
-    ]
+    alone = functools.partial(
+        _refused,
+        found="a sensor log alone",
+        expected="the video of the same name with it",
+        next_step="send both together",
+    )
+    out += [Outcome(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
     return out
 

@@ -243,9 +243,12 @@ def has_room(folder: Path, n_bytes: int) -> bool:
 def check_room(n_bytes: int, next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
     if not has_room(archive_dir(), n_bytes):
-        found = f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server"
-        expected = f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free"
-        raise PblError("FILE_UNWRITABLE", found, expected, next_step)
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
+            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
+            next_step=next_step,
+        )
 
 
 def check_opens(path: Path, expected: str, next_step: str) -> None:
