@@ -1,4 +1,4 @@
-"""Where the marker augmenter's 35 markers lie on our body: `python -m research.augmenter_places DATA`.
+"""Positions of the marker augmenter's 35 markers on our body: `python -m research.augmenter_places DATA`.
 
 DATA is the folder of the development recordings. Recorded walks and squats of `real/motions` are put on the body, its
 15 points are given to the network without error, and what it answers is expressed in the frames of the body's bones:
@@ -36,7 +36,7 @@ _HEAD = """\
 # opencap_35: the 35 markers of OpenCap's marker augmenter 0.3 (`l_` for its L)
 # source: `python -m research.augmenter_places`: recorded walks and squats of {n} persons of other laboratories put on
 # this body, its 15 points given to the network, the answers in the frames of the bones; left and right are mirror
-# images (z). What the network means by a marker, not palpated places. No detector sees these points
+# images (z). Positions as the network defines them, not palpated ones. No detector sees these points
 # metres, in the body's frame (x forward, y up, z right); sd_mm: between the persons, along x, y and z
 name,body,x,y,z,sd_mm
 """

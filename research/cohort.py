@@ -197,7 +197,7 @@ def draw(g: np.random.Generator, n_patients: int = 60, n_controls: int = 20) -> 
         of_cycles = m.cycle_sd / np.sqrt(n_cycles) * g.normal(size=shape)
         measures[name] = np.where(patient, m.patients, m.controls)[:, None] + deviation + gain + of_cycles
         if name == "gdi":
-            # What of the index at a visit is no true change goes with the scores.
+            # Changes of the index at a visit that are not true ones are correlated with the scores.
             standing = (deviation + of_cycles) / np.hypot(m.person_sd, m.visit_sd)
     scores = {}
     for name, s in SCORES.items():
@@ -345,8 +345,8 @@ def cohort(seed: int = 0, n_patients: int = 60, n_controls: int = 20) -> StudyDa
 
 
 def score_truth(name: str, n: int = 400_000) -> dict[str, float]:
-    """Of a score, from many persons: correlation with the index at the first visit, by ranks where it is ordinal, and
-    SRM from the first to the last."""
+    """Return for a score, from many persons: correlation with the index at the first visit, by ranks where it is
+    ordinal, and SRM from the first to the last."""
     many = draw(np.random.default_rng(0), n, 0)
     x, y = many.measures["gdi"][:, 0], many.scores[name]
     if SCORES[name].ordinal:
@@ -358,7 +358,7 @@ def score_truth(name: str, n: int = 400_000) -> dict[str, float]:
 
 
 def truth() -> pd.DataFrame:
-    """What the statistics estimate: `statistic, of, value`."""
+    """Return the estimands of the statistics: `statistic, of, value`."""
     rows: list[tuple[str, str, float]] = []
     for name, m in MEASURES.items():
         rows += [

@@ -2,7 +2,7 @@
 
 `research/cohort.py` draws a visit's index from its truth and an error. Here the walk itself is made, seen as BlazePose
 sees it, fitted, its events found and its index computed: patients whose knees are stiff before surgery and less so
-after it, and controls who do not change. Each visit has errors of its own. Prints, by visit, the index of the true
+after it, and controls who do not change. Each visit has separate errors. Prints, by visit, the index of the true
 motion, the one that was found with its standard deviation, and whether a change since the first visit is larger than
 the least that can be told; then the error's mean and standard deviation, and that between visits beside the cohort's.
 All of it is a function of the persons.

@@ -78,8 +78,8 @@ def measured(data: Path, keypoints_folder: Path, method: Method[KeypointParams])
 
 
 def curve_params(method: Method[KeypointParams]) -> dict:
-    """What the confidence depends on: the parameters less the curve's own name, and less the grid of the crops, which
-    moves them by less than the next frame does."""
+    """Return the dependencies of the confidence: the parameters less the curve's own name, and less the grid of the
+    crops, which moves them by less than the next frame does."""
     params = json.loads(method.paramset.canonical_json)
     return {name: value for name, value in params.items() if name not in ("confidence_curve", "crop_step_px")}
 
@@ -123,7 +123,7 @@ def fit_curve(
 
 @dataclasses.dataclass(frozen=True)
 class CurveScore:
-    """How well probabilities say what happens in a recording; lower is better.
+    """Score of probabilities against the outcome in a recording; lower is better.
 
     brier: mean squared difference of probability and outcome (0 or 1). gap: mean probability less the fraction within
     the bound. Of the stated confidence taken as a probability, and of a curve that never saw the recording.
@@ -138,7 +138,8 @@ class CurveScore:
 
 
 def leave_one_out(errors: Sequence[PointErrors], bound: float = BOUND_TRUNK) -> list[CurveScore]:
-    """For each dataset the score of a curve fitted to the others: recordings of one movement are not independent."""
+    """Return for each dataset the score of a curve fitted to the others: recordings of one movement are not
+    independent."""
     scores = []
     for dataset in dict.fromkeys(e.dataset for e in errors):
         curve = fit_curve([e for e in errors if e.dataset != dataset], "others", bound=bound)

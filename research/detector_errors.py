@@ -1,11 +1,11 @@
-"""How a keypoint method errs, as `research.corpus` draws it: `python -m research.detector_errors DATA`.
+"""Errors of a keypoint method, as `research.corpus` draws them: `python -m research.detector_errors DATA`.
 
 DATA is the folder of the development recordings, as for `research.confidence`, whose truth is taken. Prints a line for
 each recording and, of all of them, the fields of `pbl_pipeline.synthetic.Noise` that they tell.
 
 In the picture an error is a length at the person's distance: the part of each point that does not change, and the rest.
 In 3D a similarity (turn, size) takes the found points to the true ones in each frame: its mean over the recording is
-the lean, its change the wander; what is left is again a constant for each point and the rest, across the line of sight
+the lean, its change the wander; the remainder is again a constant for each point and the rest, across the line of sight
 and along it. Gross points (further than `_GROSS_M` from where the point's median error puts them) count apart.
 """
 
@@ -27,8 +27,8 @@ _AXES = ("right", "down", "ahead")
 
 
 def errors_of(keypoints: Keypoints, truth: PointTruth) -> dict[str, float]:
-    """Of one recording: standard deviations per axis in m, turns in degrees about the camera's axes, correlations over
-    1/30 s. Points and frames that one of the two lacks do not count."""
+    """Return for one recording standard deviations per axis in m, turns in degrees about the camera's axes,
+    correlations over 1/30 s. Points and frames that one of the two lacks do not count."""
     known = (keypoints.confidence > 0) & np.isfinite(truth.xyz_cam_m[..., 0])
     step = max(1, round(1 / 30 / float(np.median(np.diff(keypoints.time_s)))))
     x, _, z = np.moveaxis(truth.xyz_cam_m[known], -1, 0)

@@ -34,7 +34,7 @@ SUFFIX = "_bmlmovi"
 
 
 class ExportError(Exception):
-    """What is wrong, in words."""
+    """An error in words."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             marker_set=options.markers.stem.removeprefix("markers_"),
         )
     except ExportError as error:
-        print(f"not exported: {error}", file=sys.stderr)  # noqa: T201 - a program of its own
+        print(f"not exported: {error}", file=sys.stderr)  # noqa: T201 - a separate program
         return 1
     print(f"{options.out}: now `pbl models add {options.out}`")  # noqa: T201 - as above
     return 0

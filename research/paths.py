@@ -1,4 +1,4 @@
-"""Where the shipped files and the development recordings lie."""
+"""Paths of the shipped files and the development recordings."""
 
 from pathlib import Path
 

@@ -40,14 +40,14 @@ JOINTS = (*MIDDLE, *(f"{name}_{side}" for name in SIDED for side in "rl"))
 ODD = ("pelvis_list", "lumbar_bending", "lumbar_rotation")
 #: Frames that are taken of a recording.
 FRAMES = 60
-#: What the spine of these persons' recordings is not.
+#: Spines that these persons' recordings do not have.
 OTHER_SPINE = "LBMC"
 #: Standard deviations (deg) between people of the joints of `MIDDLE` and `SIDED`, without what goes with the tilt.
 BETWEEN_DEG = (0, 2, 7, 3, 3, 5, 4, 8, 6, 5, 6)
 
 
 class Component(NamedTuple):
-    """What a component of the mixture is made of. `sd_deg` and `mean_deg`: a value for each of `MIDDLE` and `SIDED`."""
+    """A component of the mixture. `sd_deg` and `mean_deg`: a value for each of `MIDDLE` and `SIDED`."""
 
     weight: float
     activities: tuple[str, ...]

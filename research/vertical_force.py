@@ -1,4 +1,4 @@
-"""How the vertical force of walking varies between people, for `pbl_pipeline/kinetics/vertical.py`.
+"""Variation of the vertical force of walking between people, for `pbl_pipeline/kinetics/vertical.py`.
 
     python -m research.vertical_force --adults FOLDER            # print how well it does on persons held out
     python -m research.vertical_force --adults FOLDER --write    # also write the model that ships

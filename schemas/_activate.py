@@ -13,13 +13,8 @@ def activate(start: bool = False, methods: bool = True) -> None:
     Raises what `schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or
     newer.
 
-    Parameters
-    ----------
-    start
-        Start the embedded server when it is not running.
-    methods
-        Insert the method, body and norm rows of this version of the code (loads the numerical libraries, a few
-        seconds). Commands that only look leave it out.
+    `start`: start the embedded server when it is not running. `methods`: insert the method, body and norm rows of this
+    version of the code (loads the numerical libraries, a few seconds). Commands that only look leave it out.
     """
     from . import connection, fit, plan, tables_version
 

@@ -18,7 +18,7 @@ _REFERENCE = re.compile(r"\s*->\s*(?:\[[^\]]*\]\s*)?([\w.]+?)(?:\.proj\((\w+)=.*
 
 
 def tables() -> dict[str, Any]:
-    """Every table class by its name, such as `fit.SessionFit.Trial`, in the order of declaration."""
+    """Return every table class by its name, such as `fit.SessionFit.Trial`, in the order of declaration."""
     out: dict[str, Any] = {}
     for stage, module in zip(STAGES, modules(), strict=True):
         for cls, _ in module.schema.declare_list:
@@ -30,7 +30,7 @@ def tables() -> dict[str, Any]:
 
 
 def references(name: str, cls: Any) -> list[str]:
-    """Names of the tables that a table refers to by a foreign key."""
+    """Return the names of the tables that a table refers to by a foreign key."""
     stage, master = name.split(".")[0], ".".join(name.split(".")[:2])
     out = []
     for line in cls.definition.splitlines():
@@ -42,7 +42,7 @@ def references(name: str, cls: Any) -> list[str]:
 
 
 def renamed(cls: Any) -> list[str | None]:
-    """For each of `references` the name that its column has here, None where it keeps its own."""
+    """Return for each of `references` the name of its column here, None if it is unchanged."""
     return [match[2] for line in cls.definition.splitlines() if (match := _REFERENCE.match(line))]
 
 
@@ -51,13 +51,13 @@ def computed_tables() -> list[Any]:
     return [cls for cls in tables().values() if issubclass(cls, dj.Computed)]
 
 
-#: Computed tables that have rows only where they were asked for: a reference was registered, a setting wants copies,
-#: forces were planned (visits that were registered before there were any have no plan of them).
+#: Computed tables with rows on request only: a reference was registered, a setting asks for copies, forces were planned
+#: (visits that were registered before forces existed have no plan of them).
 ON_REQUEST = ("KinematicError", "Deidentified", "Kinetics")
 
 
 def is_wanted(table: Any) -> bool:
-    """Whether the settings ask for this table (its `wanted`, where it has one); no question to the database."""
+    """Return whether the settings ask for this table (its `wanted`, if it has one), without a query."""
     return getattr(table, "wanted", lambda: True)()
 
 
@@ -70,7 +70,7 @@ def before(table: Any) -> tuple[Any, ...]:
 
 def needs(table: Any) -> list[Any]:
     """The computed tables that this one reads: those that its foreign keys name, and those of its parts. A row of them
-    can make a key of this one computable, and takes what was computed from it along when it is deleted."""
+    can make a key of this one computable, and its deletion also deletes dependent rows."""
     found = tables()
     name = next(n for n, cls in found.items() if cls is table)
     parts = [n for n in found if n == name or n.startswith(f"{name}.")]

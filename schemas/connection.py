@@ -29,21 +29,20 @@ CONNECT_TIMEOUT_S = 4.0
 #: Name of the store that holds the arrays. Write it out, `<npy@arrays>`: DataJoint 2.3.5 finds no default for `<npy@>`.
 STORE = "arrays"
 
+#: Parts of a target by which it is connected to.
+_LOGIN = ("host", "port", "user", "password")
 #: The process's connection, once there is one.
 _current: datajoint.Connection | None = None
 
 
 def connect(start: bool = False) -> datajoint.Connection:
-    """The process's connection, made on first use and again when the server has moved.
+    """Return the process's connection, made on first use and again when the server has moved.
 
     Raises `PblError` DB_NOT_RUNNING when nothing answers within a few seconds, DB_REFUSED when the login is refused,
     DB_UNAVAILABLE when `start` fails.
 
-    Parameters
-    ----------
-    start
-        Start the embedded server when it is not running (never done when DJ_HOST names a server). After `pbl demo`
-        has stopped it, any connection does.
+    `start`: start the embedded server if it is not running (never if DJ_HOST names a server). After `pbl demo` has
+    stopped it, any connection does.
     """
     target = _target(start)
     configure(target)
@@ -55,21 +54,21 @@ def connect(start: bool = False) -> datajoint.Connection:
     try:
         if current is None:
             with warnings.catch_warnings():
-                # MariaDB is supported here, by the two repairs below: no need to say the contrary at every start.
+                # MariaDB is supported here, by the repairs of `datajoint_setup`.
                 warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
-                # Named, though the configuration has them: without them DataJoint takes no notice of use_tls.
+                # Passed although they are configured: without them DataJoint ignores use_tls.
                 login = {name: target[name] for name in ("host", "user", "password")}
                 current = _current = dj.conn(**login, use_tls=target["use_tls"])
         else:
-            # The server was started again, perhaps on another port. Tables keep this object, so it moves along.
+            # The server was restarted, perhaps on another port. The tables keep this object, so it is redirected.
             info = {name: target[name] for name in ("host", "port", "user")}
             tls = {"ssl": True if target["use_tls"] is None else target["use_tls"], "ssl_input": target["use_tls"]}
             current.conn_info.update(info, passwd=target["password"], **tls)
             current.connect()
-            current.cancel_transaction()  # one that was open when the server went is gone, which DataJoint does not see
+            current.cancel_transaction()  # DataJoint does not notice that an open one was lost with the server
     except pymysql.err.OperationalError as error:
         raise _login_error(target, error) from error
-    except RuntimeError as error:  # the driver's, where it cannot do the server's way of logging in
+    except RuntimeError as error:  # of the driver, which does not support the server's authentication
         raise _no_answer(target, str(error)) from error
     if target["embedded"]:
         embedded.allow_prefix(prefix())
@@ -77,7 +76,7 @@ def connect(start: bool = False) -> datajoint.Connection:
 
 
 def another() -> datajoint.Connection:
-    """A connection beside the process's own, to the same server: for a thread, since DataJoint's serves one only."""
+    """Return a separate connection to the same server, for a thread: DataJoint's serves one only."""
     target = _target(start=False)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="MariaDB is not officially supported")
@@ -92,12 +91,12 @@ def prefix() -> str:
 
 
 def schema_name(stage: str) -> str:
-    """Name of a stage's schema on the server: `lab` -> `pbl_lab`."""
+    """Return the name of a stage's schema on the server: `lab` -> `pbl_lab`."""
     return f"{prefix()}_{stage}"
 
 
 def bind(stage: str, schema: datajoint.Schema) -> None:
-    """Create the schema of a stage and its tables as far as they are missing, and bind the classes to them.
+    """Create the missing schema and tables of a stage, and bind the classes to them.
 
     Call it in the order of dependency: a table can only refer to tables that are bound.
     """
@@ -105,12 +104,12 @@ def bind(stage: str, schema: datajoint.Schema) -> None:
     try:
         schema.activate(schema_name(stage), connection=server)
     except Exception:
-        schema.database = None  # else DataJoint would take it for bound the next time
+        schema.database = None  # otherwise DataJoint would consider it bound
         raise
 
 
 def external() -> str | None:
-    """`host:port` of the server DJ_HOST names, None when the embedded database is used."""
+    """Return `host:port` of the server that DJ_HOST names; None for the embedded database."""
     if not os.environ.get("DJ_HOST"):
         return None
     target = _target(start=False)
@@ -120,10 +119,8 @@ def external() -> str | None:
 def configure(target: dict[str, Any] | None = None) -> None:
     """Set DataJoint's configuration: server, store, job bookkeeping. `connect()` calls it."""
     if target is not None:
-        dj.config["database.host"] = target["host"]
-        dj.config["database.port"] = target["port"]
-        dj.config["database.user"] = target["user"]
-        dj.config["database.password"] = target["password"]
+        for name in _LOGIN:
+            dj.config[f"database.{name}"] = target[name]
         dj.config["database.use_tls"] = None if target["use_tls"] is None else bool(target["use_tls"])
     dj.config["database.reconnect"] = True
     dj.config["loglevel"] = os.environ["DJ_LOG_LEVEL"]
@@ -136,7 +133,7 @@ def configure(target: dict[str, Any] | None = None) -> None:
 
 
 def _target(start: bool) -> dict[str, Any]:
-    """Server and login: DJ_* when DJ_HOST is set, else those of the embedded server."""
+    """Return server and login: DJ_* if DJ_HOST is set, else those of the embedded server."""
     host = os.environ.get("DJ_HOST")
     if host:
         user, password = os.environ.get("DJ_USER"), secret("DJ_PASS")
@@ -169,11 +166,12 @@ def _target(start: bool) -> dict[str, Any]:
 
 
 def _tls() -> bool | dict[str, Any] | None:
-    """Return the encryption of the connection: None where the server can, False never, a dict of the driver's always.
+    """Return the encryption of the connection: None if the server supports it, False never, a dict for the driver
+    always.
 
     DJ_TLS_CA names the file of the authority that signed the server's certificate: name and certificate are checked
-    then. Without it DJ_USE_TLS=1 encrypts, but would not notice another server in between. A bare True is no choice:
-    DataJoint hands it on as "encrypted where possible", and a server without TLS is then spoken to in the clear.
+    then. Without it DJ_USE_TLS=1 encrypts, but does not detect another server in between. A plain True is not used:
+    DataJoint passes it on as "encrypt if possible", so that a server without TLS would be used unencrypted.
     """
     wanted, authority = os.environ.get("DJ_USE_TLS", "").lower(), os.environ.get("DJ_TLS_CA")
     if wanted and wanted not in ("1", "true", "yes"):
@@ -192,14 +190,12 @@ def _tls() -> bool | dict[str, Any] | None:
 
 
 def plain_connection(**options: Any) -> pymysql.Connection[Any]:
-    """A connection of the driver with the login of the tables, for statements that are not queries of a table.
-
-    Raises what `connect` raises.
-    """
+    """Return a connection of the driver with the login of the tables, for statements that are not queries of a table.
+    Raises what `connect` raises."""
     target = _target(start=False)
     _check_answers(target)
     tls: dict[str, Any] = {"ssl_disabled": True} if target["use_tls"] is False else {"ssl": target["use_tls"]}
-    login = {name: target[name] for name in ("host", "port", "user", "password")}
+    login = {name: target[name] for name in _LOGIN}
     try:
         return pymysql.connect(**login, **tls, charset="utf8mb4", autocommit=True, init_command=UTC, **options)
     except pymysql.err.OperationalError as error:
@@ -207,12 +203,12 @@ def plain_connection(**options: Any) -> pymysql.Connection[Any]:
 
 
 def store_backend() -> Any:
-    """DataJoint's access to the store of arrays, whatever it is. `connect()` or `configure()` must have been called."""
+    """Return DataJoint's access to the store of arrays. `connect()` or `configure()` must have been called."""
     return backend_of(STORE)
 
 
 def store_root() -> str:
-    """The folder of the store under which DataJoint files by schema, table and key."""
+    """Return the folder of the store in which DataJoint files by schema, table and key."""
     return str(dj.config.get_store_spec(STORE)["schema_prefix"]).strip("/")
 
 
@@ -266,9 +262,4 @@ def _alive(connection: datajoint.Connection) -> bool:
 
 def _same(connection: datajoint.Connection, target: dict[str, Any]) -> bool:
     info = connection.conn_info
-    return (info["host"], info["port"], info["user"], info["passwd"]) == (
-        target["host"],
-        target["port"],
-        target["user"],
-        target["password"],
-    )
+    return [info[name] for name in ("host", "port", "user", "passwd")] == [target[name] for name in _LOGIN]

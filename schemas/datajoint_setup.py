@@ -1,4 +1,4 @@
-"""DataJoint behind our configuration, its repairs for MariaDB, and every name of it that is private.
+"""DataJoint with our configuration, its repairs for MariaDB, and every private name of it that we use.
 
 Everything else in `schemas` and `workers` uses DataJoint's public face only. `tests/unit/test_datajoint_face.py` lists
 the private names below and fails where a version of DataJoint has other ones.
@@ -137,7 +137,7 @@ def backend_of(name: str) -> StorageBackend:
 
 
 def full_path(backend: Any, path: str) -> str:
-    """Where a store keeps an object: a path of the file system, or `bucket/key`."""
+    """Return the location of an object in a store: a path of the file system, or `bucket/key`."""
     return str(backend._full_path(path))
 
 

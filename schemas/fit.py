@@ -1,4 +1,4 @@
-"""The session fit: which trials are fitted together, and the movement that comes out."""
+"""The session fit: sets of trials that are fitted together, and the resulting movement."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 schema = dj.Schema()
 
-#: Name in place of the methods before the fit where markers of a laboratory are fitted.
+#: Stands for the methods before the fit if laboratory markers are fitted.
 LABORATORY = "laboratory markers"
 #: Kinds of sets, which are never fitted, pooled or averaged with one another: videos of one camera each, trials of
 #: several calibrated cameras, marker recordings.
@@ -114,7 +114,7 @@ class TrialInput(dj.Computed):
 
     @staticmethod
     def with_trials(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """These keys of Keypoints, and those of the trials of which the videos are views."""
+        """Return these keys of Keypoints, and those of the trials whose views the videos are."""
         trial_of = trials_of([int(k["video_id"]) for k in keys])
         more = [{**k, "video_id": trial_of[v]} for k in keys if (v := int(k["video_id"])) in trial_of]
         return [*map(dict, keys), *(k for k in more if k not in keys)]
@@ -269,7 +269,10 @@ class SessionFit(dj.Computed):
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
         people = session.Session.proj("subject") * lab.Subject.proj("subject_height")
         height_m = number(one(people & (FitSet & key).proj("session_id"), "subject_height"))
-        return trials, _marker_table(of_markers), height_m, method_row(FitMethod, key)
+        table = None
+        if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
+            table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
+        return trials, table, height_m, method_row(FitMethod, key)
 
     @computes
     def make_compute(
@@ -291,7 +294,7 @@ class SessionFit(dj.Computed):
     def make_computes(
         self, keys: Sequence[dict], fetched: Sequence[tuple]
     ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
-        """Several sets in one call of the library: for each what `make_compute` returns, None where it would raise.
+        """Several sets in one call of the library: for each what `make_compute` returns, None if it would raise.
 
         A worker with a GPU fits a batch so, and hands each result to the table's own make.
         """
@@ -384,12 +387,12 @@ class SessionFit(dj.Computed):
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:
-    """The session of a set, by a key that holds `fit_set`.
+    """Return the session of a set, by a key with `fit_set`.
 
     It stands in every computed table below a set, so that its natural join with `session.Session` is its own visit and
     not every pair. A set never changes its session. The session's row is locked as the insert of a row that refers to
-    it does: here before other rows, so that who plans the session (which locks it, then its sets) waits and never meets
-    a deadlock.
+    it does, but before other rows, so that planning the session (which locks it, then its sets) waits instead of
+    deadlocking.
     """
     number = int(one(FitSet & {"fit_set": key["fit_set"]}, "session_id"))
     sessions = session.Session
@@ -431,6 +434,14 @@ def _rig(views: Sequence[Mapping[str, Any]]) -> tuple[dict, list[str]] | None:
     return (file_ref(views[0]["rig_file"]), [v["rig_camera"] for v in views]) if views else None
 
 
+def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:
+    """Return the library's `TrialFit` in a file of the store."""
+    from pbl_pipeline.fit import TrialFit
+
+    with stored_file(ref) as path:
+        return TrialFit.load(path)
+
+
 def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, markers: bool = False) -> lib.Trial:
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
@@ -443,15 +454,8 @@ def _load_trial(stack: ExitStack, refs: Sequence[dict], rig: tuple | None, marke
     return MultiView.from_calibration(views, stack.enter_context(stored_file(rig[0])), rig[1])
 
 
-def _marker_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, dict] | None:
-    """Name and file of the marker set of marker recordings, where it is the laboratory's own: one for a session."""
-    if not rows or rows[0]["marker_table_file"] is None:
-        return None
-    return rows[0]["recording_marker_set"], file_ref(rows[0]["marker_table_file"])
-
-
 def trial_key(video_id: int) -> dict[str, Any] | None:
-    """Key of the fit of a recording: of its current sets the one that was computed last; None where there is none."""
+    """Key of the fit of a recording: of its current sets the one that was computed last; None if there is none."""
     trials = SessionFit.Trial.proj() * SessionFit.proj("fit_computed") * current().proj() & {"video_id": video_id}
     rows = trials.to_dicts(order_by="fit_computed DESC", limit=1)
     return {k: rows[0][k] for k in SessionFit.Trial.primary_key} if rows else None
@@ -464,12 +468,12 @@ def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
 
 
 def median(values: np.ndarray) -> float | None:
-    """Median of the values that are there; None where none is."""
+    """Return the median of the finite values; None without any."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if len(there) else None
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:
-    """The trial with float32 arrays, time stamps excepted: what the store keeps."""
+    """Return the trial with float32 arrays except for time stamps, for the store."""
     wide = [f.name for f in dataclasses.fields(trial) if isinstance(getattr(trial, f.name), np.ndarray)]
     return dataclasses.replace(trial, **{n: np.asarray(getattr(trial, n), np.float32) for n in wide if n != "time_s"})

@@ -24,7 +24,7 @@ schema = dj.Schema()
 
 
 def measure_columns(prefix: str) -> str:
-    """Definition lines of a part table of measures; `measure_rows` gives its rows."""
+    """Definition lines of a part table of measures; `measure_rows` returns its rows."""
     return f"""
     -> master
     {prefix}             : varchar(32)         # name, with its unit
@@ -89,7 +89,7 @@ class EventCorrection(dj.Manual):
 
 def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
     """Key of the correction that counts of the events of a trial (key of GaitEvents): the last one of the person who is
-    measured in its set; None where there is none or the last one was withdrawn.
+    measured in its set; None if there is none or the last one was withdrawn.
 
     Waits for a decision that is being written, and inside a transaction keeps others waiting until its end, so that
     what is computed from these rows and what is decided about them never cross.
@@ -107,7 +107,7 @@ def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def accepted_cadence(key: Mapping[str, Any]) -> float | None:
-    """Return the cadence (steps/min) of a trial (key of GaitEvents) that a person accepted last; None where no one did.
+    """Return the cadence (steps/min) of a trial (key of GaitEvents) that a person accepted last; None if no one did.
 
     `decisions.review_decisions.accept_check` writes it. Call it after `correction_of`, which waits for a decision that
     is being written.
@@ -121,7 +121,7 @@ def accepted_cadence(key: Mapping[str, Any]) -> float | None:
 
 def newest_events(key: Mapping[str, Any]) -> dict[str, Any] | None:
     """Key of the events of a fitted trial (key of SessionFit.Trial) that are shown: corrected ones before others, then
-    those that were detected last; None where none were detected yet."""
+    those that were detected last; None if none were detected yet."""
     rows = (GaitEvents.proj("events_computed") & key).to_dicts(order_by="events_computed DESC")
     keys = [{k: row[k] for k in GaitEvents.primary_key} for row in rows]
     return next((k for k in keys if correction_of(k) is not None), keys[0] if keys else None)
@@ -183,12 +183,9 @@ class GaitEvents(dj.Computed):
 
     @computes
     def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import detect_events, feet_from_fit
 
-        with stored_file(ref) as path:
-            trial = TrialFit.load(path)
-        return detect_events(feet_from_fit(trial), methods.stored(**method)), method["sha"]
+        return detect_events(feet_from_fit(fit.load_trial(ref)), methods.stored(**method)), method["sha"]
 
     def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
         self.insert1(
@@ -279,13 +276,10 @@ class GaitCycle(dj.Computed):
         correction: Mapping[str, Any] | None,
         accepted: float | None,
     ) -> tuple[tuple[lib.GaitCycle, ...], int | None]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
         from pbl_pipeline.qc import Check
 
-        with stored_file(ref) as path:
-            trial = TrialFit.load(path)
-        cycles = find_cycles(events, trial, fit_checks=[Check(*check) for check in checks])
+        cycles = find_cycles(events, fit.load_trial(ref), fit_checks=[Check(*check) for check in checks])
         if accepted is not None and refused_cadence(cycles) == accepted:
             cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
@@ -383,14 +377,12 @@ class Spatiotemporal(dj.Computed):
         ref: dict,
         checks: Sequence[tuple],
     ) -> tuple[lib.Spatiotemporal]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
         from pbl_pipeline.qc import Check
 
         found = spatiotemporal([cycle_of_row(r, name) for r in rows])
         if activity in TASK_MEASURES:
-            with stored_file(ref) as path:
-                motion = task_motion(TrialFit.load(path))
+            motion = task_motion(fit.load_trial(ref))
             found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
         return (found,)
 
@@ -437,7 +429,7 @@ _MEASURE_PARTS = (
 
 
 def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
-    """The library's `Measure` of a row of `measure_columns(prefix)`, None where it is not known."""
+    """The library's `Measure` of a row of `measure_columns(prefix)`, None if it is not known."""
     from pbl_pipeline.gait import Measure
 
     if row[f"{prefix}_mean"] is None:
@@ -449,7 +441,7 @@ def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
 
 
 def mean_of(measure: lib.Measure | None) -> float | None:
-    """The mean of a library `Measure`, None where there is none."""
+    """The mean of a library `Measure`, None if there is none."""
     return None if measure is None else number(measure.mean)
 
 

@@ -22,7 +22,7 @@ schema = dj.Schema()
 
 
 def profile_columns(prefix: str) -> str:
-    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` gives its rows."""
+    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` returns its rows."""
     return f"""
     -> master
     {prefix}_angle             : varchar(32)   # name
@@ -310,16 +310,13 @@ class SessionGdi(dj.Computed):
         )
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
         rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
-        errors = [_measure_errors(measures.measures[row["session_measure"]]) for row in rows]
-        self.Measure.insert({**key, **row, **error} for row, error in zip(rows, errors, strict=True))
+        for row in rows:
+            own = measures.measures[row["session_measure"]]
+            row["session_measure_error"] = None if own is None else number(own.error_sd)
+            row["session_measure_minimal_change"] = None if own is None else number(own.minimal_change)
+        self.Measure.insert({**key, **row} for row in rows)
         self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
         self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
-
-
-def _measure_errors(measure: lib.Measure | None) -> dict[str, float | None]:
-    """The columns of a row of SessionGdi.Measure beside those of every measure."""
-    values = (None, None) if measure is None else (measure.error_sd, measure.minimal_change)
-    return dict(zip(("session_measure_error", "session_measure_minimal_change"), map(number, values), strict=True))
 
 
 #: End of a column of the index -> field of the library's `Gdi`.
@@ -361,7 +358,7 @@ def profile_rows(profile: lib.MovementProfile | None, prefix: str) -> list[dict[
 def profile_of_rows(
     rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str
 ) -> lib.MovementProfile | None:
-    """The library's `MovementProfile`, None where there are no rows."""
+    """Return the library's `MovementProfile`; None without rows."""
     from pbl_pipeline.gait import NINE_ANGLES, MovementProfile
 
     if not rows:
@@ -402,10 +399,8 @@ def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
 
 
 def norm_keys(name: str) -> list[str]:
-    """Return the keys of the normative sets that a key (`name-v2`) or a name means, the newest version first.
-
-    Raises `PblError` NORM_UNKNOWN.
-    """
+    """Return the keys of the normative sets that a key (`name-v2`) or a name means, the newest version first. Raises
+    `PblError` NORM_UNKNOWN."""
     rows = NormativeSet.proj("norm_name", "norm_version").to_dicts(order_by="norm_version DESC")
     found = [row["norm"] for row in rows if name in (row["norm"], row["norm_name"])]
     if found:
@@ -419,7 +414,7 @@ def norm_keys(name: str) -> list[str]:
 
 
 def norm_ref(key: Mapping[str, Any]) -> tuple[str, str, dict | None]:
-    """What `norm_of_row` takes: name, checksum and, of a set that was built here, its file."""
+    """Return the arguments of `norm_of_row`: name, checksum and, for a set that was built here, its file."""
     name, sha256, stored = one(NormativeSet & key, "norm_name", "norm_sha256", "norm_file")
     return name, sha256, None if stored is None else file_ref(stored)
 
@@ -444,10 +439,8 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
 
 
 def resolve(model: str | None, norm: str | None) -> dict[str, str]:
-    """Keys of the index and the normative set by name; a set left out is the index's own.
-
-    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has.
-    """
+    """Keys of the index and the normative set by name; a set left out is the index's own. Raises `PblError`
+    SOLVER_UNKNOWN, NORM_UNKNOWN; NORM_INVALID for a set of other angles than the index has."""
     from pbl_pipeline import gait as lib
 
     method = resolve_method(GdiModel, model or lib.GDI_METHODS.default)

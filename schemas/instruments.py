@@ -27,7 +27,7 @@ _BOUNDS = {row["instrument"]: (row["instrument_low"], row["instrument_high"]) fo
 
 
 def disagreement(scores: Mapping[str, float]) -> tuple[tuple[str, ...], str, str] | None:
-    """Return which scores of a visit contradict each other, what they are and what is expected; None where none do."""
+    """Return which scores of a visit contradict each other, what they are and what is expected; None if none do."""
     for total, parts in PARTS.items():
         known = [name for name in parts if name in scores]
         if total not in scores or not known:

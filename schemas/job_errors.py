@@ -32,7 +32,7 @@ def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
 
 
 def store_full(error: BaseException) -> PblError | None:
-    """STORE_FULL where an error says that the store has no room, or came from one that does."""
+    """STORE_FULL if an error says that the store has no room, or came from one that does."""
     seen: BaseException | None = error
     while seen is not None:
         if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
@@ -71,7 +71,7 @@ def of_server(error: Exception) -> PblError:
 
 
 def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
-    """INTERNAL for an error without a code (STORE_FULL where the store is full): a table never shows a bare traceback
+    """INTERNAL for an error without a code (STORE_FULL if the store is full): a table never shows a bare traceback
     as its message."""
     if (full := store_full(error)) is not None:
         return fitted(full, key)

@@ -1,4 +1,4 @@
-"""Job tables: DataJoint's queue of each computed table, with columns of ours that count attempts."""
+"""Job tables: DataJoint's queue of each computed table, with additional columns that count attempts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .chain import computed_tables
 from .datajoint_setup import AccessError
 from .job_errors import error_code
 
-#: Columns that DataJoint's job table lacks, 0 for each new job, and what they count.
+#: Additional columns of DataJoint's job table, 0 for each new job, with their meaning.
 COUNTS = {
     "attempts": "how often its inputs changed or it took its process down",
     "deaths": "how often the worker that held it died, whatever the reason",
@@ -62,7 +62,7 @@ def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
 
 
 def _kept(made: dict[Any, Any], table: Any, make: Callable[[], Any]) -> Any:
-    """What was made for a table; made anew where the tables have another connection since."""
+    """Return the cached object of a table, made again if the tables have another connection since."""
     if table not in made or made[table].connection is not table().connection:
         made[table] = make()
     return made[table]

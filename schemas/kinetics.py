@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, check_columns, check_row, number
-from .stored_files import file_ref, stored_file
+from .stored_files import file_ref
 
 if TYPE_CHECKING:
     from pbl_pipeline import kinetics as lib
@@ -152,13 +151,11 @@ class Kinetics(dj.Computed):
         aid: str,
         method: Mapping[str, Any],
     ) -> tuple[lib.Kinetics, list[int], str]:
-        from pbl_pipeline.fit import TrialFit
         from pbl_pipeline.kinetics import visit_kinetics
 
         fits, walks = [], []
         for trial in trials:
-            with stored_file(trial["file"]) as path:
-                fits.append(dataclasses.replace(TrialFit.load(path), name=trial["trial_name"]))
+            fits.append(dataclasses.replace(fit.load_trial(trial["file"]), name=trial["trial_name"]))
             own = [gait.cycle_of_row(r, trial["trial_name"]) for r in cycles if r["video_id"] == trial["video_id"]]
             walks.append(_Walk(trial["events"], tuple(own), trial["pooled"]))
         found = visit_kinetics(fits, walks, methods.stored(**method), mass_kg=mass_kg, aid=aid)
@@ -232,7 +229,7 @@ class _Walk:
 
 
 def stated_of(session_id: int) -> tuple[float | None, str]:
-    """Return body mass (kg) and walking aid as stated of a visit, None and "" where nothing is.
+    """Return body mass (kg) and walking aid as stated of a visit, None and "" if nothing is.
 
     A locking read, which sees what is committed whenever this transaction began (as `gait.correction_of`).
     """
@@ -248,6 +245,5 @@ def stated_of(session_id: int) -> tuple[float | None, str]:
 def _aid_of_phones(videos: Sequence[Mapping[str, Any]]) -> str:
     """Return the first walking aid that the phones stated which filmed these videos."""
     sent = capture.PhoneRecording & [{"video_id": r["video_id"]} for r in videos]
-    about = [r["phone_about"] for r in sent.proj("phone_about").to_dicts(order_by="phone_recording")]
-    aids = [str((json.loads(a) if isinstance(a, str) else a).get("aid", "")) for a in about]
-    return next(filter(None, aids), "")
+    rows = sent.proj("phone_about").to_dicts(order_by="phone_recording")
+    return next(filter(None, (str(r["phone_about"].get("aid", "")) for r in rows)), "")

@@ -1,4 +1,4 @@
-"""Who and what is recorded: projects, subjects, populations, devices, camera calibrations."""
+"""Projects, subjects, populations, devices, camera calibrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which method a name means: keys (`blazepose-v5`) and short names (`blazepose`) of what the tables hold."""
+"""Lookup of methods by key (`blazepose-v5`) and short name (`blazepose`)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _RESULTS = {
 
 
 def with_keys(restriction: Mapping[str, Any]) -> dict[str, Any]:
-    """A restriction of results whose methods (and normative set) may be named short: `blazepose` becomes the key of its
-    newest version that has results, else of the newest.
+    """Return a restriction of results with the short names of its methods (and normative set) replaced by keys:
+    `blazepose` becomes that of its newest version with results, else of the newest.
 
     Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN.
     """
@@ -43,4 +43,4 @@ def keys_named(column: str, name: str) -> list[str]:
     table = _RESULTS[column][0]
     rows = table.proj(f"{column}_name", f"{column}_version").to_dicts(order_by=f"{column}_version DESC")
     found = [row[column] for row in rows if name in (row[column], row[f"{column}_name"])]
-    return found or [stored_key(table, name)]  # raises, and names those that there are
+    return found or [stored_key(table, name)]  # raises, and names the known ones

@@ -28,11 +28,8 @@ def method_columns(prefix: str) -> str:
 
 
 def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
-    """Insert the methods that the table lacks. A row is never edited.
-
-    Raises `PblError` FILE_FORMAT when code holds other parameters under a name and version that the table already
-    knows.
-    """
+    """Insert the methods that the table lacks. A row is never edited. Raises `PblError` FILE_FORMAT when code holds
+    other parameters under a name and version that the table already knows."""
     prefix = _prefix(table)
     for method in found:
         row = {
@@ -56,9 +53,9 @@ def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
 
 
 def resolve_method(table: Any, name: str) -> str:
-    """Key of the method that is meant: a row by key (`demo-v1`) or name (`demo`: its newest version), or what this
-    machine offers under that name, such as a registered model. That becomes a row when it is first asked for; other
-    parameters (another graph or `model.json`) under the same name are its next version.
+    """Return the key of a method: a row by key (`demo-v1`) or name (`demo`: its newest version), or what this machine
+    offers under that name, such as a registered model. That becomes a row on first use; other parameters (another graph
+    or `model.json`) under the same name become its next version.
 
     Raises `PblError` SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
@@ -67,7 +64,7 @@ def resolve_method(table: Any, name: str) -> str:
 
 
 def stored_key(table: Any, name: str) -> str:
-    """As `resolve_method`, of the rows alone."""
+    """Return what `resolve_method` does, from the rows alone."""
     prefix = _prefix(table)
     rows = table.proj(f"{prefix}_method_name", f"{prefix}_method_version").to_dicts(
         order_by=[f"{prefix}_method_version DESC", f"{prefix}_method"]
@@ -85,9 +82,7 @@ def stored_key(table: Any, name: str) -> str:
 
 def register(table: Any, offered: methods.Method[Any]) -> tuple[str, bool]:
     """Key of the row with these parameters under this name, and whether it is new: then as the name's next version.
-
-    Raises what `insert_methods` raises.
-    """
+    Raises what `insert_methods` raises."""
     prefix, stage = _prefix(table), methods.of_stage(table.stage)
     rows = (table & {f"{prefix}_method_name": offered.name}).to_dicts(order_by=f"{prefix}_method_version")
     versions = [row[f"{prefix}_method_version"] for row in rows]

@@ -34,7 +34,7 @@ def insert_all() -> None:
 
 
 def add_instruments() -> None:
-    """Insert the clinical instruments that ship and are not there, as far as the account may.
+    """Insert the missing clinical instruments that ship, if the account may.
 
     They are not the table's `contents`: DataJoint would insert these while it binds tables of an older version, before
     they are migrated, and compares only the numbers of rows, so that a laboratory's own would hide new ones.

@@ -54,25 +54,26 @@ def build_norm(
 ) -> BuiltNorm:
     """Build a normative set from the used cycles of the current fits and register it as the next version of its name.
 
-    Nothing that was registered changes: sessions keep the set they were planned with. Where the cycles are those of
-    the newest version, that version is given back.
+    Nothing that was registered changes: sessions keep the set they were planned with. If the cycles are those of
+    the newest version, that version is returned.
 
-    Raises `PblError` USAGE (name, nobody asked for, several chains of methods), DB_NOT_FOUND (no cycles, unknown
-    population or subject), SOLVER_UNKNOWN (a method that there is not), NORM_INVALID, ANGLE_UNITS.
+    Raises `PblError` USAGE (name, no people, several chains of methods), DB_NOT_FOUND (no cycles, unknown
+    population or subject), SOLVER_UNKNOWN (an unknown method), NORM_INVALID, ANGLE_UNITS.
 
     Parameters
     ----------
     name
         Small letters, digits and hyphens; not a name that ships with the code.
     populations, subjects
-        Whose cycles: everybody of these populations, and these subjects. With subjects alone pass `populations=()`.
+        People whose cycles are used: all of these populations, and these subjects. With subjects alone pass
+        `populations=()`.
     pooled_populations
-        Whose cycles the components are fitted to as well (the paper pools patients and controls).
+        Populations to whose cycles the components are also fitted (the paper pools patients and controls).
     restriction
         A DataJoint restriction of `fit.SessionFit * gait.GaitCycle` and the methods, such as
         `{"fit_method": "blazepose-v1"}`: needed where the tables hold several chains of methods.
     nine_angles
-        All nine angles (for `gillette-2008`) and not three.
+        All nine angles (for `gillette-2008`) instead of three.
     pace
         Cycles of videos that are walked at this pace; one of unknown pace counts as self-selected.
     """
@@ -98,7 +99,12 @@ def build_norm(
             expected="fitted sessions of these people (`pbl ingest --population`, `pbl populate`)",
             next_step="`pbl status` shows what is done",
         )
-    _one_chain([*keys, *patients])
+    chains = sorted({tuple(k[c] or fit.LABORATORY for c in _CHAIN) for k in (*keys, *patients)})
+    if len(chains) > 1:
+        raise _usage(
+            f"cycles of {len(chains)} chains of methods: " + "; ".join(", ".join(c) for c in chains[:4]),
+            "one chain: restrict by " + ", ".join(_CHAIN),
+        )
     cycles, people = _cycles(keys)
     query = {
         "populations": sorted(populations),
@@ -126,7 +132,7 @@ def build_norm(
         file = folder / "norm.json"
         sha256 = norm.save(file, digits=None)
         if newest:
-            # As the newest version the same cycles give the same bytes, and then there is nothing to register.
+            # Under the number of the newest version the same cycles make the same bytes: nothing to register then.
             if sha256 == newest["norm_sha256"]:
                 return BuiltNorm(norm=newest["norm"], new=False, set=norm, **made)
             norm = dataclasses.replace(norm, version=norm.version + 1)
@@ -162,15 +168,6 @@ def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[s
         cycles += found
         people += [key["subject"]] * len(found)
     return cycles, people
-
-
-def _one_chain(keys: Sequence[dict[str, Any]]) -> None:
-    chains = sorted({tuple(k[c] or fit.LABORATORY for c in _CHAIN) for k in keys})
-    if len(chains) > 1:
-        raise _usage(
-            f"cycles of {len(chains)} chains of methods: " + "; ".join(", ".join(c) for c in chains[:4]),
-            "one chain: restrict by " + ", ".join(_CHAIN),
-        )
 
 
 def _must_exist(table: Any, column: str, wanted: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Where a result row comes from: version, method, model, host, duration, time."""
+"""Origin of a result row: version, method, model, host, duration, time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Results = TypeVarTuple("Results")
 
 
 def origin_columns(prefix: str) -> str:
-    """Definition lines that say where a result row comes from.
+    """Return the definition lines for the origin of a result row.
 
     The names carry the table's prefix, because DataJoint refuses joins of tables that share a secondary attribute.
     """
@@ -47,7 +47,7 @@ class Origin:
 
     @classmethod
     def now(cls, seconds: float) -> Origin:
-        """Of a computation that ended now, here, and took `seconds`."""
+        """Return the origin of a computation that ended here and now after `seconds`."""
         return cls(code_version(), platform.node()[:64], round(seconds, 3), time.monotonic())
 
     def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:

@@ -25,9 +25,7 @@ GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_
 
 def default_fit(keypoint_method: str) -> str:
     """Return the key of the fit method for keypoints of this method (a key) where none is named: as `pbl run` chooses.
-
-    Raises `PblError` MODEL_MISSING, MODEL_INVALID where the method's model is not registered on this machine.
-    """
+    Raises `PblError` MODEL_MISSING, MODEL_INVALID if the method's model is not registered on this machine."""
     from pbl_pipeline.fit import default_fit as suited
 
     row = method_row(keypoints.KeypointMethod, {"keypoint_method": keypoint_method})
@@ -35,8 +33,8 @@ def default_fit(keypoint_method: str) -> str:
 
 
 def unsuited(fit_method: str, keypoint_method: str | None) -> str:
-    """What is to be said where a fit method (key) was made for other points than those of a keypoint method (key; None:
-    markers of a laboratory), "" where it was not, and where the keypoint method's model is not on this machine."""
+    """Return a warning if a fit method (key) was made for other points than those of a keypoint method (key; None:
+    markers of a laboratory); "" if not, or if the keypoint method's model is not on this machine."""
     from pbl_pipeline.fit import unsuited as compare
 
     name = method_row(fit.FitMethod, {"fit_method": fit_method})["name"]
@@ -62,18 +60,15 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     """Make a FitSet for every session whose trials are all decided and not yet in a current set, one for its trials of
     several cameras, and one for its marker recordings (MarkerPlan): these are never fitted together.
 
-    A trial is decided when it can be fitted (TrialInput), failed, shows nobody, or waits for a person's choice. While
-    another trial of the session is still being computed, nothing is planned: otherwise every single video of a visit
-    would trigger a fit of its own. A later video (or choice) makes a new set; the old set and its fit stay, no longer
+    A trial is decided when it can be fitted (TrialInput), failed, shows no one, or waits for a person's choice. While
+    another trial of the session is still being computed, nothing is planned: otherwise every video of a visit would
+    trigger a separate fit. A later video (or choice) makes a new set; the old set and its fit stay, no longer
     current. A recording that is marked as not usable (`video.NotUsable`) takes no part, and sets with it cease to be
     current. Workers take turns at a session, and where several sets of it are current all but one cease to be.
 
     Returns `fit_set` and `fit_method` of the sets that became current now.
 
-    Parameters
-    ----------
-    sessions
-        session_id of those to look at (None: all; that reads whole tables).
+    `sessions`: session_id of those to look at (None: all; that reads whole tables).
     """
     chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
     current = fit.current() & (fit.FitSet & chosen)
@@ -91,12 +86,12 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
     failed = queues_before_fit()
     made = []
     for session_id in to_plan:
-        made += _plan_alone(session_id, failed)
+        made += _plan_locked(session_id, failed)
     return made
 
 
 @repeated
-def _plan_alone(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
+def _plan_locked(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
     with locked(session_id):
         return plan_anew(session_id, failed)
 
@@ -108,7 +103,7 @@ def queues_before_fit() -> list[Any]:
 
 
 def plan_anew(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:
-    """What `plan_fit_sets` does for one session, inside `locked`; `failed`: `queues_before_fit`."""
+    """Plan one session as `plan_fit_sets` does, inside `locked`; `failed`: `queues_before_fit`."""
     outdated = fit.current() & (_with_unusable() & {"session_id": session_id})
     for key in outdated.proj().to_dicts():
         fit.FitSelection.update1({**key, "fit_current": False})
@@ -136,7 +131,7 @@ def locked(session_id: int) -> Iterator[None]:
 
 
 def _keep_one_current(session_id: int) -> None:
-    """Of several current sets of one group the largest stays current, of equally large ones the newest."""
+    """Keep the largest of several current sets of a group current; of equally large ones the newest."""
     member = fit.FitSet.Video.proj("tracking_method", "keypoint_method")
     sets = fit.FitSet.proj("session_id", "fit_set_kind", "fit_set_n", "fit_set_created") & {"session_id": session_id}
     rows = (fit.current() * sets).to_dicts(order_by="fit_set_n DESC, fit_set_created DESC")
@@ -226,21 +221,14 @@ def _make_set(group: Mapping[str, Any], rows: list[dict]) -> list[dict[str, Any]
     )
     member = ("video_id", "tracking_method", "keypoint_method")
     fit.FitSet.Video.insert(({"fit_set": name, **{k: row[k] for k in member}} for row in rows), skip_duplicates=True)
-    for older in _older_sets(group, name):
+    same = {"tracking_method": group["tracking_method"], "keypoint_method": group["keypoint_method"]}
+    sets = (fit.FitSet & about) & (fit.FitSet.Video & same).proj()
+    of_group = fit.current() & {"fit_method": group["fit_method"]} & sets.proj()
+    for older in (of_group - {"fit_set": name}).proj().to_dicts():
         fit.FitSelection.update1({**older, "fit_current": False})
     fit.FitSelection.insert1({**selection, "fit_current": True}, skip_duplicates=True)
     fit.FitSelection.update1({**selection, "fit_current": True})
     return [selection]
-
-
-def _older_sets(group: Mapping[str, Any], name: str) -> list[dict]:
-    """Current selections of the same session, kind, methods and fit method, other than `name`."""
-    same = {"tracking_method": group["tracking_method"], "keypoint_method": group["keypoint_method"]}
-    of_kind = {k: group[k] for k in ("session_id", "fit_set_kind")}
-    sets = (fit.FitSet & of_kind) & (fit.FitSet.Video & same).proj()
-    current = fit.FitSelection & {"fit_method": group["fit_method"], "fit_current": True}
-    keys = (current & sets.proj()).keys()
-    return [k for k in keys if k["fit_set"] != name]
 
 
 def fit_set_hash(group: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""Copies of the recordings in which nobody can be recognised."""
+"""Copies of the recordings in which no one can be recognised."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Deidentified(dj.Computed):
 
     @staticmethod
     def wanted() -> bool:
-        """Whether the setting asks for copies."""
+        """Return whether the setting asks for copies."""
         return bool(settings.deidentify_how())
 
     @property
     def key_source(self) -> Any:
-        """Every recording with pictures where the setting asks for copies, else none."""
+        """Recordings with pictures if the setting asks for copies, else none."""
         return video.VideoInfo.proj() & self.wanted()
 
     def make_fetch(self, key: dict) -> tuple:
@@ -110,9 +110,9 @@ class Deidentified(dj.Computed):
 @contextlib.contextmanager
 def shown(video_id: int) -> Iterator[Path | None]:
     """The recording whose pictures overlays and reports show: the de-identified copy where PBL_DEIDENTIFY asks for it,
-    None where it does not.
+    None if it does not.
 
-    Raises `PblError` DB_NOT_FOUND: there is no copy of that kind yet. HEAD_NOT_FOUND: nothing was covered in it.
+    Raises `PblError` DB_NOT_FOUND: such a copy does not exist yet. HEAD_NOT_FOUND: nothing was covered in it.
     """
     from pbl_pipeline.deidentify import nothing_covered
 

@@ -1,4 +1,4 @@
-"""Every quality check of a visit in one place; the worst outcome wins."""
+"""Quality checks of a visit in one place; the worst outcome wins."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SOURCES = (
     ("gdi", gdi.SessionGdi.Check, "gdi"),
 )
 
-#: Where the values of a check stand in `SessionQc.Check`.
+#: Columns of `SessionQc.Check` with the values of a check.
 COLUMNS = ("qc_check", "qc_check_outcome", "qc_value", "qc_threshold", "qc_advice")
 
 
@@ -56,7 +56,11 @@ class SessionQc(dj.Computed):
         found = []
         corrected = (gait.GaitCycle & key & "correction_no IS NOT NULL").keys()
         for stage, table, prefix in SOURCES:
-            rows = (table & _of_set(table, key)) - (corrected if table is gait.GaitEvents.Check else [])
+            of_set: Any = key
+            if table is keypoints.Keypoints.Check:  # keypoints are the members of a set
+                names = keypoints.Keypoints.primary_key
+                of_set = [{k: row[k] for k in names} for row in (fit.FitSet.Video & key).to_dicts()]
+            rows = (table & of_set) - (corrected if table is gait.GaitEvents.Check else [])
             checks = [(row.get("video_id"), check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
             if table is gait.GaitEvents.Check:
                 checks += [(k["video_id"], dataclasses.astuple(c)) for k in corrected for c in gait.load_events(k).qc]
@@ -89,10 +93,3 @@ class SessionQc(dj.Computed):
             }
         )
         self.Check.insert({**key, "qc_no": i, **row} for i, row in enumerate(rows, 1))
-
-
-def _of_set(table: Any, key: dict) -> Any:
-    """Return the restriction of a table of checks to one set of videos. Keypoints are its members."""
-    if table is not keypoints.Keypoints.Check:
-        return key
-    return [{k: row[k] for k in keypoints.Keypoints.primary_key} for row in (fit.FitSet.Video & key).to_dicts()]

@@ -1,4 +1,4 @@
-"""What people decided and viewed on the review page. Rows are added, never changed; `schemas.decisions` writes them."""
+"""Decisions and looks of people on the review page. Rows are added, never changed; `schemas.decisions` writes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values of columns, quality checks as rows, and rows that go with all that was computed from them."""
+"""Values of columns, quality checks as rows, and deletion of rows with their dependent results."""
 
 from __future__ import annotations
 
@@ -35,13 +35,8 @@ class InputChanged(PblError):
 
 
 def one(query: Any, *columns: str) -> Any:
-    """`query.fetch1(*columns)` for what a computation reads.
-
-    Raises
-    ------
-    InputChanged
-        There is no such row (any more).
-    """
+    """`query.fetch1(*columns)` for what a computation reads. Raises InputChanged if there is no such row (any
+    longer)."""
     try:
         return query.fetch1(*columns)
     except dj.DataJointError:
@@ -51,7 +46,7 @@ def one(query: Any, *columns: str) -> Any:
 
 
 def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The rows of a table that agree with a key, in the order of the table's own key."""
+    """Return the rows of a table that agree with a key, in the order of its primary key."""
     columns = table.heading.attributes.values()
     if any(c.codec or c.json or c.uuid for c in columns):
         return (table & key).to_dicts(order_by="KEY")
@@ -60,10 +55,8 @@ def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
-    """The one row of a table that agrees with a key, or with a query where `stored_rows` reads it.
-
-    Raises `PblError` DB_NOT_FOUND for none, USAGE for several.
-    """
+    """Return the only row of a table that agrees with a key, or with a query where `stored_rows` reads it. Raises
+    `PblError` DB_NOT_FOUND for none, USAGE for several."""
     found = rows(table, key)
     if len(found) == 1:
         return found[0]
@@ -112,13 +105,12 @@ class ReadAhead:
 
 
 def utc_now() -> datetime.datetime:
-    """Now in UTC by the clock of the database server, whole seconds, without zone: what a datetime column takes. One
-    clock for every row, whatever those of the machines say."""
+    """Return the time in UTC by the clock of the database server for a datetime column: one clock for all machines."""
     return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
 def number(value: Any) -> float | None:
-    """A float for a nullable column: None where the value is missing or not finite."""
+    """Return a float for a nullable column: None if the value is missing or not finite."""
     if value is None:
         return None
     value = float(value)
@@ -131,7 +123,7 @@ def or_nan(value: float | None) -> float:
 
 
 def plain(value: Any) -> Any:
-    """Mappings and tuples as dicts and lists of plain numbers: what a json column takes."""
+    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -144,7 +136,7 @@ def plain(value: Any) -> Any:
 
 
 def inside(column: str, values: Iterable[str | int]) -> Any:
-    """A restriction to values that hold no quotes (codes and numbers), quick for thousands."""
+    """Return a restriction to values without quotes (codes and numbers), quick for thousands."""
     listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
     return f"{column} IN ({listed})" if listed else False
 
@@ -154,16 +146,14 @@ def counted(deleted: Mapping[str, int]) -> str:
     return ", ".join(f"{n} of {name}" for name, n in deleted.items())
 
 
-#: Times that a cascade is begun anew where another process inserts below it, or holds its locks, meanwhile.
+#: Times that a cascade is begun again where another process inserts below it, or holds its locks, meanwhile.
 _DELETES = 5
 
 
 @columns_read_once()
 def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Delete the rows with these keys and all that was computed from them, in one transaction.
-
-    Returns table name to number of deleted rows, empty when there was nothing.
-    """
+    """Delete the rows with these keys and all dependent results, in one transaction. Returns table name to
+    number of deleted rows, empty when there was nothing."""
     if not keys:
         return {}
     # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
@@ -181,7 +171,7 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
             # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
             if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
                 raise
-            if target.connection.in_transaction:  # it goes on seeing the tables as they were
+            if target.connection.in_transaction:  # it keeps seeing the tables as they were
                 raise pymysql.err.OperationalError(REPEAT[0], str(error)) from error
     return counts
 

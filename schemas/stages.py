@@ -1,4 +1,4 @@
-"""The modules of tables, by name: this module imports none of them before it is asked."""
+"""The modules of tables by name; they are imported on request only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where arrays go: a folder, or a bucket of an object store (S3, MinIO)."""
+"""The store of arrays: a folder, or a bucket of an object store (S3, MinIO)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import importlib.util
 import json
 import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ def is_remote() -> bool:
 
 
 def describe() -> str:
-    """Return where arrays go, in words, without any secret."""
+    """Return the place of the arrays in words, without any secret."""
     if is_remote():
         return f"{os.environ['PBL_S3_ENDPOINT']}, bucket {bucket()}"
     return str(settings.store_dir())
@@ -39,10 +41,10 @@ def bucket() -> str:
 
 
 def store_spec() -> dict[str, Any]:
-    """The store as DataJoint's configuration has it. Makes the folder; asks no object store yet (`check_store` does).
+    """Return the store for DataJoint's configuration. Makes the folder; asks no object store yet (`check_store` does).
 
     Raises `PblError` DB_REFUSED for a folder that cannot be used, USAGE for settings of an object store that cannot
-    work, STORE_UNAVAILABLE where the package for object stores is missing.
+    work, STORE_UNAVAILABLE if the package for object stores is missing.
     """
     if is_remote():
         return _bucket_spec()
@@ -62,7 +64,7 @@ def _bucket_spec() -> dict[str, Any]:
     if not endpoint.startswith(("http://", "https://")) or "@" in endpoint:
         raise PblError(
             "USAGE",
-            key="PBL_S3_ENDPOINT",  # its value may hold a password where somebody wrote user:password@host
+            key="PBL_S3_ENDPOINT",  # its value may hold a password: user:password@host
             found="an address without http:// or https://, or with a user in it",
             expected="such as https://minio.lab.example:9000",
             next_step="correct the variable; key and secret go into PBL_S3_KEY_FILE and PBL_S3_SECRET_FILE",
@@ -89,7 +91,7 @@ def _bucket_spec() -> dict[str, Any]:
 
 
 def further_stores(taken: str) -> dict[str, Any]:
-    """The stores that DJ_STORES describes (JSON, as DataJoint reads it), for a lab's custom tables.
+    """Return the stores that DJ_STORES describes (JSON, as DataJoint reads it), for a lab's custom tables.
 
     Raises `PblError` USAGE where it is not a JSON object of stores, or describes the store `taken`, which other
     variables decide.
@@ -106,7 +108,7 @@ def further_stores(taken: str) -> dict[str, Any]:
         raise PblError(
             "USAGE",
             key="DJ_STORES",
-            found=f"it describes the store {taken!r}" if isinstance(found, dict) else "it is no JSON object",
+            found=f"it describes the store {taken!r}" if isinstance(found, dict) else "it is not a JSON object",
             expected='stores of your own, such as {"raw": {"protocol": "file", "location": "/data/raw"}}; '
             f"PBL_STORE and PBL_S3_* describe {taken!r}",
             next_step="correct the variable, or unset it",
@@ -117,64 +119,49 @@ def further_stores(taken: str) -> dict[str, Any]:
 def check_store(backend: Any, create: bool = False) -> None:
     """Write, read and compare a small object in the store.
 
-    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
+    Raises `PblError` as `store_errors`.
 
-    Parameters
-    ----------
-    backend
-        DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`).
-    create
-        Make the bucket where it is missing.
+    `backend`: DataJoint's storage backend of the store `arrays` (`schemas.connection.store_backend()`). `create`: make
+    the bucket where it is missing.
     """
-    # In a bucket always the same object, for a worker's key may not delete; in a folder a separate file that goes
-    # again. Several processes may write that object at once: whoever wrote it, it holds some bytes and their hash.
+    # In a bucket always the same object, because a worker's key may not delete; in a folder a separate file that is
+    # removed. Several processes may write that object at once: it holds some bytes and their hash whoever wrote it.
     name = secrets.token_bytes(16)
     content = name + hashlib.sha256(name).digest()
     probe = f"probe-{name.hex()}" if backend.protocol == "file" else "probe/written-by-pbl-db-init"
-    try:
+    with store_errors():
         if create and backend.protocol == "s3" and not backend.fs.exists(bucket()):
             backend.fs.mkdir(bucket())
         backend.put_buffer(content, probe)
         found = backend.get_buffer(probe)
         if backend.protocol == "file":
             backend.remove(probe)
-    except Exception as error:  # whatever layer of the client speaks, the reader needs the same advice
-        raise store_error(error) from error
     if len(found) != len(content) or hashlib.sha256(found[:16]).digest() != found[16:]:
         raise store_error(OSError("an object came back with other bytes than were written"))
 
 
 def files_below(backend: Any, folder: str = "") -> dict[str, dict[str, Any]]:
-    """The files under a folder of the store (a path in it; default: all), with what the store says of each.
-
-    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
-    """
-    try:
+    """Return the files below a folder of the store (a path in it; default: all) with what the store knows of each.
+    Raises `PblError` as `store_errors`."""
+    with store_errors():
         base = full_path(backend, "")
         found = backend.fs.find(full_path(backend, folder), detail=True)
-    except Exception as error:
-        raise store_error(error) from error
     return {str(path).removeprefix(base).lstrip("/"): about for path, about in found.items()}
 
 
 def purge(fs: Any, folder: str) -> None:
-    """Remove what a bucket holds below a folder (`bucket/path`), older versions and the parts of uploads that broke off
-    included.
-
-    Raises `PblError` STORE_UNAVAILABLE with what the store said, STORE_FULL.
-    """
+    """Remove everything below a folder of a bucket (`bucket/path`), including older versions and unfinished uploads.
+    Raises `PblError` as `store_errors`."""
     name, _, path = folder.partition("/")
     where = {"Bucket": name, "Prefix": f"{path.strip('/')}/"}
-    try:
+    with store_errors():
         while found := _kept(fs, where):
             for command, item in found:
                 fs.call_s3(command, Bucket=name, **item)
-    except Exception as error:
-        raise store_error(error) from error
 
 
 def _kept(fs: Any, where: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
-    """The commands that remove the next thousand versions and the next thousand unfinished uploads."""
+    """Return the commands that remove the next thousand versions and the next thousand unfinished uploads."""
     versions = fs.call_s3("list_object_versions", **where)
     parts = fs.call_s3("list_multipart_uploads", **where)
     listed = [*versions.get("Versions", []), *versions.get("DeleteMarkers", [])]
@@ -183,8 +170,19 @@ def _kept(fs: Any, where: dict[str, str]) -> list[tuple[str, dict[str, str]]]:
     ]
 
 
+@contextmanager
+def store_errors() -> Iterator[None]:
+    """Raise errors of the store's client in the block as `PblError` STORE_UNAVAILABLE or STORE_FULL."""
+    try:
+        yield
+    except PblError:
+        raise
+    except Exception as error:  # whatever layer of the client speaks, the reader needs the same advice
+        raise store_error(error) from error
+
+
 def store_error(error: BaseException) -> PblError:
-    """The coded error for a store that does not do what it is asked. The clients' messages hold no secret."""
+    """Return the coded error for an error of the store. The clients' messages hold no secret."""
     if (full := store_full(error)) is not None:
         return full.about(describe())
     return PblError(

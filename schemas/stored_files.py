@@ -22,9 +22,9 @@ from .datajoint_setup import backend_of, build_object_path, full_path
 def stored_file(ref: Mapping[str, Any]) -> Iterator[Path]:
     """Path to read an object of the store, from the dict that `file_ref` took from a row. Touches no database.
 
-    A store in a folder gives the file itself; a remote one a copy that is removed afterwards.
+    For a store in a folder it is the file itself, for a remote one a copy that is removed afterwards.
 
-    Raises `PblError` FILE_FORMAT where the store has no such file, another size of it, or what reads it cannot.
+    Raises `PblError` FILE_FORMAT if the store has no such file, another size of it, or what reads it cannot.
     """
     backend = backend_of(ref.get("store") or connection.STORE)
     if backend.protocol == "file":

@@ -1,4 +1,4 @@
-"""Studies: what a visit is in a study, clinical scores, cohorts, and slices that freeze what a figure was made of."""
+"""Studies: roles of visits, clinical scores, cohorts, and slices that freeze the data of figures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DAYS = {"day": 1.0, "week": 7.0, "month": 30.4375, "year": 365.25}
 
 
 def role_days(role: str) -> float | None:
-    """Days after the event that a role names: 42 for "6_weeks", -inf for those before it; None for one's own."""
+    """Days after the event that a role names: 42 for "6_weeks", -inf for those before it; None for custom ones."""
     if role in FIRST_ROLES:
         return -math.inf
     match = _AFTER.fullmatch(role)
@@ -30,7 +30,7 @@ def role_days(role: str) -> float | None:
 
 
 def is_role(text: str) -> bool:
-    """Whether a text can be a role: small letters, digits and underscores."""
+    """Return whether a text can be a role: small letters, digits and underscores."""
     return _ROLE.fullmatch(text) is not None
 
 
@@ -82,10 +82,8 @@ class ClinicalScore(dj.Manual):
     """
 
     def insert(self, rows: Any, *args: Any, **options: Any) -> None:
-        """DataJoint's own, after every value was compared with the range of its instrument.
-
-        Raises `PblError` SCORE_RANGE; then nothing is inserted. An instrument that is unknown is DataJoint's error.
-        """
+        """DataJoint's own, after every value was compared with the range of its instrument. Raises `PblError`
+        SCORE_RANGE; then nothing is inserted. An instrument that is unknown is DataJoint's error."""
         rows = self._dicts(rows)
         check_scores(rows)
         super().insert(rows, *args, **options)

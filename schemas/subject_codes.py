@@ -24,7 +24,7 @@ def check_subject(code: str, next_step: str, key: object = None) -> None:
 
 
 def day_of(label: str) -> datetime.date | None:
-    """The day that a session's label says (YYYY-MM-DD); None where it says something else."""
+    """Return the day in a session's label (ISO, such as YYYY-MM-DD); None for any other text."""
     try:
         return datetime.date.fromisoformat(label)
     except ValueError:
@@ -32,5 +32,5 @@ def day_of(label: str) -> datetime.date | None:
 
 
 def folded(code: str) -> str:
-    """A code without case, hyphens and leading zeros: two that are equal so are likely one person."""
+    """Return a code without case, hyphens and leading zeros: codes that agree then are likely of one person."""
     return re.sub(r"0*(\d+)", r"\1", re.sub(r"[-_.]", "", code.lower()))

@@ -1,5 +1,5 @@
-"""Whether the tables on the server are those of this version of the code: asked at every start, before anything reads
-or writes them.
+"""Check that the tables on the server are those of this version of the code: at every start, before anything reads or
+writes them.
 
 The table `~migrations` in the schema `lab` has a row for each numbered migration (`schemas.migrations`) that the tables
 have been through. New tables are made as this version defines them, so they get all of its rows when they are created.
@@ -53,13 +53,8 @@ def title(number: int, name: str) -> str:
 
 
 def numbered() -> list[tuple[int, str]]:
-    """Return number and name of every migration of this version, in the order of their numbers.
-
-    Raises
-    ------
-    ValueError
-        A number that is missing or used twice: a mistake in the code.
-    """
+    """Return number and name of every migration of this version, in the order of their numbers. Raises ValueError for a
+    number that is missing or used twice, a mistake in the code."""
     package = importlib.import_module("schemas.migrations")
     names = (_NAME.fullmatch(module.name) for module in pkgutil.iter_modules(package.__path__))
     found = sorted((int(match[1]), match[2]) for match in names if match)
@@ -94,10 +89,7 @@ def record(execute: Callable[..., object], number: int, name: str, statements: C
 
 def check_version() -> None:
     """Refuse tables of another version; on a server without any, record the migrations that new ones need not go
-    through. Call it before the tables are declared.
-
-    Raises `PblError` DB_MIGRATION.
-    """
+    through. Call it before the tables are declared. Raises `PblError` DB_MIGRATION."""
     if any(not table.startswith("~") for _, table in catalog.tables()):
         refuse_other_version()
     elif not applied():
@@ -109,10 +101,7 @@ def check_version() -> None:
 
 def refuse_other_version() -> None:
     """Refuse tables of a newer version (a migration was applied that this one lacks) or an older one (a migration, or a
-    column of a definition, is missing). A server without tables is neither.
-
-    Raises `PblError` DB_MIGRATION.
-    """
+    column of a definition, is missing). A server without tables is neither. Raises `PblError` DB_MIGRATION."""
     refuse_newer()
     if not any(not table.startswith("~") for _, table in catalog.tables()):
         return
@@ -130,10 +119,8 @@ def refuse_other_version() -> None:
 
 
 def refuse_newer() -> None:
-    """Refuse tables that went through a migration which this version does not have, by number and name.
-
-    Raises `PblError` DB_MIGRATION.
-    """
+    """Refuse tables that went through a migration which this version does not have, by number and name. Raises
+    `PblError` DB_MIGRATION."""
     ours = numbered()
     newer = [a for a in applied() if (a.number, a.name) not in ours]
     if newer:

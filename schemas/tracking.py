@@ -1,4 +1,4 @@
-"""People in a video, and which of them is measured."""
+"""People in a video, and the one who is measured."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Tracking(dj.Computed):
 
     @property
     def key_source(self) -> Any:
-        """Only what a probe could read: a file that is not a video has one error row, in VideoInfo."""
+        """Files that could be probed: one that is not a video has a single error row, in VideoInfo."""
         return TrackingSelection.proj() * video.VideoInfo.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
@@ -218,8 +218,8 @@ class SubjectChoice(dj.Computed):
 
 
 def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
-    """The last decision about another tracking of this video: its tracks, detector and model, the person's number
-    there, the method. None where nobody has decided."""
+    """Return the last decision about another tracking of this video: its tracks, detector and model, the person's
+    number there, the method; None without one."""
     others = Tracking * SubjectOverride & {"video_id": key["video_id"]}
     others &= f"tracking_method != '{key['tracking_method']}'"
     for row in others.to_dicts(order_by=["override_created DESC", "tracking_method"]):
@@ -233,10 +233,8 @@ def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
 
 # ---------------------------------------------------------------------------------------------- override and effects
 def set_override(key: Mapping[str, Any], person_id: int) -> None:
-    """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes what it contradicts.
-
-    Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person.
-    """
+    """Write a person's decision for one tracking selection. `drop_outdated_choices` then removes results that
+    contradict it. Raises `PblError` SUBJECT_UNKNOWN_PERSON when the video is tracked and has no such person."""
     key = {"video_id": key["video_id"], "tracking_method": key["tracking_method"]}
     if Tracking & key:
         persons = sorted(int(p) for p in (Tracking.Person & key).to_arrays("person_id"))
@@ -264,29 +262,25 @@ def choose_command(key: Mapping[str, Any], persons: str) -> str:
     )
 
 
-def outdated_choices(restriction: Any = True) -> Any:
-    """Choices that contradict the overrides: another person decided, or the decision was withdrawn."""
-    decided = SubjectChoice.proj("chosen_person_id") * SubjectOverride.proj("override_person_id")
-    differs = decided & "chosen_person_id is null or chosen_person_id != override_person_id"
-    withdrawn = (SubjectChoice & {"choice_status": "MANUAL"}) - SubjectOverride
-    return SubjectChoice & [differs.proj(), withdrawn.proj()] & restriction
-
-
 def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:
-    """Delete outdated choices and all that was computed from them, in one transaction.
+    """Delete choices that contradict the overrides (another person was chosen, or the override was withdrawn), and all
+    dependent results, in one transaction.
 
-    Where a person decided for whom the automatic choice had chosen already, nothing that was computed changes: the
-    choice becomes MANUAL and stays.
+    An override that confirms the automatic choice changes nothing that was computed: the choice becomes MANUAL and
+    stays.
 
-    Returns the number of deleted rows by table, empty when nothing was outdated. The next populate computes them anew.
+    Returns the number of deleted rows by table, empty if nothing was outdated. The next populate recomputes them.
     """
-    confirmed = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
-    confirmed = confirmed & "choice_status != 'MANUAL' and chosen_person_id = override_person_id" & restriction
+    decided = SubjectChoice.proj("choice_status", "chosen_person_id") * SubjectOverride.proj("override_person_id")
+    confirmed = decided & "choice_status != 'MANUAL' and chosen_person_id = override_person_id" & restriction
     for row in confirmed.to_dicts():
         key = {k: row[k] for k in SubjectChoice.primary_key}
         reason = f"Person {row['override_person_id']} was chosen by hand, as automatically before."
         SubjectChoice.update1({**key, "choice_status": "MANUAL", "choice_reason": reason})
-    return delete_below(SubjectChoice, outdated_choices(restriction).keys())
+    differs = decided & "chosen_person_id is null or chosen_person_id != override_person_id"
+    withdrawn = (SubjectChoice & {"choice_status": "MANUAL"}) - SubjectOverride
+    outdated = SubjectChoice & [differs.proj(), withdrawn.proj()] & restriction
+    return delete_below(SubjectChoice, outdated.keys())
 
 
 # ------------------------------------------------------------------------------------------------------- files, rows

@@ -23,7 +23,7 @@ _PAUSE_S = 0.1
 
 def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
     """Decorator of a function that is one transaction: begin it again where the server broke it off for another one's
-    sake (deadlock, lock wait). Inside a transaction that is open the error goes on up to the one who opened it."""
+    sake (deadlock, lock wait). Inside a transaction that is open the error propagates to whoever opened it."""
 
     @functools.wraps(work)
     def wrapper(*arguments: Arguments.args, **named: Arguments.kwargs) -> T:

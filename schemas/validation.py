@@ -91,13 +91,10 @@ class KinematicError(dj.Computed):
         self, key: dict, fitted: Mapping[str, Any], reference: Mapping[str, Any]
     ) -> tuple[lib.KinematicErrors]:
         from pbl_pipeline import validation as lib
-        from pbl_pipeline.fit import TrialFit
 
-        with stored_file(fitted) as path:
-            trial = TrialFit.load(path)
         with stored_file(reference) as path:
             truth = lib.Reference.load(path)
-        return (lib.compare(trial, truth),)
+        return (lib.compare(fit.load_trial(fitted), truth),)
 
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
         self.insert1(
@@ -114,7 +111,11 @@ class KinematicError(dj.Computed):
                 **origin.row("error"),
             }
         )
-        self.Joint.insert({**key, **joint_row(j)} for j in errors.joints)
+        joints = ({column: getattr(j, field) for field, column in JOINT_COLUMNS.items()} for j in errors.joints)
+        self.Joint.insert(
+            {**key, **{c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}}
+            for row in joints
+        )
 
 
 #: Field of the library's `JointError` -> column of KinematicError.Joint.
@@ -130,12 +131,6 @@ JOINT_COLUMNS = {
     "within_90": "joint_within_90",
     "normal_p": "joint_normal_p",
 }
-
-
-def joint_row(error: lib.JointError) -> dict[str, Any]:
-    """Return a library `JointError` as columns of KinematicError.Joint."""
-    row = {column: getattr(error, field) for field, column in JOINT_COLUMNS.items()}
-    return {c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}
 
 
 def _fields(joint: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Recordings and what a probe finds in them."""
+"""Recordings and the properties of their files."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ class VideoInfo(dj.Computed):
                 "n_frames": info.n_frames,
                 "n_frames_announced": info.n_frames_announced,
                 "variable_frame_rate": info.variable_frame_rate,
-                # Tags of the file: anything may stand there.
+                # Tags of the file, which are not trusted.
                 "recorded_utc": _cut(info.recorded_utc, 40),
                 "phone_make": _cut(info.make, 64),
                 "phone_model": _cut(info.model, 64),
@@ -291,7 +291,7 @@ def condition(video_id: int, rows: Rows = stored_rows) -> Condition:
 
 def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
     """The calibration that counts for a video, by its joined row of Video and VideoInfo: its own, else that of the
-    phone which recorded it; None where there is neither.
+    phone which recorded it; None if there is neither.
 
     A row of CameraCalibration, and `turn_deg`: how far its picture has to be turned clockwise to be this video's.
     """
@@ -311,10 +311,8 @@ def camera_of(row: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def present_file(video_id: int) -> Path:
-    """Return the file of a video if it is there; its bytes are not compared with those that were registered.
-
-    Raises `PblError` DB_NOT_FOUND, VIDEO_MISSING.
-    """
+    """Return the file of a video if it is there; its bytes are not compared with those that were registered. Raises
+    `PblError` DB_NOT_FOUND, VIDEO_MISSING."""
     path = Path(registered_video(video_id)["video_path"])
     if not path.is_file():
         raise _missing(path, {"video_id": video_id})
@@ -339,10 +337,8 @@ def unknown_video(video_id: int) -> PblError:
 
 
 def registered_file(path: str, sha256: str, key: dict) -> Path:
-    """The video file, after checking that it is still the one that was registered.
-
-    Raises `PblError` VIDEO_MISSING, VIDEO_CHANGED.
-    """
+    """The video file, after checking that it is still the one that was registered. Raises `PblError` VIDEO_MISSING,
+    VIDEO_CHANGED."""
     from pbl_pipeline.video import sha256_of
 
     if not Path(path).is_file():
@@ -354,7 +350,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
             found=f"{path} has SHA-256 {found}",
             expected=f"SHA-256 {sha256}, as registered",
             next_step="restore the original file, then `pbl populate --retry-errors`; "
-            "or `pbl ingest` the changed file as a video of its own",
+            "or `pbl ingest` the changed file as a separate video",
             key=f"video_id={key['video_id']}",
         )
     return Path(path)

@@ -1,4 +1,4 @@
-"""Who works on the queues: processes with their heartbeats, what they did by the minute."""
+"""Working processes with their heartbeats, and their throughput by the minute."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ class Turn(dj.Manual):
 
 
 @contextmanager
-def alone(work: str, server: Any) -> Iterator[bool]:
+def installation_lock(work: str, server: Any) -> Iterator[bool]:
     """Hold an installation-wide lock for some work: only one process on any machine has it.
 
     Yields whether it was obtained; never waits. It ends with the process or its connection, as the server's named locks
-    do. Those are anybody's to take, also an analyst's; so one counts only together with a row that names it and its
+    do. Anyone can take those, also an analyst; so one counts only together with a row that names it and its
     connection, which takes the right to write.
     """
     lock, table = secrets.token_hex(16), Turn.full_table_name

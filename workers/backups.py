@@ -30,14 +30,14 @@ def backup_folder() -> Path:
 
 
 def backup_regularly(root: Path, keep: int, say: Say = lambda _: None) -> Backup | None:
-    """Save everything into a new folder of `root`, then remove all but the `keep` newest; None where another process
+    """Save everything into a new folder of `root`, then remove all but the `keep` newest; None if another process
     is doing this.
 
     Recordings that the newest one has are linked: they take room once. The remains of an interrupted run are removed.
 
     Raises what `schemas.operations.backup.backup` raises; nothing is removed then.
     """
-    with worker.alone("backup", connection.connect()) as obtained:
+    with worker.installation_lock("backup", connection.connect()) as obtained:
         if not obtained:
             return None
         before = sorted(p for p in root.glob("*") if _PATTERN.fullmatch(p.name))

@@ -1,5 +1,5 @@
-"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in as an upload
-of the drop folder is."""
+"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in like an
+upload of the drop folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from schemas.intake import Registered, VisitRecord
 from schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import KEPT_FREE, VIDEO_ENDINGS, Copy, check_opens, has_room, take_in
+from .incoming import VIDEO_ENDINGS, Copy, check_opens, register_copies
 
 #: Age at which the rest of a broken upload is removed (s).
 _REST_S = 86_400.0
@@ -38,7 +38,7 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of a file: its name as it was sent; status as in `Registered`."""
+    """Outcome for a file: its name as it was sent; status as in `Registered`."""
 
     name: str
     status: str
@@ -53,11 +53,8 @@ def place(session_id: int) -> Place:
 
 
 class Arriving:
-    """A file that arrives: written under a new name in the person's folder of the archive, and hashed.
-
-    Raises `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes;
-    OSError.
-    """
+    """A file that arrives: written under a new name in the person's folder of the archive, and hashed. Raises
+    `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes; OSError."""
 
     def __init__(self, to: Place, name: str) -> None:
         self.name = plain_name(PurePosixPath(name.replace("\\", "/")).name)
@@ -81,7 +78,7 @@ class Arriving:
 
     @property
     def is_log(self) -> bool:
-        """Whether it is a sensor log, by its ending."""
+        """True for a sensor log, by its ending."""
         return self.path.suffix in LOG_ENDINGS
 
     def write(self, piece: bytes) -> None:
@@ -101,20 +98,9 @@ class Arriving:
         return Copy(self.path, self._sum.hexdigest())
 
     def discard(self) -> None:
-        """Remove it; what was taken into the archive has another name and stays."""
+        """Remove the file; one that was registered has another name and stays."""
         self._file.close()
         self.path.unlink(missing_ok=True)
-
-
-def check_room(n_bytes: int) -> None:
-    """Raise `PblError` FILE_UNWRITABLE where so many bytes do not fit into the archive."""
-    if not has_room(archive_dir(), n_bytes):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
-            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step="tell who runs the server",
-        )
 
 
 def check(arrived: Arriving) -> PblError | None:
@@ -132,11 +118,11 @@ def register(
     """Register files that arrived whole; a sensor log goes with the video of its name. One outcome for each video and
     each log without a video; None, with nothing done, while the drop folder is being taken over or a person removed.
 
-    Raises `PblError` DB_NOT_FOUND where the visit is gone, DB_..., FILE_UNWRITABLE.
+    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., FILE_UNWRITABLE.
     """
     logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
     out = []
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             return None
         place(to.session_id)  # a visit that was removed is not made again
@@ -144,19 +130,21 @@ def register(
         for one, copy in arrived:
             if not one.is_log:
                 log = logs.pop(PurePosixPath(one.name).stem, None)
-                out.append(_take_in(visit, one.name, [copy, log] if log else [copy], by))
-    expected, next_step = "the video of the same name with it", "send both together"
-    out += [
-        Outcome(f"{stem}{copy.path.suffix}", "refused", error=_refused("a sensor log alone", expected, next_step, stem))
-        for stem, copy in logs.items()
-    ]
+                out.append(_register_copies(visit, one.name, [copy, log] if log else [copy], by))
+    alone = functools.partial(
+        _refused,
+        found="a sensor log alone",
+        expected="the video of the same name with it",
+        next_step="send both together",
+    )
+    out += [Outcome(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
     return out
 
 
-def _take_in(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
+def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
     try:
-        result: Registered = take_in(visit, name, copies, archive_dir())
+        result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
         if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
             raise

@@ -1,6 +1,6 @@
 """A worker's heartbeat: a thread writes every few seconds that it is alive, its current job, and its finished jobs.
 
-systemd and Kubernetes know whether a process is alive on their machine; this tells it to workers on other machines,
+systemd and Kubernetes know whether a process is alive on their machine; this reports it to workers on other machines,
 which free the reservations of dead ones (`recover`), and to `pbl status`.
 """
 

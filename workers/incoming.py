@@ -1,12 +1,12 @@
-"""Recordings that phones upload: taken over from the drop folder when they are whole.
+"""Import of complete uploads from the drop folder of phones.
 
-Layout: SUBJECT/SESSION/FILE under the place that `PBL_INCOMING` names. Beside a video may lie the phone's sensor log of
-the same name (.csv, .json, .zip; docs/phone_capture.md), which is taken with it. A file is taken when it was the same
-in two runs at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then
-removed from where it came: whatever breaks off in between, the bytes are in at least one place, and the next run goes
-on. A recording that cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
+Layout: SUBJECT/SESSION/FILE in the folder `PBL_INCOMING`. A video may have the phone's sensor log of the same name
+(.csv, .json, .zip; docs/phone_capture.md), which is imported with it. A file is complete if it was the same in two runs
+at least `SETTLED_S` apart. It is copied into the archive and checked there, registered, and only then removed from the
+drop folder: after an interruption the bytes are in at least one place, and the next run continues. A recording that
+cannot be registered is moved into the folder `_refused` of the archive, with the reason beside it.
 
-Uploads are taken in random order: whatever one of them does to the run, no other waits behind it for ever.
+Uploads are imported in random order, so that none waits forever behind one that breaks the run.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from schemas.subject_codes import check_subject
 
 #: Seconds in which a file must not have changed.
 SETTLED_S = 60.0
-#: What is a recording, by the ending; what is neither that nor a log is left alone and named.
+#: Endings of recordings; files that are neither recordings nor logs are ignored and named.
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
-#: After this time a run begins no further upload, and gives up one that is still being copied (s).
+#: Time after which a run begins no further upload, and that after which it gives up copying one (s).
 RUN_S, UPLOAD_S = 600.0, 600.0
-#: What reading a sensor log may take (s, bytes).
+#: Limits for reading a sensor log (s, bytes).
 LOG_S, LOG_BYTES = 60.0, 2**30
-#: What opening a recording may take (s, bytes).
+#: Limits for opening a recording (s, bytes).
 _OPEN_S, _OPEN_BYTES = 60.0, 2**31
 #: Space on the archive's disk that uploads do not fill (bytes).
 KEPT_FREE = 10**9
@@ -62,7 +62,7 @@ _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 
 
 @dataclasses.dataclass
-class Taken:
+class Imports:
     """The outcome of a run, by the names of the uploads."""
 
     registered: list[str] = dataclasses.field(default_factory=list)
@@ -82,21 +82,21 @@ class Copy:
     sha256: str
 
 
-def take_over(
+def import_uploads(
     url: str | None = None, archive: Path | None = None, settled_s: float = SETTLED_S, run_s: float = RUN_S
-) -> Taken | None:
-    """List the drop folder, and take what is whole. Safe to break off and to repeat.
+) -> Imports | None:
+    """Import the complete uploads of the drop folder. Safe to interrupt and to repeat.
 
-    Returns None where another process does it now.
+    Returns None if another process is importing.
 
-    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE. What
-    was not taken until then stays in the drop folder.
+    Raises `PblError` USAGE; FILE_MISSING: no drop folder; FILE_UNWRITABLE: no archive; DB_..., STORE_UNAVAILABLE.
+    Uploads that were not imported until then stay in the drop folder.
     """
     drop, archive = drop_folder(url or incoming_url()), archive or archive_dir()
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             return None
-        out = Taken()
+        out = Imports()
         try:
             remove_copies(archive)
             whole = _listed(drop, archive, settled_s, out)
@@ -108,13 +108,13 @@ def take_over(
             if time.monotonic() > end:
                 out.later = len(whole) - i
                 break
-            _take(drop, recording, logs, archive, out)
+            _import_upload(drop, recording, logs, archive, out)
     out.registered.sort()
     return out
 
 
 # ------------------------------------------------------------------------------------------------------------- listing
-def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) -> list[tuple[Upload, list[Upload]]]:
+def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Imports) -> list[tuple[Upload, list[Upload]]]:
     """Recordings that have not changed for `settled_s`, each with its logs."""
     seen, now = load_seen(archive), time.time()
     still: dict[str, list] = {}
@@ -151,7 +151,7 @@ def _listed(drop: Folder | Bucket, archive: Path, settled_s: float, out: Taken) 
 
 
 def _misplaced(upload: Upload) -> str:
-    """Return why an entry of the drop folder is not a recording in its place; "" where it is one, or a log."""
+    """Return why an entry of the drop folder is not a recording in its place; "" if it is one, or a log."""
     name = upload.name
     if any(part.startswith((".", "_")) for part in name.parts):
         return "a name that begins with . or _, as what is still being written has"
@@ -165,7 +165,7 @@ def _misplaced(upload: Upload) -> str:
 
 
 # -------------------------------------------------------------------------------------------------------------- taking
-def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive: Path, out: Taken) -> None:
+def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive: Path, out: Imports) -> None:
     """Copy, check, register, remove; what is refused is moved aside with its reason."""
     name, given, copies = str(recording.name), [recording, *logs], []
     try:
@@ -175,10 +175,10 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
                 copies.append(_copy(drop, upload, archive, end))
             subject, session, file = recording.name.parts
             check_subject(subject, "rename the folder and upload again", recording.name)
-            registered = take_in(VisitRecord(subject, session), file, copies, archive)
+            registered = register_copies(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
-        except Exception as error:  # whatever it is, one upload never stops the others
+        except Exception as error:  # one upload never stops the others
             coded = _named(name, error)
             if coded.code in _OURS:
                 raise
@@ -203,15 +203,8 @@ def _take(drop: Folder | Bucket, recording: Upload, logs: list[Upload], archive:
 
 
 def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> Copy:
-    """Copy into the archive under a new name, on disk when this returns.
-
-    Raises
-    ------
-    PblError
-        UPLOAD_REFUSED.
-    OSError, StillChanging
-        Nothing is left behind.
-    """
+    """Copy into the archive under a new name, on disk when this returns. Raises `PblError` UPLOAD_REFUSED; OSError and
+    StillChanging: nothing is left behind."""
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, upload.name.parts[0])
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
@@ -247,12 +240,20 @@ def has_room(folder: Path, n_bytes: int) -> bool:
     return shutil.disk_usage(folder).free >= n_bytes + KEPT_FREE
 
 
-def check_opens(path: Path, expected: str, next_step: str) -> None:
-    """Decode the first picture of a file in a process with limits.
+def check_room(n_bytes: int, next_step: str) -> None:
+    """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
+    if not has_room(archive_dir(), n_bytes):
+        raise PblError(
+            "FILE_UNWRITABLE",
+            found=f"no room for {n_bytes / 1e9:.1f} GB in the archive of the server",
+            expected=f"room for it beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
+            next_step=next_step,
+        )
 
-    Raises `PblError` VIDEO_...: what is wrong with it; VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the
-    limits.
-    """
+
+def check_opens(path: Path, expected: str, next_step: str) -> None:
+    """Decode the first picture of a file in a process with limits. Raises `PblError` VIDEO_...: what is wrong with it;
+    VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the limits."""
     try:
         limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
     except LimitExceeded as error:
@@ -261,7 +262,7 @@ def check_opens(path: Path, expected: str, next_step: str) -> None:
         ) from error
 
 
-def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
+def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
     """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
     them; return the outcome. `file`: the name that the recording came with.
 
@@ -299,13 +300,8 @@ def take_in(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path
 def _set_aside(
     drop: Folder | Bucket, given: Sequence[Upload], copies: Sequence[Copy], archive: Path, why: PblError
 ) -> None:
-    """Move what is refused into the archive's folder for it, the reason first. What was copied is moved as the copy.
-
-    Raises
-    ------
-    OSError
-        It cannot be moved: it stays in the drop folder.
-    """
+    """Move a refused upload into the archive's folder for it, the reason first. A copy is moved instead of the
+    original. Raises OSError if it cannot be moved: it stays in the drop folder."""
     name = given[0].name
     folder = folder_of(archive, REFUSED, name.parts[0])
     mark = copies[0].sha256 if copies else hashlib.sha256(os.fsencode(str(name))).hexdigest()
@@ -338,7 +334,7 @@ def _unwritable(archive: Path, error: OSError) -> PblError:
 
 
 def _named(name: str, error: Exception) -> PblError:
-    """The coded error about what was uploaded, by its name there and not by that of our copy."""
+    """Return the coded error about an upload, under its original name instead of that of our copy."""
     if isinstance(error, PblError):
         return error if error.code == "UPLOAD_REFUSED" else error.with_key(name)
     return PblError(

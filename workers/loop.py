@@ -1,4 +1,4 @@
-"""The working process: take jobs, compute, insert, queue what follows; wait when there is nothing to do."""
+"""The working process: take jobs, compute, insert, queue their followers; wait if there is nothing to do."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
                 for job, made in zip(batch, result.result(), strict=True):
                     left.remove(job)
                     ended.append(worker.one(job, made))
-            except BaseException:  # told to end at once, or the database does not answer
+            except BaseException:  # told to end immediately, or the database does not answer
                 device.shutdown(wait=False, cancel_futures=True)
                 for job in left:
                     worker.report(job, Outcome(job, run_job.LATER))
@@ -59,8 +59,8 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
 
 
 def _threads() -> int:
-    """How many batches are computed at a time: on a GPU two, so that one is packed and unpacked on the host while the
-    other is solved; a CPU does both itself."""
+    """Return how many batches are computed at a time: two on a GPU, so that one is packed and unpacked on the host
+    while the other is solved; a CPU does both itself."""
     import jax
 
     return 1 if jax.default_backend() == "cpu" else 2
@@ -76,13 +76,13 @@ log = logging.getLogger("pbl.worker")
 
 #: Pause after the first look that found nothing, and the longest; each look that finds nothing doubles it.
 IDLE_S = (0.5, 20.0)
-#: An idle worker looks at all tables when no worker has done so for as long.
+#: Time without a look at all tables by any worker after which an idle one looks (s).
 REFRESH_EVERY_S = 60.0
 #: Longest pause of the process for phones between two looks, and of one that ends when nothing is left.
 PHONE_S = 1.0
-#: The other processes leave a job of a phone's recording to that process for so long (s): longer than its pause.
+#: Time for which the other processes leave a job of a phone's recording to that process (s): longer than its pause.
 LEAVE_S = 3
-#: A lone process looks so often for long recordings, which it leaves to another one (s).
+#: Interval at which a lone process looks for long recordings, which it leaves to another one (s).
 LONG_EVERY_S = 10.0
 #: Conditions on a job: of a long recording, or not; of a phone's; of none, or one that had waited for `LEAVE_S`.
 _IS_LONG = f"priority IN ({','.join(map(str, registry.LONG.values()))})"
@@ -92,7 +92,7 @@ _IS_LEFT = f"(priority != {registry.FIRST} OR scheduled_time < CURRENT_TIMESTAMP
 
 
 def takes(short: bool, phones: bool, phone: bool, long: bool = False) -> str | None:
-    """Condition on the jobs that a process takes (`process.Options`): None where it takes all."""
+    """Return the condition on the jobs that a process takes (`process.Options`); None for all."""
     if phone or long:
         return _IS_FIRST if phone else _IS_LONG
     return " AND ".join(([_IS_SHORT] if short else []) + ([_IS_LEFT] if phones else [])) or None
@@ -145,7 +145,7 @@ class Worker:
                 self.heartbeat.doing(f"waits for the database: {error}")
                 event(log, logging.WARNING, "database away", error=str(error)[:200])
                 run_job.wait_for_database(self.stop, pause=not run_job.is_gone(error))
-                queue.let_go_all()  # what was reserved for later; a job in hand has waited for the database itself
+                queue.release_all()  # what was reserved for later; a job in hand has waited for the database itself
                 self._refreshed = -1e9
                 continue
             troubled = 0
@@ -159,7 +159,7 @@ class Worker:
                 quiet = 0 if self.siblings and queue.anything_reserved_here() else quiet + 1
                 if quiet > self.siblings:
                     return
-            self._let_go()
+            self._forget_recording()
             self.heartbeat.doing("waits for a recording of a phone" if self.phone else "idle")
             # Not all at the same moment: workers that were started together would go on asking together.
             self.stop.wait(idle * random.uniform(0.7, 1.3))  # noqa: S311
@@ -201,7 +201,7 @@ class Worker:
         return queue.claim(table, n, where)
 
     def _conditions(self) -> dict[Any, str | None]:
-        """The tables of which jobs may be taken, and the condition on their keys."""
+        """Return the tables whose jobs may be taken, with the condition on their keys."""
         if self.only is None:
             return dict.fromkeys(self.tables, self.takes)
         scope = self.only()
@@ -215,7 +215,7 @@ class Worker:
         try:
             while left and not self.stop.is_set():
                 ended.append(self.one(left.pop(0)))
-        finally:  # also where we are told to end at once
+        finally:  # also where we are told to end immediately
             for job in left:
                 queue.put_back(job)
         self.follow(ended)
@@ -234,7 +234,7 @@ class Worker:
         if job.table.__name__ == "VideoInfo":
             self._in_hand = int(job.key["video_id"])
         elif job.table.__name__ == "Keypoints":
-            self._let_go()
+            self._forget_recording()
         self.done += good
         self.failed += outcome.what == run_job.FAILED
         self.heartbeat.count(job.table.__name__, int(good), int(outcome.what == run_job.FAILED), outcome.seconds)
@@ -246,7 +246,7 @@ class Worker:
             self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
         return outcome
 
-    def _let_go(self) -> None:
+    def _forget_recording(self) -> None:
         self._in_hand = None
         release_frames()
 
@@ -256,8 +256,8 @@ class Worker:
         self.found.add(refresh.after(good, [o.job for o in outcomes if o.what == run_job.FAILED]))
 
     def _refresh(self) -> bool | None:
-        """Look at all tables if it is time. Whether something was found; None where another worker is at it, or at a
-        job of the recordings that are ours alone."""
+        """Look at all tables if it is time. Return whether something was found; None while another worker is looking,
+        or working on our recordings."""
         if self.only is not None:
             scope = self.only()
             found = refresh.refresh_scope(scope)
@@ -268,7 +268,7 @@ class Worker:
             return None if any(len(jobs) for jobs in held) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
-        tables_version.refuse_newer()  # migrated while this worker ran: it ends, and its successor does not start
+        tables_version.refuse_newer()  # after a migration meanwhile this worker ends, and its successor does not start
         self.heartbeat.doing("looks at all tables")
         found = refresh.refresh(self._everything)
         if found is None:

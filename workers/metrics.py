@@ -45,6 +45,19 @@ class Metrics:
         start_http_server(port, addr=host, registry=self.registry)
 
 
+class KeptReports(Metrics):
+    """Metrics that also keep every report with its time (`time.monotonic`), for benchmarks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reports: list[tuple[float, Claim, Outcome | None]] = []
+
+    def heard(self, job: Claim, outcome: Outcome | None) -> None:
+        """Keep and count a report."""
+        self.reports.append((time.monotonic(), job, outcome))
+        super().heard(job, outcome)
+
+
 class _Queues(Collector):
     """Job rows by table and status, as a thread last read them: a request never waits for the database."""
 

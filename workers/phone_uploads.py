@@ -1,15 +1,14 @@
-"""Recordings that phones send, from the first part to the row: the parts as files of the archive, checked and put
-together, taken in as an upload of the drop folder is, and computed before everything else.
+"""Recordings that phones send, from the first part to the row: the parts as files of the archive, checked and joined,
+taken in like an upload of the drop folder, and computed before everything else.
 
-Every part is a file of its own, which has its name only when it is whole and on disk. Whatever breaks off, the parts
-that are there count, and all of them stay until the recording is registered.
+Every part is a separate file, which gets its name only when it is complete and on disk. After an interruption the
+existing parts count, and all of them stay until the recording is registered.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-import secrets
 import shutil
 from pathlib import Path
 
@@ -19,10 +18,10 @@ from schemas.capture import UPLOADING
 from schemas.intake import VisitRecord, phone_recordings
 from schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
 from schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders
-from schemas.operations.folders import private_folder, sync_folders
+from schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import KEPT_FREE, Copy, check_opens, has_room, take_in
+from .incoming import Copy, check_opens, register_copies
 from .registry import FIRST
 
 
@@ -39,18 +38,6 @@ def missing(phone: Phone, sent: Sent) -> list[int]:
     return [n for n in range(sent.n_parts) if str(n) not in here]
 
 
-def check_room(sent: Sent) -> None:
-    """Raise `PblError` FILE_UNWRITABLE where a recording does not fit into the archive."""
-    # Twice: the parts stay until the whole is registered.
-    if not has_room(archive_dir(), 2 * (sent.video_bytes + sent.log_bytes)):
-        raise PblError(
-            "FILE_UNWRITABLE",
-            found="no room for the recording in the archive of the server",
-            expected=f"room for it twice, beside {KEPT_FREE / 1e9:.0f} GB that are kept free",
-            next_step="tell who runs the server; the recording stays on the phone until there is room",
-        )
-
-
 def check_part(sent: Sent, start: int, end: int, total: int) -> int:
     """Return the number of the part with the bytes from `start` to `end`, the last one included. Raises `PblError`
     UPLOAD_REFUSED for what is not a part of the recording."""
@@ -63,24 +50,12 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
 
 
 def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -> None:
-    """Write a part to the archive, on disk when this returns.
-
-    Raises
-    ------
-    PblError
-        UPLOAD_REFUSED where the bytes are not those that the phone sent.
-    OSError
-        It cannot be written.
-    """
+    """Write a part to the archive, on disk when this returns. Raises `PblError` UPLOAD_REFUSED if the bytes are not
+    those that the phone sent; OSError if it cannot be written."""
     if hashlib.sha256(body).hexdigest() != sha256:
         raise upload_refused(f"part {number} with another SHA-256 than was sent", "it is sent again")
     here = folder(phone, sent)
-    new = here / f".{secrets.token_hex(6)}"
-    with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as target:
-        target.write(body)
-        target.flush()
-        os.fsync(target.fileno())
-    new.replace(here / str(number))
+    write_text(here / str(number), body)
     sync_folders(here, here)
 
 
@@ -121,12 +96,12 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
 def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     """Register a recording that was put together, have it computed first, and remove its parts; return its video_id.
 
-    Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND where the
-    visit is gone; VIDEO_DUPLICATE where another visit has the recording; what is wrong with it.
+    Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND if the
+    visit is gone; VIDEO_DUPLICATE if another visit has the recording; what is wrong with it.
     """
     stated = {name: sent.about[name] for name in ("activity", "pace") if name in sent.about}
     visit = VisitRecord(phone.subject, phone.label, **stated)
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             raise PblError(
                 "DB_REFUSED",
@@ -136,14 +111,14 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
             )
         phone_recordings.recording(phone, sent.number)  # a visit that was removed is not made again
         if video.Video & {"video_sha256": copies[0].sha256} & f"session_id != {phone.session_id}":
-            # Without whose: the phone is told, and has the right to its own visit alone.
+            # Without the owner: the phone has the right to its own visit alone.
             raise PblError(
                 "VIDEO_DUPLICATE",
                 found="this recording is registered in another visit",
                 expected="a recording of this visit",
                 next_step="film again; who runs the server can find and move it (`pbl move`)",
             )
-        result = take_in(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
+        result = register_copies(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
     phone_recordings.received(sent.number, result.video_id)
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)

@@ -60,7 +60,7 @@ def populate(
     retry_errors: bool = False,
     visit: int | None = None,
 ) -> Run:
-    """Compute what is missing. One call is one worker; several may run at once. `schemas.activate()` comes before.
+    """Compute missing results. One call is one worker; several may run at once. `schemas.activate()` comes before.
 
     Raises `PblError` USAGE for an unknown table name.
 
@@ -74,7 +74,10 @@ def populate(
         session_id of the visit of which alone is computed, its usable recordings and current sets; jobs of it that
         other workers hold are waited for. None: everything.
     """
-    for name in ("datajoint", "pbl.worker"):  # they would print into the bar what the summary and `pbl status` say
+    for name in (
+        "datajoint",
+        "pbl.worker",
+    ):  # the summary and `pbl status` report the same
         logging.getLogger(name).setLevel(logging.CRITICAL)
     wanted = {table_named(n) for n in tables or ()}
     chosen = [t for t in computed_tables() if not tables or t in wanted]

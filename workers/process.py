@@ -25,13 +25,13 @@ from .run_job import Outcome
 
 #: Variable by which a process sees only some of the GPUs; batch systems set it for a job.
 VISIBLE = "CUDA_VISIBLE_DEVICES"
-#: After so long a driver that does not answer counts as none.
+#: Time after which a driver that does not answer counts as missing (s).
 QUERY_S = 30.0
 
 
 def given_gpus() -> tuple[str, ...]:
     """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
-    none where there is no NVIDIA driver."""
+    none if there is no NVIDIA driver."""
     listed = os.environ.get(VISIBLE)
     if listed is None:
         query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
@@ -73,7 +73,7 @@ class Options:
 
     @property
     def lone(self) -> bool:
-        """Whether long recordings get a process for as long as there are any, because one process serves detection."""
+        """True if long recordings get a temporary process, because a single process serves detection."""
         ends = self.once or self.max_jobs is not None
         return self.processes == 1 and not ends and registry.DETECTOR in registry.GROUPS[self.resource]
 
@@ -107,7 +107,7 @@ def work(options: Options, pipe: Connection) -> None:
     if options.phone:
         os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
     if options.processes > 1:
-        # Without this JAX reserves most of a GPU's memory for the first of several processes that share it.
+        # Otherwise JAX reserves most of a GPU's memory for the first of several processes that share it.
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     import schemas
 
@@ -145,7 +145,7 @@ def work(options: Options, pipe: Connection) -> None:
     def report(job: Claim | None, outcome: Outcome | None) -> None:
         try:
             pipe.send((job, outcome))
-        except OSError:  # the supervisor has ended: end, too
+        except OSError:  # the supervisor has ended: so does this process
             stop.set()
 
     with heartbeat.Heartbeat(options.resource) as beats:

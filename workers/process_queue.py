@@ -35,7 +35,7 @@ class Task:
 
     function: Callable[..., object]  # importable by name
     args: tuple[Any, ...]
-    broken: Callable[[str], PblError]  # error to report where the process died or exceeded a limit, from what happened
+    broken: Callable[[str], PblError]  # makes the error of a process that died or exceeded a limit
     file: str = ""  # name of the file that the function writes: its path is the first argument then
     open_files: contextlib.ExitStack = dataclasses.field(default_factory=contextlib.ExitStack)  # closed at the end
     seconds: float = math.inf  # limits of `limited`
@@ -67,7 +67,7 @@ class Work:
 
     @property
     def error(self) -> PblError | None:
-        """Why the task failed; None where it did not."""
+        """Error of a failed task, else None."""
         found = self._future.exception() if self.ended and not self._future.cancelled() else None
         return found if isinstance(found, PblError) else None
 
@@ -78,14 +78,10 @@ class Work:
 
 
 class ProcessQueue:
-    """Runs tasks one after the other, and keeps what the last ones produced until it is closed.
+    """Runs tasks one after the other, and keeps the files of the last ones until it is closed.
 
-    Parameters
-    ----------
-    most
-        Number of tasks that may wait.
-    kept
-        Number of works that are kept; the oldest that have ended are forgotten, with their files.
+    `most`: number of tasks that may wait. `kept`: number of works that are kept; the oldest that have ended are
+    forgotten, with their files.
     """
 
     def __init__(self, most: int, kept: int) -> None:
@@ -96,7 +92,7 @@ class ProcessQueue:
         self._lock, self._stop = threading.Lock(), threading.Event()
 
     def find(self, key: Hashable) -> Work | None:
-        """Return the work of a key; None where nothing was begun, or it is no longer kept."""
+        """Return the work of a key; None if nothing was begun, or it is no longer kept."""
         with self._lock:
             if key in self._works:
                 self._works.move_to_end(key)
@@ -109,10 +105,8 @@ class ProcessQueue:
                 del self._works[key]
 
     def begin(self, key: Hashable, task: Task) -> Work:
-        """Return the work of a key: the earlier one where it waits, runs or has a file, else a new one.
-
-        Raises `PblError` USAGE where too many wait.
-        """
+        """Return the work of a key: the earlier one where it waits, runs or has a file, else a new one. Raises
+        `PblError` USAGE where too many wait."""
         with self._lock:
             earlier = self._works.pop(key, None)
             if earlier is None or (earlier.ended and earlier.path is None):
@@ -151,10 +145,8 @@ class ProcessQueue:
 
 
 def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | None:
-    """Run a task to its end; return the file that it made, if it makes one.
-
-    Raises the error that the function raised, `task.broken`, or INTERNAL for any other exception.
-    """
+    """Run a task to its end; return the file that it made, if it makes one. Raises the error that the function raised,
+    `task.broken`, or INTERNAL for any other exception."""
     folder = root / secrets.token_hex(8)
     folder.mkdir()
     part = folder / f"part-{task.file}"
@@ -179,7 +171,7 @@ def _run(task: Task, done: Any, root: Path, stop: threading.Event) -> Path | Non
 
 
 def _reporting(done: Any, function: Callable[..., object], args: tuple[Any, ...]) -> None:
-    """Run in the process: call the function; what `progress.track` counts goes into `done`."""
+    """Call the function, in the process; `done` gets the fraction that `progress.track` counts."""
 
     def tell(n: int, total: int | None) -> None:
         done.value = n / total if total else 0.0

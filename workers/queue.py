@@ -1,8 +1,8 @@
-"""The queue of a table: DataJoint's own job rows, filled in one statement, reserved, put back, fenced.
+"""The queue of a table: DataJoint's job rows, filled in one statement, reserved, put back, fenced.
 
-A job row is `pending`, `reserved` or `error`; a finished one is deleted, because the result row says that it is done.
-What a reservation needs to be told from a dead one: host, process and connection (DataJoint writes them), and the
-heartbeat of that process (`workers.heartbeat`).
+A job row is `pending`, `reserved` or `error`; a finished one is deleted, because the result row marks it as done. Host,
+process and connection (written by DataJoint) and the heartbeat of that process (`workers.heartbeat`) distinguish a live
+reservation from a dead one.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from schemas.transactions import repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
 
-#: Candidates looked at for each job that is wanted: others look at the same ones.
+#: Candidates that are read for each job: other workers read the same ones.
 _SPREAD = 4
-#: The longest that a job which was put back waits (s).
+#: Longest wait of a job that was put back (s).
 LONGEST_WAIT_S = 60.0
 #: Jobs that this process holds: table and hash of the key.
 _held: set[tuple[str, str]] = set()
@@ -36,7 +36,7 @@ _held: set[tuple[str, str]] = set()
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A reserved job. The reservation is its holder's as long as the row says what is written here."""
+    """A reserved job. The reservation is valid while its row has these values."""
 
     table: Any
     key: dict[str, Any]
@@ -61,7 +61,7 @@ def key_hash(key: Mapping[str, Any]) -> str:
 
 
 def is_held(table: Any, key: Mapping[str, Any]) -> bool:
-    """Whether this process has reserved the job and not ended it."""
+    """Return whether this process has reserved the job and not ended it."""
     return (table.__name__, key_hash(key)) in _held
 
 
@@ -71,7 +71,7 @@ def fill(
 ) -> int:
     """Queue every key that can be computed and has neither a result nor a job, in one statement; returns how many.
 
-    `keys`: only what belongs to these (keys of a table above); `where`: only what a condition on the key holds for.
+    `keys`: restriction to these (keys of a table above); `where`: a condition on the key.
     `priority`: that of a short recording; jobs of a long one get `registry.LONG` instead.
     DataJoint's own refresh inserts row by row.
     """
@@ -90,11 +90,11 @@ def fill(
     # IGNORE: another process may queue the same key between the two halves of the statement. Nothing in it comes from
     # outside: names are DataJoint's own, quoted by its adapter.
     statement = f"INSERT IGNORE INTO {jobs.full_table_name} ({names}) SELECT {values} FROM ({todo.make_sql()}) AS todo"  # noqa: S608
-    return _alone(table.connection, lambda: int(table.connection.query(statement).rowcount))
+    return _committed(table.connection, lambda: int(table.connection.query(statement).rowcount))
 
 
 def _is_long(keys: Any) -> str:
-    """Condition on keys: that of a long recording, or of a set with one."""
+    """Return the condition on keys of a long recording, or of a set with one."""
     long = video.VideoInfo.proj("n_frames") & f"n_frames > {LONG_FRAMES}"
     name = "video_id"
     if name not in keys.heading.primary_key:
@@ -103,7 +103,7 @@ def _is_long(keys: Any) -> str:
 
 
 @repeated
-def _alone(connection: Any, statement: Callable[[], int]) -> int:
+def _committed(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
     connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
@@ -112,19 +112,18 @@ def _alone(connection: Any, statement: Callable[[], int]) -> int:
 
 
 def sweep(table: Any, which: str = "status != 'reserved'") -> int:
-    """Delete jobs that are not needed any more: done by another route, or no longer asked for; returns how many."""
+    """Delete jobs that are done by another route or no longer requested; return how many."""
     n = 0
     for needless in (table.proj(), dj.Not(keys_of(table).proj())):
         if jobs := jobs_of(table) & which:  # most often there are none
             gone = jobs.restrict(needless, semantic_check=False)
-            n += int(_alone(table.connection, functools.partial(gone.delete_quick, get_count=True)))
+            n += int(_committed(table.connection, functools.partial(gone.delete_quick, get_count=True)))
     return n
 
 
 # --------------------------------------------------------------------------------------------------- reserving, ending
 def most_urgent(table: Any, where: str | None = None) -> int | None:
-    """Priority of the first job that can be taken now; None where there is none. `where`: of those for whose key a
-    condition holds."""
+    """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
     jobs = jobs_of(table)
     row = jobs.connection.query(
         f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
@@ -154,15 +153,15 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
 
 
 def anything_reserved_here() -> bool:
-    """Whether a process of this machine has a job in hand."""
+    """Return whether a process of this machine works on a job."""
     here = {"host": platform.node()}
     return any(len(jobs_of(table).reserved & here) for table in computed_tables())
 
 
 def finish(job: Claim) -> None:
-    """The job is done: its row goes, if it is still ours."""
+    """Delete the row of a finished job, if it is still ours."""
     _mine(job).delete_quick()
-    let_go(job)
+    release(job)
 
 
 def fail(job: Claim, message: str, stack: str = "") -> bool:
@@ -170,25 +169,25 @@ def fail(job: Claim, message: str, stack: str = "") -> bool:
     ours = len(_mine(job)) == 1
     if ours:
         jobs_of(job.table).error(job.key, error_message=message, error_stack=stack or None)
-    let_go(job)
+    release(job)
     return ours
 
 
 def put_back(job: Claim, reason: str = "", delay_s: float = 0.0, **counts: int) -> bool:
-    """Make the job pending again, taken earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
-    columns of `schemas.jobs.COUNTS`. Whether it was ours."""
+    """Make the job pending again, earliest after `delay_s`; `reason` stays in its row, and `counts` are values of
+    columns of `schemas.jobs.COUNTS`. Return whether it was ours."""
     ours = reset(_mine(job), reason, delay_s, **counts) == 1
-    let_go(job)
+    release(job)
     return ours
 
 
-def let_go(job: Claim) -> None:
+def release(job: Claim) -> None:
     """Forget the job: another worker has it."""
     _held.discard((job.table.__name__, job.hash))
 
 
-def let_go_all() -> None:
-    """Forget every job: nothing is in hand any more. What is still reserved is freed like a dead process'."""
+def release_all() -> None:
+    """Forget all jobs. Remaining reservations are freed like those of a dead process."""
     _held.clear()
 
 
@@ -208,7 +207,7 @@ def reset_to_new(jobs: Any) -> int:
     return reset(jobs, "", 0.0, **dict.fromkeys(COUNTS, 0))
 
 
-def wake(table: Any) -> int:
+def advance_delayed(table: Any) -> int:
     """Make jobs ready that would wait for longer than any is put back for: the server's clock was set back."""
     jobs = jobs_of(table)
     cursor = jobs.connection.query(
@@ -225,10 +224,10 @@ def _mine(job: Claim) -> Any:
 
 
 class ReservationLost(Exception):
-    """Another worker holds the job by now: its result must not be written twice."""
+    """Raised if another worker holds the job by now: its result must not be written twice."""
 
 
-def hold(job: Claim) -> float:
+def lock_reservation(job: Claim) -> float:
     """Inside the transaction that inserts: go on only while the reservation is ours, and let no other worker take it;
     returns when the job was queued (s since 1970).
 
@@ -248,7 +247,7 @@ def hold(job: Claim) -> float:
 
 
 def errors_of(table: Any, code: str | None = None, keys: Iterable[Mapping[str, Any]] | None = None) -> Any:
-    """The error rows of a table, of one code or of some keys if asked."""
+    """Return the error rows of a table, optionally of one code or of some keys."""
     rows = jobs_of(table).errors
     if code is not None:
         if not code.replace("_", "").isalnum():

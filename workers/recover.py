@@ -16,12 +16,12 @@ from schemas.jobs import jobs_of
 from . import queue
 from .queue import Claim
 
-#: A worker that has not been seen for so long is dead. Its heart beats every `heartbeat.PERIOD_S`; this also outlasts
-#: a database that is away for a minute and a process that compiles.
+#: Time without a heartbeat after which a worker is dead (s). It exceeds `heartbeat.PERIOD_S`, a minute without the
+#: database, and a process that compiles.
 DEAD_AFTER_S = 180.0
 
-#: After so many crashes of its process a job becomes an error row; and after so many deaths of the whole worker that
-#: held it, which may have had another cause.
+#: Crashes of its process, and deaths of the whole worker that held it (which may have another cause), after which a job
+#: becomes an error row.
 CRASHES, DEATHS = 3, 10
 
 #: Exceptions that say nothing about the job: a signal, a lost server. DataJoint's own populate makes error rows of them
@@ -38,7 +38,7 @@ def free_dead(table: Any) -> int:
     was seen for `DEAD_AFTER_S`; one that never had a heartbeat (a populate by hand) when its reservation is older than
     the time limit of its table. A job whose processes died `DEATHS` times becomes an error row.
     """
-    jobs, n = jobs_of(table), queue.wake(table)
+    jobs, n = jobs_of(table), queue.advance_delayed(table)
     for row in jobs.reserved.to_dicts():
         if not _alive(row, table):
             key = {k: row[k] for k in jobs.primary_key}
@@ -52,10 +52,8 @@ def free_dead(table: Any) -> int:
 
 
 def crashed(job: Claim, reason: str) -> bool:
-    """Count a crash of the job's process: put it back, or make an error row of it the third time (`CRASHES`).
-
-    Returns whether the job was still that process's.
-    """
+    """Count a crash of the job's process: put it back, or make an error row of it the third time (`CRASHES`). Returns
+    whether the job was still that process's."""
     n = job.attempts + 1
     if n < CRASHES:
         return queue.put_back(job, f"its process died ({reason})", 1.0, attempts=n)
@@ -103,7 +101,7 @@ def _alive(row: dict[str, Any], table: Any) -> bool:
 
 
 def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.datetime) -> bool:
-    """Whether a process of this host lives; a number that a younger process carries by now counts as dead."""
+    """Return whether a process of this host lives; a number that a younger process has by now counts as dead."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -118,7 +116,7 @@ def _alive_here(pid: int, reserved: datetime.datetime | None, now: datetime.date
 
 
 def _age_of_process(pid: int) -> float | None:
-    """Seconds since a process started; None where the system does not tell (no /proc)."""
+    """Return the seconds since a process started; None without /proc."""
     try:
         ticks = int(Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19])
         uptime = float(Path("/proc/uptime").read_text(encoding="utf-8").split()[0])

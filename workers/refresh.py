@@ -9,7 +9,7 @@ from typing import Any
 
 from schemas import chain, fit, review, tracking, video, worker
 from schemas.reading.visit_progress import Scope, of_visit
-from schemas.worker import alone
+from schemas.worker import installation_lock
 
 from . import queue, recover
 from .queue import Claim
@@ -78,31 +78,33 @@ def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
 
 
 def refresh(everything: bool | None = None) -> Refreshed | None:
-    """Look for what can be computed: free dead reservations, drop what a decision made outdated, queue what is missing.
+    """Look for computable keys: free dead reservations, drop results that a decision made outdated, queue missing ones.
 
-    What workers finish is queued at once (`after`), so a look is for what came from outside: new recordings, choices,
-    methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the recordings
-    that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
+    Followers of finished jobs are queued immediately (`after`), so a look is for changes from outside: new recordings,
+    choices, methods, deleted rows. Comparing whole tables takes long with 300,000 videos, so most looks are at the
+    recordings that were registered or decided about in the last `RECENT_DAYS`, and one an hour at all.
 
-    Returns None where another process is at it.
+    Returns None while another process is looking.
 
-    Parameters
-    ----------
-    everything
-        Look at all rows; None where the last such look is an hour ago, or where there are few videos.
+    `everything`: look at all rows; None if the last such look is an hour ago, or where there are few videos.
     """
     server = video.Video.connection
-    with alone("refresh", server) as had:
+    with installation_lock("refresh", server) as had:
         if not had:
             return None
         if everything is None:
-            everything = _few(server) or _age_of_full_look() > ALL_EVERY_S
+            some = server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()  # noqa: S608
+            everything = len(some) < FEW or _age_of_full_look() > ALL_EVERY_S
         lately = None if everything else recent()
         if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
             lately = None
-        out = _look(lately)
+        out = _queue_missing(lately)
         if lately is None:
-            _note_full_look()
+            server.query(
+                f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
+                " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
+                args=(ALL,),
+            )
         return out
 
 
@@ -118,13 +120,13 @@ def recent() -> Scope:
 
 
 def refresh_scope(scope: Scope) -> Refreshed:
-    """`refresh` for some recordings alone, beside whoever looks at all: what of them can be computed is queued, what
-    nobody asks for any more is taken out of the queues."""
-    return _look(scope, own=True)
+    """Refresh some recordings alone, also while another process looks at all: queue what can be computed of them, and
+    remove obsolete jobs of them."""
+    return _queue_missing(scope, own=True)
 
 
 def queue_visit(session_id: int) -> None:
-    """Queue what a decision made computable of a visit, so that pages and workers see it at once."""
+    """Queue what a decision made computable of a visit, so that pages and workers see it immediately."""
     refresh_scope(of_visit(session_id))
 
 
@@ -133,9 +135,9 @@ def queue_visit_of(video_id: int) -> None:
     queue_visit(int((video.Video & {"video_id": video_id}).fetch1("session_id")))
 
 
-def _look(scope: Scope | None, own: bool = False) -> Refreshed:
-    """Fill the queues with what of a scope (None: of all) can be computed. `own`: other recordings are left as they
-    are; else choices that a decision made outdated are dropped, and all queues are swept."""
+def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:
+    """Queue what can be computed of a scope (None: of all). `own`: other recordings stay untouched; otherwise outdated
+    choices are dropped, and all queues are swept."""
     from schemas.tracking import drop_outdated_choices
 
     out, tables = Refreshed(), chain.computed_tables()
@@ -152,27 +154,15 @@ def _look(scope: Scope | None, own: bool = False) -> Refreshed:
             out.swept += queue.sweep(table, *([f"status != 'reserved' AND {where}"] if own else []))
             out.queued += Counter({table.__name__: queue.fill(table, where=where)})  # without zeros
         elif not own:
-            out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go at once
+            out.swept += queue.sweep(table, "status = 'error'")  # few: those of a deleted row go immediately
     return out
 
 
-def _few(server: Any) -> bool:
-    return len(server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()) < FEW  # noqa: S608
-
-
 def _age_of_full_look() -> float:
-    """Seconds since the last look at all rows; infinite where there was none."""
+    """Seconds since the last look at all rows; infinite if there was none."""
     table = worker.Look.full_table_name
     row = video.Video.connection.query(
         f"SELECT TIMESTAMPDIFF(SECOND, look_time, CURRENT_TIMESTAMP(3)) FROM {table} WHERE look=%s",  # noqa: S608
         args=(ALL,),
     ).fetchone()
-    return float("inf") if row is None or row[0] < 0 else float(row[0])  # in the future: the clock was set back
-
-
-def _note_full_look() -> None:
-    video.Video.connection.query(
-        f"INSERT INTO {worker.Look.full_table_name} (look, look_time) VALUES (%s, CURRENT_TIMESTAMP(3))"  # noqa: S608
-        " ON DUPLICATE KEY UPDATE look_time = CURRENT_TIMESTAMP(3)",
-        args=(ALL,),
-    )
+    return float("inf") if row is None or row[0] < 0 else float(row[0])  # negative: the clock was set back

@@ -10,16 +10,10 @@ from schemas import computed_tables
 
 #: Resource classes: reading video, neural detectors on video, the session fit, and everything that takes milliseconds.
 DECODE, DETECTOR, FIT, LIGHT = "decode", "detector", "fit", "light"
-#: Names for what a machine is asked to serve.
-GROUPS: dict[str, tuple[str, ...]] = {
-    "all": (DECODE, DETECTOR, FIT, LIGHT),
-    "cpu": (DECODE, DETECTOR, LIGHT),
-    "gpu": (FIT,),
-    DECODE: (DECODE,),
-    DETECTOR: (DETECTOR,),
-    FIT: (FIT,),
-    LIGHT: (LIGHT,),
-}
+#: Groups of resource classes that a machine can serve.
+CLASSES = (DECODE, DETECTOR, FIT, LIGHT)
+GROUPS: dict[str, tuple[str, ...]] = {"all": CLASSES, "cpu": (DECODE, DETECTOR, LIGHT), "gpu": (FIT,)}
+GROUPS |= {name: (name,) for name in CLASSES}
 
 #: Priority of a recording of a phone (the person is still there), of new work and of what is computed again: the lower
 #: number is taken first.

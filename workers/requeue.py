@@ -1,4 +1,4 @@
-"""Computing again: error rows on request, and results of an older method or code, behind all new work."""
+"""Repeated computations: error rows on request, and results of an older method or code, behind all new work."""
 
 from __future__ import annotations
 
@@ -34,10 +34,7 @@ def retry(
     key: Mapping[str, Any] | None = None,
 ) -> dict[str, int]:
     """Make error rows pending again, of one code, one table, one video, one key of that table if asked; table -> how
-    many.
-
-    Raises `PblError` USAGE for an unknown table or code.
-    """
+    many. Raises `PblError` USAGE for an unknown table or code."""
     tables = [table_named(table)] if table else computed_tables()
     out = {}
     for one in tables:
@@ -63,9 +60,9 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
 # ---------------------------------------------------------------------------------------------------------- reprocess
 @dataclasses.dataclass(frozen=True)
 class Reprocess:
-    """What is to be done again. `add`: selections of a method, which is fitted by `fit_method` where it is one of the
-    keypoints; `outdated`: keys whose results are deleted; `unasked`: number of those that are not computed again now,
-    because the recording is marked as not usable, or another selection took their place."""
+    """Plan of repeated computations. `add`: selections of a method, which is fitted by `fit_method` where it is one of
+    the keypoints; `outdated`: keys whose results are deleted; `unasked`: number of those that are not computed again
+    now, because the recording is marked as not usable, or another selection took their place."""
 
     table: str
     add: list[dict[str, Any]]
@@ -107,11 +104,11 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     chosen = resolve_method(methods, method)
     recorded = video.Video & (True if since is None else f"video_created >= '{since:%Y-%m-%d}'")
     rows = selection & recorded
-    if prefix == "kinetics":  # also visits that were registered before there were forces to plan
+    if prefix == "kinetics":  # also visits that were registered before forces could be planned
         rows = dj.U("session_id") & (gait.GaitPlan & recorded)
     others = [k for k in rows.primary_key if k != column]
     have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
-    # The choice of the subject goes with the tracking: that of this version, not that of the older row.
+    # The choice of the subject follows the tracking: that of this version, not of the older row.
     beside = {"subject_method": resolve_ingest(Methods())["subject_method"]} if prefix == "tracking" else {}
     add: dict[tuple, dict[str, Any]] = {}
     for row in rows.to_dicts():
@@ -127,10 +124,8 @@ def plan_again(
     since: datetime.datetime | None = None,
     before: datetime.datetime | None = None,
 ) -> Reprocess:
-    """Which results of a table would be deleted and computed again: of a method, computed since or before a time.
-
-    Raises `PblError` USAGE for an unknown table.
-    """
+    """Return the results of a table that would be deleted and computed again: of a method, computed since or before a
+    time. Raises `PblError` USAGE for an unknown table."""
     one = table_named(table)
     rows = one()
     prefix = next(n.removesuffix("_computed") for n in one.heading.names if n.endswith("_computed"))
@@ -164,7 +159,7 @@ def _named(columns: Sequence[str], name: str) -> list[tuple[str, str]]:
 
 
 def carry_out(plan: Reprocess) -> Iterator[int]:
-    """Do what was planned, in small transactions, and queue it behind new work; yields how many are done so far."""
+    """Carry out a plan in small transactions, queued behind new work; yield how many are done so far."""
     one = table_named(plan.table)
     if plan.add:
         _, selection, _ = _SELECTIONS[plan.table]
@@ -196,7 +191,7 @@ def parse_time(text: str | None) -> datetime.datetime | None:
 
 
 def summary(plan: Reprocess) -> Sequence[str]:
-    """Return what a plan would do, in words."""
+    """Return the effects of a plan in words."""
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")

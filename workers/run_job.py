@@ -1,4 +1,4 @@
-"""One reserved job through the three parts of its make: computed once, inserted once, whatever happens in between."""
+"""Execution of one reserved job: computed once and inserted once, despite interruptions."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from . import queue
 from .queue import Claim, ReservationLost
 
 #: Outcomes of a job.
-DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "somebody else has it", "failed", "later"
-#: Its key is gone: a row above was deleted, or another selection took its place. Its job is deleted, not tried.
+DONE, ALREADY, LOST, FAILED, LATER = "done", "already there", "another worker has it", "failed", "later"
+#: The key of the job is gone: a row above was deleted, or another selection replaced it. The job is deleted.
 VANISHED = "no longer asked for"
 
 #: Exceptions of the driver and DataJoint about the database: where it is away, full or read-only the computed result is
-#: kept and written later; at most `REPEATS` times the same statement is tried again at once.
+#: kept and written later; at most `REPEATS` times the same statement is tried again immediately.
 DATABASE_ERRORS = (
     LostConnectionError,
     pymysql.err.OperationalError,
@@ -40,7 +40,7 @@ DATABASE_ERRORS = (
 REPEATS = 10
 #: Attempts of a job whose inputs are gone or changed, and how long it waits after each but the last (s).
 ATTEMPTS, RETRY_S = 3, (1.0, 30.0)
-#: Errors of the file system that say nothing about the job: store full, read-only, away.
+#: Errors of the file system that are unrelated to the job: store full, read-only, away.
 STORE_GONE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EACCES)
 #: How long a job waits after such an error (s).
 STORE_WAIT_S = queue.LONGEST_WAIT_S
@@ -61,13 +61,13 @@ class Outcome:
 
 @dataclasses.dataclass
 class Computed:
-    """A result that was computed before its insert, and what it was computed from."""
+    """A result that was computed before its insert, with its inputs."""
 
     fetched: tuple
     result: tuple
 
     def of(self, fetched: tuple) -> bool:
-        """Whether these inputs are the same."""
+        """Return whether these inputs are the same."""
         try:
             if bool(fetched == self.fetched):
                 return True
@@ -88,11 +88,11 @@ def run(
     `computed`: a result from a batch; it is used if the inputs are still those it was computed from. `waiting`: called
     again and again while the job waits for the database.
 
-    A result is inserted only while the reservation is ours (`queue.hold`), so that a job which two processes were given
-    leaves one row. Where the database goes away after the computation, or its disk is full, the result is kept and
-    inserted when it is back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job back for
-    `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of these
-    make an error row.
+    A result is inserted only while the reservation is ours (`queue.lock_reservation`), so that a job which two
+    processes were given leaves one row. Where the database goes away after the computation, or its disk is full, the
+    result is kept and inserted when it is back, for up to `DATABASE_WAIT_S`. A store that is full or away puts the job
+    back for `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of
+    these make an error row.
 
     KeyboardInterrupt and SystemExit put the job back and go on up.
     """
@@ -111,7 +111,7 @@ def run(
                 kept = repeated * DATABASE_PAUSE_S < DATABASE_WAIT_S
                 if kept and wait_for_database(stop, waiting, pause=not is_gone(error)):
                     continue
-                queue.let_go(job)  # its reservation is that of a dead process, and is freed as such
+                queue.release(job)  # its reservation is that of a dead process, and is freed as such
                 outcome = _outcome(job, LATER, error)
             elif number_of(error) in REPEAT and repeated < REPEATS:
                 continue
@@ -129,7 +129,7 @@ class _Attempt:
     computed: Computed | None = None
 
     def make(self) -> str:
-        """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any more); raises what goes wrong."""
+        """DONE, ALREADY (the row is there) or VANISHED (it is not asked for any longer); raises what goes wrong."""
         table, key = self.job.table(), self.job.key
         if key in table:
             return ALREADY
@@ -139,7 +139,7 @@ class _Attempt:
         if self.computed is None or not self.computed.of(fetched):
             self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
         with table.connection.transaction:
-            queued_s = queue.hold(self.job)
+            queued_s = queue.lock_reservation(self.job)
             if not self.computed.of(table.make_fetch(dict(key))):
                 raise InputChanged("other rows than before the computation", self.job)
             remove_left_over(table, key, queued_s)
@@ -154,7 +154,7 @@ class _Attempt:
 
 
 def _is_wanted(job: Claim) -> bool:
-    """Whether the key can still be computed: its rows above are there, and it is still asked for."""
+    """Return whether the key can still be computed: its rows above exist, and it is still requested."""
     return bool(keys_of(job.table) & job.key)
 
 
@@ -166,7 +166,7 @@ def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
 def _settle(job: Claim, error: Exception) -> Outcome:
     """End the reservation of a job that failed, by what kind of error it was."""
     if isinstance(error, ReservationLost):
-        queue.let_go(job)
+        queue.release(job)
         return Outcome(job, LOST)
     if isinstance(error, DuplicateError) and job.key in job.table():
         queue.finish(job)
@@ -193,7 +193,7 @@ def _settle(job: Claim, error: Exception) -> Outcome:
 
 
 def cause_outside(error: BaseException) -> str | None:
-    """Return what the file system or the database said where the store or the server is at fault, not the job."""
+    """Return the message of the file system or the database if the store or the server is at fault, not the job."""
     if number_of(error) in REPEAT:
         return f"DATABASE: {type(error).__name__}: {error}"
     if isinstance(error, PblError) and error.code == "STORE_FULL":  # `schemas.origin.computes` gave it its code
@@ -207,13 +207,13 @@ def cause_outside(error: BaseException) -> str | None:
 
 
 def number_of(error: BaseException) -> int:
-    """The server's number of an error, 0 where there is none."""
+    """The server's number of an error, 0 if there is none."""
     first = error.args[0] if isinstance(error, DATABASE_ERRORS) and error.args else 0
     return first if isinstance(first, int) else 0
 
 
 def is_gone(error: BaseException) -> bool:
-    """Whether an error says that the database cannot be reached."""
+    """Return whether an error means that the database cannot be reached."""
     return isinstance(error, LostConnectionError) or (isinstance(error, DATABASE_ERRORS) and number_of(error) in AWAY)
 
 
@@ -240,8 +240,7 @@ def wait_for_database(
 
 
 def fetch_batch(jobs: Sequence[Claim]) -> list[tuple | None]:
-    """The inputs of several jobs of one table; None where they cannot be fetched (what is wrong is said when the job
-    runs alone)."""
+    """Return the inputs of several jobs of one table; None if they cannot be fetched (the job alone reports why)."""
     table, out = jobs[0].table(), []
     for job in jobs:
         try:
@@ -256,7 +255,8 @@ def fetch_batch(jobs: Sequence[Claim]) -> list[tuple | None]:
 def compute_batch(jobs: Sequence[Claim], fetched: Sequence[tuple | None]) -> list[Computed | None]:
     """Compute several jobs together (`make_computes` of their table); touches no database.
 
-    A job without inputs, or of a batch that fails, gives None: it is then run alone, and its error is its own.
+    The result is None for a job without inputs or of a batch that fails: it is then run alone and reports its own
+    error.
     """
     out: list[Computed | None] = [None] * len(jobs)
     good = [i for i, f in enumerate(fetched) if f is not None]

@@ -20,18 +20,12 @@ CADENCE_PER_MIN = 3.0
 
 
 class SelfTestFailed(Exception):
-    """This machine computes something else than it should, or cannot reach what it needs."""
+    """Raised if this machine computes wrong results, or cannot reach what it needs."""
 
 
 def check(tables: Sequence[Any]) -> None:
     """Write and read the store, and do known jobs of the resource classes that are served: real ones then find the
-    networks loaded and the programs of that size compiled.
-
-    Raises
-    ------
-    SelfTestFailed
-        With what was expected and found.
-    """
+    networks loaded and the programs of that size compiled. Raises SelfTestFailed with the expected and found values."""
     served = {registry.stage_of(t).resource for t in tables}
     _store()
     if registry.FIT in served:

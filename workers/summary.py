@@ -1,4 +1,4 @@
-"""The nightly summary: what was done, what failed, who worked, how full the disks are; as text and as a page."""
+"""Nightly summary: finished and failed work, workers, free disk space; as text and as a page."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ def rows(found: Summary) -> list[tuple[str, str]]:
 
 
 def as_text(found: Summary) -> str:
-    """For a terminal or a mail."""
+    """Return the summary for a terminal or a mail."""
     width = max(len(name) for name, _ in rows(found))
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows(found)) + "\n"
 
 
 def as_html(found: Summary) -> str:
-    """One page without anything from elsewhere."""
+    """Return the summary as one page without external resources."""
     lines = "".join(f"<tr><th>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows(found))
     style = (
         "body{font-family:system-ui,sans-serif;margin:2rem;color:#1a1a1a}table{border-collapse:collapse}"
@@ -108,7 +108,7 @@ def as_html(found: Summary) -> str:
 
 
 def write(found: Summary, folder: Path) -> list[Path]:
-    """`summary-DATE.txt` and `.html`."""
+    """Write `summary-DATE.txt` and `.html`."""
     folder.mkdir(parents=True, exist_ok=True)
     out = []
     for ending, text in (("txt", as_text(found)), ("html", as_html(found))):

@@ -1,7 +1,7 @@
 """`pbl worker`: a supervisor and its working processes.
 
 The working processes compute (`workers.loop`) and report over a pipe which jobs they work on. The supervisor opens no
-video and loads no numerical library, so it survives whatever a job does to its process: a process that dies is
+video and loads no numerical library, so it survives a job that crashes its process: a process that dies is
 replaced, and the job that killed it is put back, or becomes an error row when it has done so too often; a job beyond
 its time limit is ended with its process.
 
@@ -39,7 +39,7 @@ log = logging.getLogger("pbl.worker")
 
 #: Pause before a process that died is replaced (s): doubled up to the longest while processes keep dying.
 RESTART_S = (0.5, 60.0)
-#: After a process that lived for so long the pause begins anew (s).
+#: Lifetime of a process after which the pause begins again from the shortest (s).
 HEALTHY_S = 60.0
 #: After so many processes in a row that died earlier and without a job, the supervisor ends with an error.
 HOPELESS = 5
@@ -129,7 +129,7 @@ class Supervisor:
         return _Child(process, here, time.monotonic(), number=number)
 
     def _serve_long(self) -> None:
-        """Start the process for long recordings that a lone process asked for, where there is none."""
+        """Start the process for long recordings that a lone process asked for, if there is none."""
         number, asked = self.options.processes + 1, self._long_waits and self.options.lone and not self._stopping
         if asked and all(c.number != number for c in self._children):
             self._children.append(self._launch(number))
@@ -219,7 +219,7 @@ class Supervisor:
         self._settle()
 
     def _settle(self) -> None:
-        """Do what is unsettled; what the database does not take at the moment is done later, or left to `recover`."""
+        """Settle jobs of dead processes; while the database is away this is retried, or left to `recover`."""
         while self._unsettled and time.monotonic() >= self._settle_at:
             try:
                 connection.connect()

@@ -1,4 +1,4 @@
-"""What limits the accuracy of the fit: one factor at a time against the benchmark's default, on synthetic walks.
+"""Limits of the accuracy of the fit: one factor at a time against the benchmark's default, on synthetic walks.
 
     python -m research.benchmarks.ablation
     python -m research.benchmarks.ablation --seeds 4 --duration-s 6 --only camera --only "2D weight"
@@ -9,7 +9,7 @@ rate), so rows are compared person by person. Errors are of the first trial of a
 costs most; `+-` is the standard error of the change over people.
 
 Columns: `all` and `main`: mean over joints of the median absolute error over frames, as in docs/benchmarks.md;
-`bias`: mean over joints of the size of the mean error of a trial; `sd`: of what is left without it; `bias share`: of
+`bias`: mean over joints of the size of the mean error of a trial; `sd`: of the remainder; `bias share`: of
 the mean square error; `RTE`: mean distance of the pelvis to its true path after rotation about the vertical and shift;
 `in 90 %`: share of the samples within 1.645 standard deviations of the fit. docs/ablation.md says what was found.
 """

@@ -1,4 +1,4 @@
-"""What the ablation changes, one factor at a time, and the walks it looks at.
+"""Factors of the ablation, changed one at a time, and its walks.
 
 A `Setup` says how a session is observed and fitted; `Setup()` is the benchmark's default (docs/benchmarks.md). A
 `Factor` is a setup that differs from it in one thing.
@@ -44,7 +44,7 @@ LEFT_SCALES, RIGHT_SCALES = (
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """How a session is observed and fitted.
+    """Observation and fit of a session.
 
     noise
         Of the detector.
@@ -55,7 +55,7 @@ class Setup:
         Share of the points (marker and frame) whose confidence is 0.001: as good as not found, but in the picture, so
         that the frame counts as one with the whole person in view.
     site, size
-        What the person's marker offsets and deviations of the eight scales from 1 are multiplied by.
+        Factor of the person's marker offsets and of the deviations of the eight scales from 1.
     sides_alike
         A left segment's scale is that of the right one. The walker draws the two apart, each with its own 5 %.
     squash, lean_deg
@@ -111,7 +111,7 @@ DEFAULT = Factor("default", "as the benchmark", Setup())
 
 
 def factors() -> tuple[Factor, ...]:
-    """All rows but the default."""
+    """Return all rows but the default."""
     rows: list[Factor] = []
 
     def add(group: str, name: str, **changes: Any) -> None:

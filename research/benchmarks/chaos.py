@@ -1,13 +1,13 @@
-"""Workers, supervisors, the database and the disks fail at random while recordings come in: what is left afterwards.
+"""Workers, supervisors, the database and the disks fail at random while recordings come in: results and remains.
 
     python -m research.benchmarks.chaos --minutes 20 --seed 1             # as root, who may mount two small disks
     python -m research.benchmarks.chaos --minutes 10 --database mysql     # on Debian's MySQL (tests/mysql.py)
 
 Faults, one every few seconds: kill -9 of working processes, of supervisors, and of the database inside an insert,
 before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
-database; a full disk of the store and of the database. The supervisors pass for machines of their own, so that a paused
+database; a full disk of the store and of the database. The supervisors act as separate machines, so that a paused
 process loses its job to another. Heavy stages give recorded results. The last lines compare what `pbl status` says with
-what is there, and count what was left behind; exit status 1 where anything is wrong.
+the results, and count the remains; exit status 1 where anything is wrong.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ STATUS_S, DRAIN_S = 120.0, 900.0
 
 
 def main_of_boss(number: int) -> None:
-    """A supervisor of one process, on a machine of its own."""
+    """A supervisor of one process, on a separate machine."""
     from workers.supervisor import Supervisor
 
     os.environ[HOST] = f"machine-{number}"
@@ -152,7 +152,7 @@ class Site:
         self.done["supervisor killed"] += 1
 
     def pause_worker(self) -> None:
-        """In the background: meanwhile others take its job."""
+        """Pause a worker in the background: meanwhile others take its job."""
         if pids := self.children():
             seconds = self.draw.uniform(2.0, PAUSE_S)
             self.done["working process paused" + (", taken for dead" if seconds > DEAD_S else "")] += 1
@@ -374,7 +374,7 @@ def _drain(site: Site, supervisors: int, until: float) -> list[str]:
 
 
 def _left(registered: int) -> list[str]:
-    """What is not as it should be: results that are missing, jobs and files that were left behind."""
+    """Return the faults: missing results, jobs and files that were left behind."""
     from schemas import computed_tables, connection, fit
     from schemas.operations.orphans import orphans
 

@@ -1,4 +1,4 @@
-"""False alarms of `pbl_pipeline.stats.curve_test`: how often it finds a phase where there is no difference.
+"""False alarms of `pbl_pipeline.stats.curve_test`: how often it finds a phase without a difference.
 
     python -m research.benchmarks.curve_alarms
     python -m research.benchmarks.curve_alarms --studies 1000 --only unequal

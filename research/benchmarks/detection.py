@@ -3,7 +3,7 @@
     python -m research.benchmarks.detection
     python -m research.benchmarks.detection --out pictures      # pictures of the frames in which sides were exchanged
 
-Reads `../shared/data/real/multiview`; see the README there for its source and licence: 100 frames at 60 Hz of somebody
+Reads `../shared/data/real/multiview`; see the README there for its source and licence: 100 frames at 60 Hz of a person
 who balances, seen from four sides. Each video goes through the chain alone (probe, tracking, choice, keypoints). The
 reference are the points that others triangulated from OpenPose in the four views and smoothed (the Butterworth .trc),
 projected into each camera by Calib_scene.toml (why this calibration: `multiview.py`).
@@ -74,7 +74,7 @@ def detected(camera: str, params: KeypointParams | None = None) -> Keypoints:
     info = probe(path)
     tracking = track_people(path, info=info)
     chosen = choose_subject(tracking).person_id
-    assert chosen is not None, f"{camera}: nobody is clearly the subject"
+    assert chosen is not None, f"{camera}: no one is clearly the subject"
     lens = load_camera(CALIBRATION, IMAGE_SIZE_PX, CAMERAS[camera])
     return detect_keypoints(path, tracking, chosen, lens, params)
 

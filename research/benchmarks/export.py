@@ -1,4 +1,4 @@
-"""How fast visits are exported, and whether memory stays flat.
+"""Speed and memory of exporting visits.
 
     python -m research.benchmarks.export --visits 1000
 

@@ -1,9 +1,9 @@
-"""How fast visits are exported from the tables, and whether memory stays flat.
+"""Speed and memory of exporting visits from the tables.
 
     python -m research.benchmarks.export_tables --visits 1000
 
 A visit is a walk of 8 s in one video (240 frames at 30 Hz, blazepose_33), put through the whole chain with stand-ins
-for detection and fit in an embedded database. The other visits are copies of its rows, each of a person of its own;
+for detection and fit in an embedded database. The other visits are copies of its rows, each of a separate person;
 they share its files in the store. `pbl export --all` is called in this process, as a person would call it.
 """
 

@@ -61,8 +61,8 @@ Cycles = list[tuple[str, np.ndarray]]
 
 
 def curves(trial: LabTrial, shift_s: float = 0.0, fourier: bool = False) -> Cycles:
-    """All cycles from label to label, shifted in time; by Fourier resampling from 101 points, as the program that was
-    published with the index does it, instead of interpolation."""
+    """Return all cycles from label to label, shifted in time; by Fourier resampling from 101 points, as the program
+    that was published with the index does it, instead of interpolation."""
     out, time = [], trial.series.time_s
     for side in ("left", "right"):
         angles = trial.series.of_side(side)
@@ -93,7 +93,8 @@ def unlike_controls(shared: Path) -> Callable[[np.ndarray], float]:
 
 
 def conventions(shared: Path, say: Callable[[str], None] = click.echo) -> dict[str, tuple[float, float, float]]:
-    """Of each convention: mean and sd of the index over the children, and the median distance to the controls."""
+    """Return for each convention mean and sd of the index over the children, and the median distance to the
+    controls."""
     trials, norm, distance = walks(shared), load_norm("gillette-166-nine-angles"), unlike_controls(shared)
     plain = [curves(t) for t in trials]
     made = {

@@ -1,11 +1,11 @@
-"""Whether `pbl worker --resource gpu` keeps its device busy: figures of docs/operations.md.
+"""Utilisation of the device by `pbl worker --resource gpu`: figures of docs/operations.md.
 
     python -m research.benchmarks.gpu_worker                                  # 256 sessions, batches of 32
     python -m research.benchmarks.gpu_worker --batch 1,8,32 --json gpu.json   # what the size of a batch brings
     python -m research.benchmarks.gpu_worker --seconds 8                      # trials of one length: fewer programs
     python -m research.benchmarks.gpu_worker --sessions 4 --warm-up 2 --batch 2 --alike   # to try it on a CPU
 
-A database of its own holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
+A separate database holds sessions of one to three walks with their keypoints (the walker of `pbl synth`, a few walks
 with new noise for each trial), as they lie there when detection is through. One worker fits all of them. The first ones
 (`--warm-up`) let it compile and are not counted; what is compiled after them is said.
 """
@@ -56,7 +56,7 @@ PARTS = (
     ("savez_compressed", "of that: compress arrays"),
 )
 
-#: What computes: a batch, or one session alone.
+#: Unit of computation: a batch, or one session alone.
 COMPUTE = ("compute_batch", "make_compute")
 #: Of the parts, what follows the computation.
 AFTER = ("run", "make_insert", "savez_compressed")
@@ -86,7 +86,7 @@ def plans(n: int, seconds: Sequence[float], alike: bool, seed: int = 0) -> list[
 
 
 class Walks:
-    """Keypoints of walks, each made once; every trial gets noise of its own."""
+    """Keypoints of walks, each made once; every trial gets separate noise."""
 
     def __init__(self) -> None:
         self._made: dict[tuple, Any] = {}
@@ -250,8 +250,9 @@ def union_s(spans: Sequence[Span], window: Span) -> float:
 
 
 def windows(spans: Sequence[dict[str, Any]], warm_up: int) -> tuple[Span, Span]:
-    """From the moment in which the last of the `warm_up` sessions is computed to the last call of the device ("under
-    load": there would be another batch) and to the last row. Where nothing is warmed up, from the first batch on.
+    """Return the time from the moment in which the last of the `warm_up` sessions is computed to the last call of the
+    device ("under load": there would be another batch) and to the last row. Where nothing is warmed up, from the first
+    batch on.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """The working process of `gpu_worker`: the real one, which notes when it does what.
 
-Each span is one line of a file of its own process: name, begin and end on the machine's clock, how many sessions, and
+Each span is one line of the file of a process: name, begin and end on the machine's clock, how many sessions, and
 what of the time its thread spent on tracing and compiling (or loading) programs.
 """
 

@@ -2,7 +2,7 @@
 
 Damaged and lying video files under hostile names, and fuzzed sensor logs, through `ingest` and a real worker (probe
 and tracking; nothing is a stand-in). Printed: what became of each kind. The command fails where a worker's process
-died, a job met its time limit, or an input gave neither a row nor a coded error. It starts a database of its own.
+died, a job met its time limit, or an input gave neither a row nor a coded error. It starts a separate database.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the marker augmenter knows of the pelvis: laboratories' markers, recorded motions, and our fits of two clips.
+"""Accuracy of the marker augmenter at the pelvis: laboratories' markers, recorded motions, and our fits of two clips.
 
     python -m research.benchmarks.marker_augmenter                       # laboratories and motions
     python -m research.benchmarks.marker_augmenter --fits FOLDER         # and fits: real_clips --save FOLDER

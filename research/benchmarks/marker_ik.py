@@ -64,7 +64,8 @@ def fitted_angles(fit: TrialFit) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """Of two curves: correlation, mean difference (deg) and the standard deviation of the difference (deg)."""
+    """Agreement of two curves: correlation, mean difference (deg) and the standard deviation of the difference
+    (deg)."""
 
     r: float
     offset_deg: float
@@ -78,7 +79,7 @@ class Agreement:
 def agreement(
     ours: tuple[np.ndarray, dict[str, np.ndarray]], theirs: tuple[np.ndarray, dict[str, np.ndarray]]
 ) -> dict[str, Agreement]:
-    """Of each angle, at our time stamps inside theirs."""
+    """Return the agreement of each angle, at our time stamps within theirs."""
     inside = (ours[0] >= theirs[0][0] - 1e-6) & (ours[0] <= theirs[0][-1] + 1e-6)
     found = {}
     for name, values in ours[1].items():

@@ -1,7 +1,7 @@
 """Files of every kind that is read, with something wrong in them: python -m research.benchmarks.mutated
 
 Each file is made from a sound one by changing bytes, cutting, repeating, and, by what it is, fields and numbers; then
-it is read and used as the commands do, in a process of its own that may take a minute a file. Printed, by kind: what
+it is read and used as the commands do, in a separate process that may take a minute a file. Printed, by kind: what
 became of them, the longest time and the most memory. The command fails where the answer was no result and no code (an
 unforeseen error), where a file took longer than a minute, or where the process was beyond 1 GiB.
 `--kind KIND --first N --each 1 --here` repeats one, with its traceback.
@@ -38,17 +38,17 @@ from pbl_pipeline.paramset import canonical_json
 from tests.guard import guarded
 
 LONGEST_S, MOST_MIB = 60.0, 1024.0
-#: What stands for a number or text in a table.
+#: Replacements of a number or text in a table.
 _CELLS = (
     *("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e400", "9" * 400, "1.5.2", "", "x", "\x00", "\x1b[2J"),
     *("\u202e", "1,1", "\t", '"', "0x7f", "__import__('os')", "\ud7ff", "4611686018427387904", "1e-320", "[", "true"),
 )
-#: What stands for a value or an attribute in XML.
+#: Replacements of a value or an attribute in XML.
 _XML_VALUES = (
     *("XFD1048576", "XFD499999", "A0", "ZZZZZZ1", "A99999999999", "-1", "1e400", "9" * 400, "nan", "", "x", "n", "s"),
     *("str", "b", "d", "e", "inlineStr", "0", "4294967296", "true", "\u202e", "&a;", "&#0;", "&amp;", "../../x", "1:1"),
 )
-#: What stands for a value in JSON.
+#: Replacements of a value in JSON.
 _VALUES: tuple[Callable[[], Any], ...] = (
     *(lambda v=v: v for v in (None, True, 0, -1, 1.5, 2**62, 10**305, 1e308, "", "x", "\x1b[2J", "a\nb", "\ud800")),
     *(lambda v=v: v for v in (float("nan"), float("inf"), float("-inf"), 1e-320)),
@@ -245,7 +245,7 @@ def _npz(data: bytes, draw: random.Random) -> bytes:
         warnings.simplefilter("ignore")
         changed: dict[str, Any] = of_arrays({k: f[k] for k in f.files}, draw)
         draw.choice([np.savez, np.savez_compressed])(out, **changed)
-    if draw.random() < 0.05:  # zeros that nobody asked for, or that somebody did
+    if draw.random() < 0.05:  # zeros that were not requested, or were
         with zipfile.ZipFile(out, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr(draw.choice(["extra.npy", "qpos2.npy"]), bytes(50_000_000))
     return out.getvalue()
@@ -274,7 +274,7 @@ def _nothing(data: bytes, draw: random.Random) -> bytes:
 
 
 def kinds() -> list[Kind]:
-    """All kinds; what reads them is loaded here."""
+    """Return all kinds; their readers are loaded here."""
     from research.benchmarks import mutated_files as m
 
     return [
@@ -398,7 +398,7 @@ def _child(name: str, seeds: Sequence[int], folder: Path, pipe: Connection) -> N
 
 
 def apart(name: str, seeds: Sequence[int]) -> list[Outcome]:
-    """Outcomes from processes of their own: one that dies or takes too long is an outcome and has a successor."""
+    """Outcomes from separate processes: one that dies or takes too long is an outcome and is replaced."""
     context, found = multiprocessing.get_context("spawn"), []
     while len(found) < len(seeds):
         folder = Path(tempfile.mkdtemp(prefix="mutated-"))

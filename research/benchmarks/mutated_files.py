@@ -81,7 +81,7 @@ def use_keypoints(path: Path) -> None:
 
 
 def _pack(trial: Any) -> None:
-    """What a fit does before it solves."""
+    """Prepare a fit up to its solution."""
     from pbl_pipeline.fit import METHODS
     from pbl_pipeline.fit.session import make_session
 
@@ -417,7 +417,8 @@ def sheet(path: Path) -> None:
 
 
 def use_sheets(path: Path) -> None:
-    """In this process, whose memory is measured; the commands read a workbook in another one with limits."""
+    """Read sheets in this process, whose memory is measured; the commands read a workbook in another one with
+    limits."""
     from unittest import mock
 
     from pbl_pipeline.errors import PblError
@@ -633,7 +634,7 @@ def tracking(path: Path) -> None:
 
 
 def use_tracking(path: Path) -> None:
-    """As a file of the store."""
+    """Read tracks as a file of the store."""
     from types import SimpleNamespace
     from unittest import mock
 
@@ -761,7 +762,7 @@ def form(path: Path) -> None:
 
 
 def use_form(path: Path) -> None:
-    """As the page reads it while it arrives; a form that it refuses has the code USAGE here."""
+    """Read a form as the page does while it arrives; a form that it refuses has the code USAGE here."""
     import asyncio
     from concurrent.futures import ThreadPoolExecutor
 

@@ -1,4 +1,4 @@
-"""How much the size of the picture matters: units of the detector's error, and results at several sizes.
+"""Effect of the size of the picture: units of the detector's error, and results at several sizes.
 
     python -m research.benchmarks.picture_size unit         # the detector's error against what may be its unit
     python -m research.benchmarks.picture_size scaled       # keypoints, camera and picture multiplied: a change of unit
@@ -130,7 +130,7 @@ def result(name: str, fit: TrialFit) -> float:
 
 
 def candidates(k: Keypoints) -> dict[str, np.ndarray]:
-    """What a detector's error may be a fraction of, (T,) each in px of the file."""
+    """Return sizes of which a detector's error may be a fraction, (T,) each in px of the file."""
     frames = len(k.time_s)
     xyz, xy = (np.nan_to_num(np.asarray(a, float)) for a in (k.xyz_cam_m, k.xy_px))
     root = root_positions(xyz, xy, k.confidence, np.tile(k.camera.matrix, (frames, 1, 1)))
@@ -161,7 +161,7 @@ def sizes_of(name: str) -> Iterator[int]:
 
 @click.group()
 def main() -> None:
-    """What the size of the picture changes."""
+    """Effects of the size of the picture."""
 
 
 @main.command()

@@ -1,4 +1,4 @@
-"""How often the intervals of `pbl_pipeline.stats` hold the truth, in simulated cohorts of 60 patients and 20 controls.
+"""Coverage of the intervals of `pbl_pipeline.stats`, in simulated cohorts of 60 patients and 20 controls.
 
     python -m research.benchmarks.study_intervals
     python -m research.benchmarks.study_intervals --studies 4000 --only icc
@@ -93,7 +93,7 @@ def _cohort_change(g: np.random.Generator, name: str) -> Estimate:
 
 
 def _cohort_correlation(g: np.random.Generator, score: str) -> Estimate:
-    """Of the index with a score, patients at the first visit."""
+    """Return the correlation of the index with a score, of patients at the first visit."""
     drawn = draw(g)
     there = drawn.patient & drawn.counts[:, 0]
     kind = "spearman" if SCORES[score].ordinal else "pearson"

@@ -42,7 +42,7 @@ def recording(kind: str, camera: str, seed: int, marker_set: str, noise: str) ->
     """One recording and its truth."""
     task, impairments, views = KINDS[kind]
     view = views[seed % len(views)]
-    ground = "treadmill" if view == "sagittal" else "overground"  # nobody walks out of a phone's upright picture
+    ground = "treadmill" if view == "sagittal" else "overground"  # no one walks out of a phone's upright picture
     spec = SynthSpec(task, seed, impairments, view, camera, marker_set, ground=ground, noise=noise)
     made = synthesise(spec)
     return SessionInput([made.keypoints], [spec.name], "static" if camera == "static" else "handheld"), made.truth

@@ -102,8 +102,8 @@ def shown_circles(path: Path, info: VideoInfo, track: PersonTrack, n: int) -> np
 
 
 def agreement(tracking: Tracking, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Of the track that overlaps most with one true person: overlap and distance in the common frames, their share of
-    the person's, and the number of the track."""
+    """Return for the track that overlaps most with one true person: overlap and distance in the common frames, their
+    share of the person's, and the number of the track."""
     known = np.isfinite(truth[:, 0])
     best: tuple[float, tuple[np.ndarray, np.ndarray, float, int]] | None = None
     for person in tracking.persons:

@@ -1,10 +1,10 @@
-"""Which cycles of a bent way count as walking, at slow and fast walks alike.
+"""Cycles of a bent path that count as walking, in slow and fast walks.
 
     python -m research.benchmarks.turns
     python -m research.benchmarks.turns --limit 0 --limit 20 --limit 30 --limit 40   # 0: by time, as version 1
 
 Three parts, all by the default event method with the limit of `WalkingParams.max_turn_deg_per_stride` changed:
-- straight walks: how far the heading seems to turn within a cycle where nobody turns (90th and 99th percentile,
+- straight walks: how far the heading seems to turn within a cycle where no one turns (90th and 99th percentile,
   largest), of synthetic people (`pbl synth`, true markers, and with 20 mm of noise) and of the laboratory's children
   (`../shared/data/real/gait_lab_c3d`). A limit below would lose them.
 - circles on which a stride turns by so many degrees, at four speeds: the fraction of the strides that is kept.

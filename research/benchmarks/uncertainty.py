@@ -1,4 +1,4 @@
-"""How far the standard deviations of a fit (`TrialFit.qpos_sd`) tell its errors, on synthetic people.
+"""Agreement of the standard deviations of a fit (`TrialFit.qpos_sd`) with its errors, on synthetic people.
 
     python -m research.benchmarks.uncertainty
     python -m research.benchmarks.uncertainty --params blazepose
@@ -115,7 +115,7 @@ def clip(seed: int) -> tuple[SessionInput, np.ndarray]:
     """The same with BlazePose's errors; seeds take turns at scene, frame rate, and a phone that stands or is held."""
     task, view = SCENES[seed % len(SCENES)]
     fps, held = (30.0, 60.0)[seed // 6 % 2], bool(seed // 12 % 2)
-    ground = "treadmill" if view == "sagittal" else "overground"  # nobody walks out of a phone's upright picture
+    ground = "treadmill" if view == "sagittal" else "overground"  # no one walks out of a phone's upright picture
     truth = synthesise(
         SynthSpec(task, seed, view=view, fps=fps, marker_set="blazepose_33", ground=ground, seconds=5.0)
     ).truth

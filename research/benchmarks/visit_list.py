@@ -1,6 +1,6 @@
-"""What the list of visits of `pbl web` costs: for docs/web.md.
+"""Cost of the list of visits of `pbl web`: for docs/web.md.
 
-    python -m research.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a database of its own
+    python -m research.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a separate database
 
 The rows are copies of one recorded visit with other days, roles, indices and outcomes; the questions are those of the
 page. Bars: first page 300 ms (median of 50), any filter 500 ms, at the server.
@@ -56,7 +56,7 @@ def spread(n_visits: int) -> None:
 
 
 def filters() -> dict[str, Any]:
-    """What is measured, by name."""
+    """Return the measured filters by name."""
     from schemas.reading.visit_list import OUTCOMES, STATES, Filter
 
     day = datetime.date

@@ -1,4 +1,4 @@
-"""How fast the 3D view of `pbl web` draws: for docs/web.md.
+"""Frame rate of the 3D view of `pbl web`: for docs/web.md.
 
     python -m research.benchmarks.web_3d               # 2,000 frames at 1280 x 720 in a Chromium without windows
 
@@ -6,7 +6,7 @@ Needs `pip install -e .[browser]` and a Chromium of the machine. Without a graph
 software; the renderer is printed. Bar: 50 frames a second. "drawn" waits after each frame until it is finished;
 "shown" draws a frame each time the browser asks for one, which it does at most 60 times a second. "processor_ms" is
 what a frame takes of all of the browser's processes together (mean of both), which says what idle processors would do
-where others compute, too. "shown" comes first: a canvas whose pixels were read is shown at half the rate.
+while other processes compute. "shown" comes first: a canvas whose pixels were read is shown at half the rate.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How soon a recording plays in `pbl web`: for docs/web.md.
+"""Time until a recording plays in `pbl web`: for docs/web.md.
 
     python -m research.benchmarks.web_video            # 30 s of 1080p in a Chromium without windows
 
-Makes a database of its own; needs `pip install -e .[browser]` and a Chromium of the machine. From a click on the
+Makes its own database; needs `pip install -e .[browser]` and a Chromium of the machine. From a click on the
 recording's link in its visit: "shown" is when the first frame is on the page, "ready" when body and controls are,
 "plays" when the next frame is, Play being pressed as soon as it is there. "start" is from the click on Play to that
 frame. Bar: plays after 1.0 s. The body is that of the tests' stand-in; video, server and page are real.

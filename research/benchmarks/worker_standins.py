@@ -42,7 +42,7 @@ def frames_of(path: Path | str) -> int:
 
 
 def install(patch: pytest.MonkeyPatch) -> None:
-    """Put the recorded results in place of the heavy stages; no video is opened."""
+    """Replace the heavy stages by recorded results; no video is opened."""
     chain.install(patch)
     probe = functools.cache(pbl_pipeline.video.probe)
     recorded, pause = Path(os.environ[RECORDED]), float(os.environ.get(SLEEP, "0"))

@@ -1,4 +1,4 @@
-"""What the queue costs: figures of docs/operations.md. What it survives: `research.benchmarks.chaos`.
+"""Cost of the queue: figures of docs/operations.md. Failures that it survives: `research.benchmarks.chaos`.
 
     python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
@@ -7,7 +7,7 @@
     python -m research.benchmarks.workers long               # 300 videos with one of two hours among them
     python -m research.benchmarks.workers kills              # kill -9 ten times in every stage
 
-Heavy stages give a recorded result: the point is the queue. Each command starts a database of its own in a temporary
+Heavy stages return a recorded result: the subject is the queue. Each command starts a separate database in a temporary
 folder and removes it.
 """
 
@@ -48,7 +48,7 @@ _JOBS_OF_A_SESSION = 9 * EACH + 3
 
 @contextlib.contextmanager
 def installation() -> Iterator[Path]:
-    """A database and store of its own, the recorded stages in this process too; yields the folder."""
+    """Yield the folder of a separate database and store, with the recorded stages also in this process."""
     import schemas
 
     with database.installation() as home, pytest.MonkeyPatch.context() as patch:
@@ -74,24 +74,18 @@ def say(what: str, value: float, unit: str, bar: str = "") -> None:
 
 
 def work(processes: int, heard: list[Report] | None = None, **options: Any) -> float:
-    """Work until nothing is left; the seconds from the first job in hand to the last one ended.
-
-    `heard`: takes what the workers report, with the time.
-    """
-    from workers.metrics import Metrics
+    """Work until nothing is left; return the seconds from the first report to the last one. `heard` gets all
+    reports."""
+    from workers.metrics import KeptReports
     from workers.process import Options
     from workers.supervisor import Supervisor
 
-    said = [] if heard is None else heard
-
-    class Clock(Metrics):
-        def heard(self, job: Claim, outcome: Outcome | None) -> None:
-            said.append((time.monotonic(), job, outcome))
-            super().heard(job, outcome)
-
     once = {"once": True, "selftest": False, "processes": processes, **options}
-    assert Supervisor(Options(**once), Clock(), worker_standins.work).run() == 0
-    return said[-1][0] - said[0][0]
+    metrics = KeptReports()
+    assert Supervisor(Options(**once), metrics, worker_standins.work).run() == 0
+    if heard is not None:
+        heard += metrics.reports
+    return metrics.reports[-1][0] - metrics.reports[0][0]
 
 
 # --------------------------------------------------------------------------------------------------------------- scale
@@ -247,7 +241,7 @@ def speed(keys: int, work_ms: float) -> None:
     from workers import queue
 
     def begin() -> None:
-        """All keys wait, nothing is done."""
+        """Let all keys wait, with nothing done."""
         for rows in (video.VideoInfo, tracking.Tracking.jobs, video.VideoInfo.jobs):
             rows.delete_quick()
         assert queue.fill(video.VideoInfo) == keys
@@ -403,7 +397,7 @@ def memory(jobs: int) -> None:
 @click.option("--processes", default=1, show_default=True)
 @click.option("--faster", default=100.0, show_default=True, help="Detection takes 1/N of the time that it would.")
 def long(videos: int, minutes: float, late: int, processes: int, faster: float) -> None:
-    """How long a recording waits behind another's video: the longest time in which no process took any job."""
+    """Waiting time of a recording behind another video: the longest time in which no process took any job."""
     from research.benchmarks.many_recordings import archived, register_many
     from schemas import tracking, video
     from schemas.intake import VisitRecord

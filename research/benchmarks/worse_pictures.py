@@ -1,4 +1,4 @@
-"""How dark, blurred or small a picture may be: recordings made worse, and how far the detected points move.
+"""Tolerance for dark, blurred and small pictures: recordings made worse, and how far the detected points move.
 
     python -m research.benchmarks.worse_pictures                    # walk, demo, cam01
     python -m research.benchmarks.worse_pictures --clip demo        # needs the demo recording only

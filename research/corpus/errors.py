@@ -38,7 +38,7 @@ SESSIONS: dict[str, list[tuple[str, ...]]] = {
 }
 #: A mean true change of the index below this is too small for a fraction of it.
 LEAST_CHANGE = 3.0
-#: What two visits of one person have in common.
+#: Properties that two visits of one person share.
 _VISIT = ["person", "view", "camera"]
 
 
@@ -194,7 +194,7 @@ def _by_group(errors: pd.DataFrame, found: str, true: str) -> pd.DataFrame:
 
 def view_table(errors: pd.DataFrame) -> pd.DataFrame:
     """Error of the mean of the indices of one walk from several views (`SESSIONS`), each by the first camera that saw
-    it: over the walks that were seen so, and over those of the persons held out. A trial of its own is made of each
+    it: over the walks that were seen so, and over those of the persons held out. A separate trial is made of each
     view: the walk is the same, the detector errs anew."""
     walk = ["held_out", "person", "condition", "severity"]
     off: Any = errors.assign(off=errors["gdi"] - errors["gdi_true"]).pivot_table(
@@ -268,7 +268,8 @@ def coverage_table(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def responsiveness(errors: pd.DataFrame, found: str = "gdi", true: str = "gdi_true") -> pd.DataFrame:
-    """How much of the change of the index between two visits of a person is found again, per impairment and over all.
+    """Return the fraction of the change of the index between two visits of a person that is found, per impairment and
+    over all.
 
     Two visits: healthy and impaired, or two severities, seen from the same view. The fraction is the sum of the changes
     found over the sum of the true ones, so that small changes do not dominate; NaN where the true mean change is below

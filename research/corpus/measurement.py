@@ -78,7 +78,7 @@ class Seen:
 
     @property
     def alone(self) -> bool:
-        """Whether it was fitted alone."""
+        """True if it was fitted alone."""
         return sum(SESSIONS[self.session[0]].values()) == 1
 
     def mirrored(self) -> Seen:
@@ -130,7 +130,7 @@ def read_passes(folder: Path, norm: NormativeSet) -> list[Seen]:
 
 
 def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Iterator[list[np.ndarray]]:
-    """Of each pass, the scores (N, K) of the cycles of the left and of the right side."""
+    """Return for each pass the scores (N, K) of the cycles of the left and of the right side."""
     percent = np.linspace(0.0, 100.0, 51)
     curves = data[f"{kind}_curves"] * STEP_DEG
     at = np.array([np.concatenate([np.interp(norm.percent, percent, a) for a in c]) for c in curves])
@@ -141,8 +141,8 @@ def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Itera
 
 
 def _angles(data: dict[str, np.ndarray], kind: str) -> Iterator[np.ndarray]:
-    """Of each pass (2, 3, 2) deg: of the mean curve of the left and the right side, each angle's mean and range; NaN
-    where a side has no cycle."""
+    """Return for each pass (2, 3, 2) deg: of the mean curve of the left and the right side, each angle's mean and
+    range; NaN where a side has no cycle."""
     ends = np.cumsum(data[f"{kind}_curves_n"])[:-1]
     parts = zip(np.split(data[f"{kind}_curves"] * STEP_DEG, ends), np.split(data[f"{kind}_right"], ends), strict=True)
     for curves, right in parts:
@@ -349,9 +349,9 @@ def lasting_table(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def change_table(frame: pd.DataFrame) -> pd.DataFrame:
-    """Of the true change of synthetic people between healthy and the severest impairment, the fraction that is found,
-    by impairment and kind of session; impairments that change the index by less than 3 points in the mean are left
-    out."""
+    """Return, of the true change of synthetic people between healthy and the severest impairment, the fraction that is
+    found, by impairment and kind of session; impairments that change the index by less than 3 points in the mean are
+    left out."""
     keys = ["kind", "person"]
     own: Any = frame[frame["source"] == "synthetic"]
     healthy: Any = own[own["condition"].isin(["", HEALTHY])].groupby(keys)[["found", "plain", "true"]].mean()
@@ -412,8 +412,8 @@ def _stated(pairs: Any) -> np.ndarray:
 
 
 def probability_table(pairs: pd.DataFrame) -> pd.DataFrame:
-    """Of pairs that changed, how often the true change goes the way of the found one, and by `IMPORTANT_CHANGE`, beside
-    the mean probability that was stated, by stated probability."""
+    """Return for pairs that changed how often the true change goes the way of the found one, and by `IMPORTANT_CHANGE`,
+    beside the mean probability that was stated, by stated probability."""
     own = pairs[~pairs["unchanged"] & (pairs["true"].abs() > 0.01)]
     said = _stated(own)
     true = own["true"] * np.sign(own["found"])
@@ -548,7 +548,7 @@ def widening_of(judged_out: pd.DataFrame) -> float:
 
 
 def coverage_by_chance(judged_out: pd.DataFrame, widening: float, persons: int) -> tuple[np.ndarray, np.ndarray]:
-    """How often the 90 % intervals of each person left out hold the truth, in order; and the 5th, 50th and 95th
+    """Return how often the 90 % intervals of each person left out hold the truth, in order; and the 5th, 50th and 95th
     percentile of the mean of so many persons drawn from them."""
     rows: Any = judged_out.assign(ok=judged_out["ratio"] <= widening * Z90)
     held = rows.groupby("person")["ok"].mean().to_numpy()

@@ -69,7 +69,7 @@ _LOCKED_RAD = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Recorded:
-    """What one file holds: `time_s` (T,); joint -> (T,) rad, of the body's joints with its signs; `path_m` (T, 3), the
+    """Content of one file: `time_s` (T,); joint -> (T,) rad, of the body's joints with its signs; `path_m` (T, 3), the
     pelvis in the y-up ground of the file, or None; `cycle`: one gait cycle, whose end is its beginning."""
 
     time_s: np.ndarray

@@ -112,7 +112,7 @@ def read_motions(
     low_quality: bool = False,
     markerless: bool = False,
 ) -> list[Motion]:
-    """All recordings of joint angles that `folder/index.csv` lists, in its order.
+    """Return all recordings of joint angles that `folder/index.csv` lists, in its order.
 
     Rows of other kinds (markers, mean curves of groups, tables of persons, pixels) are passed over.
 
@@ -185,7 +185,7 @@ def activity_of(label: str) -> str:
 
 
 def _is_motion(row: Mapping[str, str]) -> bool:
-    """Whether a row is angles over time: a rate in Hz, or gait cycles of single trials."""
+    """Return whether a row is angles over time: a rate in Hz, or gait cycles of single trials."""
     if row["units"].split("/")[0] not in ("deg", "rad"):
         return False
     try:

@@ -66,7 +66,7 @@ class Walk:
 
     @property
     def held_out(self) -> bool:
-        """Whether nothing may be chosen by looking at this person."""
+        """True if this person may not influence any choice."""
         return is_held_out(self.person)
 
     def fit(self) -> TrialFit:
@@ -89,18 +89,18 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of the case, in a corpus."""
+        """Name of the case in a corpus."""
         w = self.walk
         return f"{w.person}|{w.condition}|{w.severity:g}|{self.view}|{self.camera}|{self.detector}" + (
             f"|visit {self.visit}" if self.visit else ""
         )
 
     def trials(self) -> dict[str, Keypoints]:
-        """What the detector gives in each view."""
+        """Return the detector's output in each view."""
         return {v: dataclasses.replace(self, view=v).keypoints() for v in self.view.split("+")}
 
     def keypoints(self, noise: Noise | None = None) -> Keypoints:
-        """What the detector gives in the one view of a case, by its error model of `DETECTORS` or another noise.
+        """Return the detector's output in the only view of a case, by its error model of `DETECTORS` or another noise.
 
         The same at each call. Cases of one visit and recording have the same random errors for person, view, camera and
         detector, so that they differ by the walk alone; those of another are drawn anew, but for where the points lie
@@ -133,8 +133,8 @@ class Case:
 
 
 def _zoom(xy_px: Float[np.ndarray, "T J 2"], size_px: tuple[int, int], share: float) -> float:
-    """How many times as long a lens shows the person as so large a share of the picture's height where she is largest;
-    at most such that no point leaves the picture that was in it."""
+    """Return the factor of a focal length that shows the person as so large a share of the picture's height where she
+    is largest; at most such that no point leaves the picture that was in it."""
     height = np.ptp(xy_px[..., 1], axis=1).max() / size_px[1]
     from_middle = np.abs(xy_px - (np.array(size_px) - 1) / 2) / (np.array(size_px) / 2)
     return float(min(share / height, max(1.0, 1.0 / from_middle.max())))
@@ -175,7 +175,7 @@ def corpus(
     Each synthetic person is seen healthy in every view, and with each impairment at two severities: in every view, or
     `quick`, in one view that changes with the impairment. Eight people, four of them held out, or `quick` two,
     one held out. Recorded walks are seen in every view by both cameras, or `quick` in two views. `together`: views that
-    make one session, in place of a session for each view.
+    make one session, instead of a session for each view.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""On the device: from clean points of a sequence to what a detector, a fit or a laboratory makes of them.
+"""Clean points of a sequence as a detector, a fit or a laboratory would see them, computed on the device.
 
 Of each example: pace, view, mirror, where the markers sit, lean and its drift, noise (across and along the line of
 sight, with and without memory, at the frame rate of the recording), a wrong scale, exchanged legs, gross outliers,
@@ -45,8 +45,9 @@ def augment(key: Any, xyz: Any, phase: Any, walks: Any) -> dict[str, Any]:
 
 
 def seen_joints(key: Any, xyz: Any) -> tuple[Any, Any, Any]:
-    """What is seen of points (T, 6, 2, 3) of any length: joints (T, 5, 2, 3), which are known (T, 5, 2), and whether
-    left and right have changed places. As in training, but at the pace of the points and without the wrong scale."""
+    """Return the seen part of points (T, 6, 2, 3) of any length: joints (T, 5, 2, 3), which are known (T, 5, 2), and
+    whether left and right have changed places. As in training, but at the pace of the points and without the wrong
+    scale."""
     return _seen_joints(iter(jax.random.split(key, 64)), xyz)
 
 
@@ -98,7 +99,7 @@ def _markers(key_toe, key_sole, key_each, xyz):
 
 
 def _leaning(key, joints):
-    """All points turned about a level axis (gravity not known, a detector that leans people), slowly changing."""
+    """Turn all points about a level axis (gravity not known, a detector that leans people), slowly changing."""
     k = jax.random.split(key, 5)
     axis = jax.random.uniform(k[0], maxval=2 * np.pi)
     fixed = 0.07 * jax.random.normal(k[1])
@@ -156,7 +157,7 @@ def _outliers(key, joints):
 
 
 def _missing(key, shape):
-    """Which joints (T, 5, 2) are known."""
+    """Return which joints (T, 5, 2) are known."""
     k = iter(jax.random.split(key, 24))
     t = shape[0]
     known = jnp.ones(shape, bool)

@@ -81,7 +81,7 @@ def _wraps(phase: np.ndarray, time: np.ndarray) -> np.ndarray:
 
 
 def evidence(found: list[Case], p: PhaseParams) -> tuple[np.ndarray, np.ndarray]:
-    """What speaks for each event that is found (N, E), and whether it is real (N,)."""
+    """Return the evidence for each event that is found (N, E), and whether it is real (N,)."""
     rows, real = [], []
     for case in found:
         for _, k, at, values in _events(case, p):
@@ -108,13 +108,13 @@ def fit_logistic(x: np.ndarray, real: np.ndarray) -> dict[str, Any]:
 
 
 def probability(x: np.ndarray, curve: dict[str, Any]) -> np.ndarray:
-    """Of each row of `evidence`."""
+    """Return the probability of each row of `evidence`."""
     return 1 / (1 + np.exp(-np.clip(curve["intercept"] + x @ np.array(curve["slope"]), -30, 30)))
 
 
 def reliability(stated: np.ndarray, real: np.ndarray) -> dict[str, Any]:
-    """How well stated probabilities hold: mean stated and fraction of real events in each band, Brier score, expected
-    calibration error."""
+    """Return the calibration of stated probabilities: mean stated and fraction of real events in each band, Brier
+    score, expected calibration error."""
     edges = np.array([0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 1.0 + 1e-9])
     band = np.digitize(stated, edges) - 1
     rows, error = [], 0.0

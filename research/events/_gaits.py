@@ -1,4 +1,4 @@
-"""How a person walks or runs: angles over the phases of both legs, healthy and with impairments."""
+"""Gaits of walking and running: angles over the phases of both legs, healthy and with impairments."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def curve_foot_off(rhythm: Rhythm) -> float:
 
 
 def _range_of_steps(rng: np.random.Generator, rhythm: Rhythm) -> float:
-    """How far the legs swing against the curve of that speed: shuffling people hardly."""
+    """Swing of the legs relative to the curve of that speed; small in shuffling people."""
     if rhythm.speed < 0.35 and rng.random() < 0.35:
         return float(rng.uniform(0.35, 1.0))
     return float(np.clip(rng.normal(1.0, 0.1), 0.7, 1.3))

@@ -1,4 +1,4 @@
-"""From angles of pelvis and legs to the points of both legs: plain forward kinematics of hinges, in leg lengths."""
+"""Points of both legs from angles of pelvis and legs: plain forward kinematics of hinges, in leg lengths."""
 
 from __future__ import annotations
 

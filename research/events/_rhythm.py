@@ -1,4 +1,4 @@
-"""When the feet come down and leave: rhythms of walking from 40 to 185 steps a minute, even and uneven."""
+"""Times of initial contact and toe-off: rhythms of walking from 40 to 185 steps a minute, even and uneven."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Rhythm:
 
 
 def draw_rhythm(rng: np.random.Generator) -> Rhythm:
-    """A rhythm of anybody: children and adults, healthy or not, with a walking aid or without."""
+    """A rhythm of any person: children and adults, healthy or not, with a walking aid or without."""
     norm = gait_norm()
     speed = float(rng.uniform(norm.speed[0], norm.speed[-1]))
     leg_m = float(rng.uniform(0.45, 1.02))

@@ -97,7 +97,7 @@ def _ramp(time: np.ndarray, start: float, stop: float) -> np.ndarray:
 
 
 def not_walking(rng: np.random.Generator, time: np.ndarray, *, calm: bool = False):
-    """Angles and heading of somebody who stands, sits, squats, steps on the spot or sideways, sways or turns."""
+    """Angles and heading of a person who stands, sits, squats, steps on the spot or sideways, sways or turns."""
     n = len(time)
     out = {name: np.zeros((n, 2)) + rng.normal(0, 2, 2) for name in LEG_ANGLES}
     out |= {name: np.zeros(n) + rng.normal(0, 1) for name in PELVIS_ANGLES}

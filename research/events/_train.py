@@ -21,8 +21,8 @@ from ._corpus import UNIT_M, Corpus
 
 @dataclasses.dataclass(frozen=True)
 class TrainParams:
-    """How to train. `solved_share`: examples from solved motions, where the corpus has such. `minutes`: fewer steps
-    where more would take longer; the history says how many there were."""
+    """Parameters of the training. `solved_share`: examples from solved motions, where the corpus has such. `minutes`:
+    fewer steps where more would take longer; the history says how many there were."""
 
     seed: int = 0
     steps: int = 30000
@@ -116,7 +116,7 @@ def _rate(number: Any, total: Any, params: TrainParams) -> Any:
 
 
 def _fitting_steps(run: Callable[[Any], Any], key: Any, chunk: int, params: TrainParams, say: Any) -> int:
-    """How many steps are made: those asked for, or as many as fit into the minutes."""
+    """Return the number of steps: those asked for, or as many as fit into the minutes."""
     keys = jax.random.split(key, chunk)
     began = time.monotonic()
     jax.block_until_ready(run(keys))

@@ -1,1 +1,1 @@
-"""How many heads of real recordings `pbl deidentify` covers, against heads located by eye."""
+"""Coverage of heads in real recordings by `pbl deidentify`, against heads located by eye."""

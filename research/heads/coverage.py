@@ -1,4 +1,4 @@
-"""How much of the heads in real recordings `pbl_pipeline.deidentify` covers, against heads located by eye.
+"""Coverage of heads in real recordings by `pbl_pipeline.deidentify`, against heads located by eye.
 
 Located is the whole head, hair to chin, as an ellipse in a box; what of it lies in the picture has to be covered.
 """
@@ -73,7 +73,7 @@ class LocatedClip:
 
 @dataclasses.dataclass(frozen=True)
 class HeadCoverage:
-    """How one head was covered: `frames` (N,) in which it is in view, `fraction` (N,) of its ellipse that is hidden,
+    """Coverage of one head: `frames` (N,) in which it is in view, `fraction` (N,) of its ellipse that is hidden,
     `certain` (N,) whether the frame was reported as certain."""
 
     clip: str
@@ -97,7 +97,7 @@ def located_clips() -> tuple[LocatedClip, ...]:
 
 
 def head_coverage(clip: LocatedClip, heads: Heads) -> list[HeadCoverage]:
-    """What `covered_picture` hides of each located head."""
+    """Return the part of each located head that `covered_picture` hides."""
     certain = np.array([not r for r in heads.reasons()])
     found = []
     for head in clip.heads:
@@ -109,8 +109,8 @@ def head_coverage(clip: LocatedClip, heads: Heads) -> list[HeadCoverage]:
 
 
 def frame_coverage(heads: Sequence[HeadCoverage]) -> tuple[int, int, int]:
-    """Of the heads of one clip: frames with a head, those in which all are covered, and those in which one is not
-    although the frame was reported as certain."""
+    """Return for the heads of one clip: frames with a head, those in which all are covered, and those in which one is
+    not although the frame was reported as certain."""
     with_head: set[int] = set()
     open_frames: set[int] = set()
     silent: set[int] = set()

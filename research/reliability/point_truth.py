@@ -1,4 +1,4 @@
-"""Where the points of a person truly are in the picture: of a synthetic trial, of calibrated cameras, of marker mocap.
+"""True positions of a person's points in the picture: of a synthetic trial, of calibrated cameras, of marker mocap.
 
 A laboratory's motion capture knows nothing of the phone that filmed beside it. But the person moved, and the phone did
 not: thousands of pairs of a place in the room and a pixel say where the phone stood and how long its lens is
@@ -79,7 +79,8 @@ class PointTruth:
 
 
 def truth_of_synthetic(keypoints: Keypoints, truth: Truth) -> PointTruth:
-    """Of a trial of `pbl synth`. Raises `PblError` REFERENCE_INPUT where the two are not of one trial."""
+    """Return the truth of a trial of `pbl synth`. Raises `PblError` REFERENCE_INPUT where the two are not of one
+    trial."""
     if truth.markers_world_m.shape[:2] != keypoints.confidence.shape:
         raise _refused(
             f"truth of {truth.markers_world_m.shape[:2]} frames and points for {keypoints.confidence.shape}",
@@ -91,9 +92,9 @@ def truth_of_synthetic(keypoints: Keypoints, truth: Truth) -> PointTruth:
 def truth_of_trc(
     keypoints: Keypoints, path: str | Path, camera: Camera | None = None, pose: CameraPose | None = None
 ) -> PointTruth:
-    """Of markers that several calibrated cameras triangulated (TRC), frame by frame from the first, in the picture of
-    one of these cameras: `camera` and `pose`, with (x, y, z)_trc = (y, z, x)_world as Pose2Sim writes it. Without a
-    pose the camera is found from the points (`resect`), with the lens of `camera` or of the keypoints.
+    """Return the truth of markers that several calibrated cameras triangulated (TRC), frame by frame from the first, in
+    the picture of one of these cameras: `camera` and `pose`, with (x, y, z)_trc = (y, z, x)_world as Pose2Sim writes
+    it. Without a pose the camera is found from the points (`resect`), with the lens of `camera` or of the keypoints.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT, REFERENCE_INPUT (other frames, or too few points in common).
     """
@@ -114,8 +115,8 @@ def truth_of_trc(
 
 
 def truth_of_bodies(keypoints: Keypoints, path: str | Path) -> PointTruth:
-    """Of marker mocap (`reference_of_bodies`' file) beside a camera that stood still: the points of the marker set on
-    the bodies of the mocap's model, scaled as these are, in the camera that `resect` finds.
+    """Return the truth of marker mocap (`reference_of_bodies`' file) beside a camera that stood still: the points of
+    the marker set on the bodies of the mocap's model, scaled as these are, in the camera that `resect` finds.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT, REFERENCE_INPUT (no camera explains the points).
     """

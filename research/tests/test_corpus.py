@@ -33,7 +33,7 @@ def _walk(person: str = "somebody", condition: str = "healthy", severity: float 
 
 
 def _fake_fit(change):
-    """In place of `fit_sessions`: the truth of each case, changed."""
+    """Return, instead of `fit_sessions`, the truth of each case, changed."""
 
     def fit(cases):
         def run(sessions, method):

@@ -1,6 +1,6 @@
 """The export script of docs/metrabs.md, with a randomly initialised network that has MeTRAbs' interface.
 
-torch is no dependency of the project: without it these tests skip. To run them, install torch, onnx and onnxscript
+torch is not a dependency of the project: without it these tests skip. To run them, install torch, onnx and onnxscript
 beside the project and `pytest -m needs_extra research/tests/test_export_metrabs.py`.
 """
 
@@ -56,8 +56,8 @@ def test_without_metrabs_it_says_what_is_missing(tmp_path, capsys):
 
 @pytest.fixture
 def torch() -> Any:
-    pytest.importorskip("onnxscript", reason="torch and onnxscript are no dependencies of the project")
-    return pytest.importorskip("torch", reason="torch is no dependency of the project")
+    pytest.importorskip("onnxscript", reason="torch and onnxscript are not dependencies of the project")
+    return pytest.importorskip("torch", reason="torch is not a dependency of the project")
 
 
 def make_network(torch: Any, n_points: int = RAW) -> Any:

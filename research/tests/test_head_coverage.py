@@ -1,4 +1,4 @@
-"""How many heads of recordings are covered."""
+"""Coverage of heads in recordings."""
 
 import dataclasses
 

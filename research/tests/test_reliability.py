@@ -102,7 +102,7 @@ def test_errors_are_counted_in_trunks(trial):
 
 @pytest.mark.slow
 def test_a_camera_is_found_from_what_it_saw(trial):
-    """Mocap in axes of its own, another clock, a lens that is 12 % longer than guessed, noise and gross outliers."""
+    """Mocap in separate axes, another clock, a lens that is 12 % longer than guessed, noise and gross outliers."""
     keypoints, world = trial.keypoints, trial.truth.markers_world_m
     turn = Rotation.from_euler("xyz", [0.3, -1.1, 2.0])
     room = turn.apply(world.reshape(-1, 3)).reshape(world.shape) + np.array([3.0, -1.0, 0.5])

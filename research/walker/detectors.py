@@ -1,4 +1,4 @@
-"""How detectors err, as measured on recordings with a truth: the errors that a corpus of known walks is seen with.
+"""Errors of detectors, measured on recordings with a known truth, for a corpus of known walks.
 
 Their pixels err with a correlation in time and by constants, their 3D leans and wanders, and the leg that is away from
 the camera is seen worse.

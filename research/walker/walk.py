@@ -62,7 +62,7 @@ def walk_qpos(
         heading), "eight" (a figure of eight, any duration), all 4 to 6 m from the camera in the mean and inside an
         upright phone picture; None: chosen by the seed.
     speed_m_per_s, stride_s
-        In place of the seed's own.
+        Instead of the seed's own.
     camera_height_m, pelvis_height_m
         Above the floor. The world's origin is at the camera.
 

@@ -27,7 +27,7 @@ def camera() -> None:
 def add(file: Path, like: Path | None) -> None:
     """Register the calibration in FILE, in the place of an older one of the same lens, size and rate.
 
-    What was computed with another calibration than now counts is deleted and listed; `pbl populate` computes it anew.
+    Results of another calibration than now counts are deleted and listed; `pbl populate` recomputes them.
     """
     import schemas
     from schemas.intake import calibrations as cameras
@@ -59,7 +59,7 @@ def list_() -> None:
 def remove(camera_id: int) -> None:
     """Withdraw calibration NUMBER of `pbl camera list` from the phones that have it.
 
-    What was computed with it is deleted and listed. Videos that were ingested with it keep it.
+    Its results are deleted and listed. Videos that were ingested with it keep it.
     """
     import schemas
     from schemas.intake import calibrations as cameras

@@ -1,4 +1,4 @@
-"""`pbl choose`: decide who is measured."""
+"""`pbl choose`: choose the measured person."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @click.option(
     "--not-usable", "reason", type=click.Choice(tuple(UNUSABLE)), help="Leave the video out, for this reason."
 )
-@click.option("--note", default="", metavar="TEXT", help="With --not-usable: more of why, without names.")
+@click.option("--note", default="", metavar="TEXT", help="With --not-usable: details, without names.")
 @click.option("--usable", is_flag=True, help="Take --not-usable back.")
 def choose(
     video_id: int,
@@ -33,9 +33,9 @@ def choose(
     note: str,
     usable: bool,
 ) -> None:
-    """Measure PERSON of video VIDEO_ID, or nobody. The choice wins over the automatic one.
+    """Measure PERSON of video VIDEO_ID, or leave the video out. The choice overrides the automatic one.
 
-    What was computed for another person is deleted and listed; `pbl populate` computes it anew. Without PERSON nothing
+    Results of another person are deleted and listed; `pbl populate` recomputes them. Without PERSON nothing
     changes: the persons, their scores and the reason of the automatic choice are printed, and with --sheet a picture of
     them is written. A video that is --not-usable takes part in no fit; its visit is computed without it, and what was
     computed with it comes back with --usable.
@@ -88,7 +88,7 @@ def _decide_usable(video_id: int, reason: str | None, note: str) -> None:
 
 
 def lines(found: list[Candidates]) -> list[str]:
-    """The printed form of who can be chosen."""
+    """Return the candidates as printed lines."""
     from schemas.tracking import choose_command
 
     out = []

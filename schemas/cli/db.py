@@ -149,7 +149,7 @@ def config(out: Path, overwrite: bool) -> None:
     """Write datajoint.json and .secrets/ of the database in use, so that plain `import datajoint` connects to it.
 
     The login is the one of this call: DJ_USER's, or the embedded database's. .secrets/ is readable for you alone and
-    keeps itself out of git. DataJoint goes on asking before it deletes (safemode).
+    keeps itself out of git. DataJoint continues asking before it deletes (safemode).
 
     Example: pbl db config --out notebooks
     """
@@ -185,7 +185,7 @@ for command in (backup, config, restore, migrate, roles):
 def start() -> None:
     """Start the database; get the server and create the folder first where they are missing.
 
-    Safe to repeat. The server goes on running until `pbl db stop`, or until the machine is switched off.
+    Safe to repeat. The server continues running until `pbl db stop`, or until the machine is switched off.
 
     Example: pbl db start
     """

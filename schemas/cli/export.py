@@ -35,7 +35,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl export --help`
     help="trc, mot, forces, osim, c3d, dlc, csv, parquet or bids; once for each.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
-@click.option("--subject", help="Code of the subject, in place of FILES: from the tables.")
+@click.option("--subject", help="Code of the subject: from the tables instead of FILES.")
 @click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--all", "every", is_flag=True, help="All fitted visits of the tables, or all of --subject.")
 @click.option("--slice", "slice_name", help="The visits that count in this slice (`pbl study slice`).")
@@ -48,8 +48,8 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl export --help`
     help="Sensor log of the phone, once for each of FILES: its sensors become analog channels of the C3D.",
 )
 @click.option("--marker-set", type=click.Path(path_type=Path), help="Table (CSV) that FILES were fitted with.")
-@click.option("--name", default="", help="Name of the person or trial for the headers; without it they name nobody.")
-@click.option("--number-trials", is_flag=True, help="trial_1, trial_2, ... in place of the recordings' names.")
+@click.option("--name", default="", help="Name of the person or trial for the headers; without it they are anonymous.")
+@click.option("--number-trials", is_flag=True, help="trial_1, trial_2, ... instead of the recordings' names.")
 @click.option("--markers-only", is_flag=True, help="No further points on each body in .trc and .osim.")
 @click.option("--allow-failed", is_flag=True, help="Export a fit that failed a check; the files say so.")
 @click.option("--overwrite", is_flag=True, help="Write into a folder that has files; those of the same name go.")
@@ -78,7 +78,7 @@ def export(
     visit has a folder OUT/SUBJECT/SESSION; one that cannot be exported is named, the others are written, and the exit
     status is 1.
     """
-    from pbl_pipeline.export import ExportOptions, check_export, write_export
+    from pbl_pipeline.export import GAIT_FORMATS, ExportOptions, check_export, write_export
 
     many = every or slice_name is not None
     if not files and subject is None and not many:
@@ -98,7 +98,14 @@ def export(
     if many:
         _write_many(wanted, slice_name, formats, out, options)
         return
-    visit = _of_files(files, formats, attitude, marker_set) if files else _of_tables(wanted, formats)
+    if files:
+        visit = _of_files(files, formats, attitude, marker_set)
+    else:
+        import schemas
+        from schemas.reading import fitted_visit
+
+        schemas.activate(methods=False)
+        visit = fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
     for path in write_export(visit, formats, out, options):
         click.echo(path)
 
@@ -125,15 +132,6 @@ def _of_files(
             next_step="`pbl gait *.fit.npz --out metrics.json` in the folder of these fits, then export again",
         )
     return visit
-
-
-def _of_tables(wanted: dict[str, str], formats: tuple[str, ...]) -> Visit:
-    import schemas
-    from pbl_pipeline.export import GAIT_FORMATS
-    from schemas.reading import fitted_visit
-
-    schemas.activate(methods=False)
-    return fitted_visit(wanted, gait=bool(GAIT_FORMATS & set(formats)))
 
 
 def _write_many(

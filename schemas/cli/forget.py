@@ -9,7 +9,7 @@ import click
 
 @click.command()
 @click.argument("subject")
-@click.option("--yes", is_flag=True, help="Do it. Without it only the list of what would go is printed.")
+@click.option("--yes", is_flag=True, help="Do it. Without it only the list of the removals is printed.")
 @click.option(
     "--videos",
     is_flag=True,
@@ -19,7 +19,7 @@ import click
 def forget(subject: str, yes: bool, videos: bool) -> None:
     """Remove every row and every stored file of the person SUBJECT, and prove it with a list.
 
-    A dry run is the default. What goes is written to PBL_HOME/forgotten/SUBJECT.json before the first row is deleted;
+    A dry run is the default. The list is written to PBL_HOME/forgotten/SUBJECT.json before the first row is deleted;
     interrupted, run it again until it reports that nothing is left (exit code 0). Backups, and reports or exports that
     were made, are not reached. Needs an account that may delete, and a key that may delete from the store.
 

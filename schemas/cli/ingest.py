@@ -11,15 +11,8 @@ if TYPE_CHECKING:
     from schemas.intake import Methods, Registered, Sensors, VisitRecord
 
 
-#: Options that name methods -> field of `Methods`.
-_METHODS = {
-    "tracking_method": "tracking",
-    "keypoint_method": "keypoint",
-    "fit_method": "fit",
-    "index": "gdi",
-    "norm": "norm",
-    "kinetics_method": "kinetics",
-}
+#: Parameters that name methods: fields of `Methods`.
+_METHODS = ("tracking", "keypoint", "fit", "gdi", "norm", "kinetics")
 
 
 @click.command()
@@ -53,7 +46,7 @@ _METHODS = {
     metavar="FILE",
     help="Write an empty sheet (.csv, .xlsx) for --sheet, with all its columns; nothing else is done.",
 )
-@click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, say what would happen.")
+@click.option("--dry-run", is_flag=True, help="With --sheet: read all, change nothing, print the outcome.")
 @click.option("--subject", metavar="CODE", help="Pseudonymous code of the person, never a name.")
 @click.option(
     "--session",
@@ -64,7 +57,7 @@ _METHODS = {
 @click.option(
     "--name-pattern",
     metavar="REGEX",
-    help="What the files' names, without suffix, say: named groups subject, session, pace, activity.",
+    help="Pattern of the files' names, without suffix, with named groups subject, session, pace, activity.",
 )
 @click.option("--project", metavar="NAME", help="Study or clinic, for a subject that is new.")
 @click.option(
@@ -104,12 +97,16 @@ _METHODS = {
 @click.option("--height-m", type=float, help="Measured body height of the subject, such as 1.72 (else: as it was).")
 @click.option("--mass-kg", type=float, help="Measured body mass at the visit, such as 68.5 (else: as it was).")
 @click.option("--person", type=click.IntRange(min=1), help="Measure this person of the tracking (else: automatic).")
-@click.option("--tracking-method", metavar="NAME", help="Method of person tracking (else: the default).")
-@click.option("--keypoint-method", metavar="NAME", help="Keypoint method or model (else: default).")
-@click.option("--fit-method", metavar="NAME", help="Method of the session fit (else: what suits the keypoints).")
-@click.option("--index", metavar="NAME", help="Gait Deviation Index: pbl-2025-three-angles (default) or gillette-2008.")
+@click.option("--tracking-method", "tracking", metavar="NAME", help="Method of person tracking (else: the default).")
+@click.option("--keypoint-method", "keypoint", metavar="NAME", help="Keypoint method or model (else: default).")
+@click.option("--fit-method", "fit", metavar="NAME", help="Method of the session fit (else: chosen by the keypoints).")
+@click.option(
+    "--index", "gdi", metavar="NAME", help="Gait Deviation Index: pbl-2025-three-angles (default) or gillette-2008."
+)
 @click.option("--norm", metavar="NAME", help="Normative set of the Gait Deviation Index (else: the index's own).")
-@click.option("--kinetics-method", metavar="NAME", help="Method of forces and joint moments (else: the default).")
+@click.option(
+    "--kinetics-method", "kinetics", metavar="NAME", help="Method of forces and joint moments (else: the default)."
+)
 def ingest(
     videos: tuple[Path, ...],
     sheet: Path | None,
@@ -155,7 +152,7 @@ def ingest(
         write_template(template, COLUMNS)
         click.echo(f"written: {template}; a row for each video, {', '.join(NEEDED)} are needed (docs/files.md)")
         return
-    methods = Methods(**{field: stated.pop(option) for option, field in _METHODS.items()})
+    methods = Methods(**{name: stated.pop(name) for name in _METHODS})
     stated = {option: value for option, value in stated.items() if value is not None}
     if sheet is not None:
         if any((videos, markers, marker_set, rig, name_pattern, attitude, depth, imu, stated)):
@@ -227,7 +224,7 @@ def _sheet(sheet: Path, methods: Methods, dry_run: bool) -> None:
 def _visits(
     paths: tuple[Path, ...], name_pattern: str | None, stated: dict[str, Any]
 ) -> tuple[list[tuple[int, VisitRecord]], list[Registered]]:
-    """(position of a file, its visit), and the files whose name does not fit the pattern.
+    """Return (position of a file, its visit) of all files, and the refused files whose name does not fit the pattern.
 
     Raises `PblError` USAGE for an invalid pattern; `click.UsageError` where it and an option state the same, or neither
     states the subject.

@@ -1,4 +1,4 @@
-"""`pbl list`: what is registered."""
+"""`pbl list`: people, visits, videos, methods, decisions and looks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @click.group("list", epilog="Example: pbl list videos --subject P017")
 def list_() -> None:
-    """What is registered: people, visits, videos, methods, decisions and looks.
+    """List people, visits, videos, methods, decisions and looks.
 
     Example: pbl list visits --population patient --csv > visits.csv
     """
@@ -59,7 +59,7 @@ def visits(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
 def changes(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
     """The changes of index and measures between a visit and the one before, and the probability that each is real.
 
-    Where two visits were not filmed alike, `not_comparable` says why.
+    `not_comparable` states why two visits cannot be compared, such as different camera views.
     """
     _print("changes", restriction, as_json, as_csv)
 
@@ -67,28 +67,28 @@ def changes(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
 @list_.command(epilog="Example: pbl list videos --subject P017 --session 2026-03-01 --json")
 @_options(*_VISITS, click.option("--activity", help="Of this activity, such as walking."))
 def videos(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
-    """The videos, with their numbers: what `pbl why`, `pbl choose` and `pbl move` ask for."""
+    """The videos, with their numbers: which `pbl why`, `pbl choose` and `pbl move` take."""
     _print("videos", restriction, as_json, as_csv)
 
 
 @list_.command(epilog="Example: pbl list decisions --subject P017 --json")
 @_options(*_VISITS)
 def decisions(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
-    """What people decided on the review page or with `pbl choose`, the newest first: who, when, what was before."""
+    """Decisions on the review page or by `pbl choose`, newest first: by whom, when, and the previous state."""
     _print("decisions", restriction, as_json, as_csv)
 
 
 @list_.command(epilog="Example: pbl list looks --subject P017 --csv > looks.csv")
 @_options(*_VISITS)
 def looks(as_json: bool, as_csv: bool, **restriction: str | None) -> None:
-    """Who looked at which recording on the review page, the newest first. Written where PBL_AUDIT_LOOKS=1 is set."""
+    """Looks at recordings on the review page, newest first. Recorded if PBL_AUDIT_LOOKS=1 is set."""
     _print("looks", restriction, as_json, as_csv)
 
 
 @list_.command(epilog="Example: pbl list methods --stage fit")
 @_options(click.option("--stage", metavar="NAME", help="Of this stage, such as keypoint, fit or gait."))
 def methods(as_json: bool, as_csv: bool, stage: str | None) -> None:
-    """The methods by stage. Where a method is asked for, its key or its name is taken; a name is its newest version."""
+    """The methods by stage. Options take the key of a method, or its name for the newest version."""
     from schemas import activate
     from schemas.reading import registered
 

@@ -1,4 +1,4 @@
-"""`pbl method`: methods of a laboratory's own."""
+"""`pbl method`: custom methods."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 
 @click.group(epilog="Example: pbl method add slow.json")
 def method() -> None:
-    """Methods of your own: a registered one with other parameters, by a name. `pbl list methods` shows all."""
+    """Custom methods: a registered one with other parameters, under a new name. `pbl list methods` shows all."""
 
 
 @method.command(epilog="Example: pbl method add slow.json && pbl reprocess --table SessionFit --new-method slow --yes")

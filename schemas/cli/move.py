@@ -8,13 +8,13 @@ import click
 @click.command()
 @click.argument("video_id", type=int)
 @click.option("--to", "target", required=True, metavar="SUBJECT/SESSION", help="Where the recording belongs.")
-@click.option("--yes", is_flag=True, help="Do it. Without it only what would change is printed.")
+@click.option("--yes", is_flag=True, help="Do it. Without it only the changes are printed.")
 def move(video_id: int, target: str, yes: bool) -> None:
-    """Put video VIDEO_ID, registered for the wrong person or visit, where it belongs.
+    """Move video VIDEO_ID, registered for the wrong person or visit, to the right one.
 
     Where several cameras filmed the trial, all of its videos go. Keypoints stay. Fits that hold them are deleted with
-    all that was computed from them; `pbl populate` fits what is left of the old visit, and the new one. A person or
-    visit that is new is made.
+    all dependent results; `pbl populate` fits the rest of the old visit, and the new one. A person or visit that is new
+    is made.
 
     \b
     Example: pbl move 17 --to P018/2026-03-01

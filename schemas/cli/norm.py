@@ -16,7 +16,7 @@ def norm() -> None:
 
 @norm.command("list", epilog="Example: pbl norm list")
 def list_sets() -> None:
-    """The sets in the database, those that ship with the code among them; without a database those alone."""
+    """The sets in the database, including those that ship with the code; without a database the latter alone."""
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.gait import load_norm, norm_names
     from schemas import activate, gdi
@@ -44,7 +44,7 @@ def list_sets() -> None:
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), help="Also write the set as JSON, for `pbl gait --norm FILE`.")
 def show(name: str, out: Path | None) -> None:
-    """Where the set NAME comes from and what is in it; a name without a version is its newest.
+    """Print source and content of the set NAME; a name without a version is its newest.
 
     Sets that ship are shown without a database.
     """

@@ -1,4 +1,4 @@
-"""`pbl report`: what the tables hold of a visit, as files for people."""
+"""`pbl report`: files for people about a visit in the tables."""
 
 from __future__ import annotations
 

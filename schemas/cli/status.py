@@ -1,4 +1,4 @@
-"""`pbl status`: how far the tables are, what failed and what waits."""
+"""`pbl status`: state of the tables, errors, and videos that wait for a choice."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--exact", is_flag=True, help="Count also what is not queued yet, however many videos there are.")
+@click.option("--exact", is_flag=True, help="Also count unqueued keys, for any number of videos.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, with the full error stacks.")
 def status(exact: bool, as_json: bool) -> None:
-    """Show per table what is done, pending, being computed, in error or waiting; errors with their next step.
+    """Show per table how many rows are done, pending, running, in error or waiting; errors with their next step.
 
     \b
     Example: pbl status

@@ -1,16 +1,12 @@
-"""`pbl study import|slice|...`: what of a study needs the tables."""
+"""`pbl study import|slice|...`: commands of a study that need the tables."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from ._kind import kind_option
-
-if TYPE_CHECKING:
-    from pbl_pipeline.study import StudyData
 
 
 @click.command(
@@ -25,7 +21,7 @@ if TYPE_CHECKING:
     metavar="FILE",
     help="Write an empty sheet (.csv, .xlsx) of visits with all its columns and scores; nothing else is done.",
 )
-@click.option("--dry-run", is_flag=True, help="Change nothing; say row by row what would happen.")
+@click.option("--dry-run", is_flag=True, help="Change nothing; print the outcome row by row.")
 @click.option("--distinct-codes", is_flag=True, help="Codes such as P1 and P001 are different people.")
 def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, distinct_codes: bool) -> None:
     """Visits, clinical scores, cohorts, and activity and pace of videos from SHEETS (.csv, .xlsx).
@@ -66,7 +62,7 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
     "Example: pbl study slice spine2026",
 )
 @click.argument("name", required=False)
-@click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of everybody).")
+@click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of all).")
 @click.option("--role", "roles", multiple=True, help="Visits of this role; repeat for several (else: all).")
 @click.option("--event", default="", help="What the days of the visits count from, such as surgery.")
 @click.option("--note", default="", help="Shown on the report.")
@@ -77,7 +73,7 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
 @click.option("--index", "gdi_method", help="Method of the index, where the tables hold several.")
 @click.option("--norm", help="Normative set, where the tables hold several.")
 def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: str, note: str, **methods: str) -> None:
-    """Freeze visits and methods under NAME; for a slice that is there, say what changed since. Without NAME: the list.
+    """Freeze visits and methods under NAME; for an existing slice print the changes since. Without NAME list all.
 
     Methods are named by their key, such as blazepose-v5, or short, such as blazepose: the newest version with results.
     """
@@ -116,10 +112,15 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
+    import schemas
     from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.study import deidentified, write_study
+    from schemas.studies import slices
 
-    data = load_slice(name, curves=not no_curves)
+    schemas.activate(methods=False)
+    data = slices.study_data(name, curves=not no_curves)
+    for text in slices.changes(name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
@@ -130,7 +131,7 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
 @click.group()
 def instrument() -> None:
-    """Clinical scores of your own, beside those that ship."""
+    """Custom clinical scores, in addition to those that ship."""
 
 
 @instrument.command(
@@ -164,18 +165,6 @@ def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     if errors:
         raise click.exceptions.Exit(1)
     click.echo(f"{name}: added")
-
-
-def load_slice(name: str, curves: bool = True) -> StudyData:
-    """The `StudyData` of a slice; what changed since it was frozen is said on stderr. Raises as `slices.study_data`."""
-    import schemas
-    from schemas.studies import slices
-
-    schemas.activate(methods=False)
-    data = slices.study_data(name, curves)
-    for text in slices.changes(name):
-        click.echo(f"changed since it was frozen: {text}", err=True)
-    return data
 
 
 def _write_key(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""`pbl validate`: how far the fits are from reference movements."""
+"""`pbl validate`: errors of the fits against reference movements."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _WithDefault(click.Group):
 
 @click.group(cls=_WithDefault)
 def validate() -> None:
-    """Compare fits with reference movements and print the paper's tables, the paper's own figures beside.
+    """Compare fits with reference movements and print the paper's tables, with the published figures for comparison.
 
     Without a command it is `tables`: everything in the database, or the FITS that are named.
 
@@ -100,7 +100,11 @@ def tables(
     elif references or source or shift_s:
         raise click.UsageError("--reference, --source and --shift go with FITS; in the database: pbl validate add")
     else:
-        frame = _of_database()
+        import schemas
+        from schemas.reading.frames import validation_frame
+
+        schemas.activate(methods=False)
+        frame = validation_frame()
     for error in refused:
         click.echo(error.text(), err=True)
     if not frame.empty:
@@ -146,7 +150,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     """Compare the index of one camera with that of several cameras, of visits that have both.
 
     Each is taken against a norm of the same kind: `pbl norm build NAME --kind single` and `--kind rig`, and both norms
-    named when the visits are ingested. The paper's figure stands beside.
+    named when the visits are ingested. The published figure is printed for comparison.
     """
     import schemas
     from pbl_pipeline.csv_cells import frame_to_csv
@@ -177,7 +181,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
 )
 @click.argument("old")
 @click.argument("new", required=False)
-@click.option("--tables", "in_tables", is_flag=True, help="Results of the tables by two methods, in place of refits.")
+@click.option("--tables", "in_tables", is_flag=True, help="Results in the tables by two methods, instead of refits.")
 @click.option("--keep", type=click.Path(path_type=Path), metavar="DIR", help="Keep what is refitted, in DIR/METHOD.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Write CSV, LaTeX and HTML there.")
 def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: Path | None) -> None:
@@ -301,18 +305,10 @@ def add(
         click.echo("next: pbl populate")
 
 
-def _of_database() -> pd.DataFrame:
-    import schemas
-    from schemas.reading.frames import validation_frame
-
-    schemas.activate(methods=False)
-    return validation_frame()
-
-
 def _of_files(
     fits: Sequence[Path], references: Sequence[Path], dataset: str, source: str | None, shift_s: float
 ) -> tuple[pd.DataFrame, list[PblError]]:
-    """Errors of fits in files, by the library alone; what was refused beside."""
+    """Return the errors of fits in files, by the library alone, and the refusals."""
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.validation import TrialErrors, compare, error_frame
     from schemas.intake.references import read_reference

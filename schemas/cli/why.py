@@ -1,4 +1,4 @@
-"""`pbl why`: where a video stands and what would happen next."""
+"""`pbl why`: state of a video, and the next step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 @click.argument("video_id", type=int)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def why(video_id: int, as_json: bool) -> None:
-    """Show every stage of one video: its row, its job or its error with advice, and what would run next.
+    """Show every stage of one video: its row, job or error with advice, and the next step.
 
     \b
     Example: pbl why 17

@@ -17,7 +17,7 @@ from ..stored_files import file_ref, stored_file
 
 @dataclasses.dataclass(frozen=True)
 class Candidates:
-    """One tracked video: the persons with their scores, best first, and what was decided so far.
+    """One tracked video: the persons with their scores, best first, and the current decision.
 
     status "TRACKED" stands for a choice that is not computed yet; `chosen` is then the person of a decision that waits
     to be computed. `key` is that of the tracking.
@@ -32,10 +32,8 @@ class Candidates:
 
 
 def candidates(video_id: int, tracking_method: str | None = None) -> list[Candidates]:
-    """Return the people who can be chosen in a video, once for each tracking method (or for one of them).
-
-    Raises `PblError` DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN.
-    """
+    """Return the people who can be chosen in a video, once for each tracking method (or for one of them). Raises
+    `PblError` DB_NOT_FOUND for a video that is not registered or not tracked yet, SOLVER_UNKNOWN."""
     key, name = _key(video_id, tracking_method), video.registered_video(video_id)["video_name"]
     out, found = [], (tracking.Tracking & key).keys()
     for tracked in found:
@@ -72,7 +70,7 @@ def candidates(video_id: int, tracking_method: str | None = None) -> list[Candid
 def write_sheet(about: Candidates, out_path: Path) -> Path:
     """Write the picture of the people of a video, boxed and numbered, as JPEG, or as PNG where `out_path` says so.
 
-    It is the stored one where somebody had to choose (JPEG only), else it is drawn from the video.
+    The stored picture of an open choice is copied (JPEG only); otherwise it is drawn from the video.
 
     Raises `PblError` TRACK_NO_PERSON, FILE_UNWRITABLE, FILE_FORMAT (the stored picture is lost), VIDEO_MISSING,
     VIDEO_CHANGED.
@@ -82,7 +80,7 @@ def write_sheet(about: Candidates, out_path: Path) -> Path:
     if not about.scores:
         raise PblError(
             "TRACK_NO_PERSON",
-            found="nobody in the video",
+            found="no one in the video",
             expected="at least one person",
             next_step=FILM_THE_WHOLE_BODY,
             key=about.name,
@@ -117,21 +115,14 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
 
 
 def selection_of(video_id: int, tracking_method: str | None = None) -> dict[str, Any]:
-    """Key of the one TrackingSelection that is meant.
-
-    Raises `PblError` DB_NOT_FOUND for a video that is not registered, SOLVER_UNKNOWN; USAGE where several methods track
-    the video and none is named, or another one.
-    """
+    """Return the key of the only TrackingSelection that matches. Raises `PblError` DB_NOT_FOUND for a video that is not
+    registered, SOLVER_UNKNOWN; USAGE where several methods track the video and none is named, or another one."""
     selections = (tracking.TrackingSelection & _key(video_id, tracking_method)).keys()
-    if len(selections) != 1:
-        raise _which_tracking(video_id, tracking_method)
-    return dict(selections[0])
-
-
-def _which_tracking(video_id: int, tracking_method: str | None) -> PblError:
-    """Each tracking method numbers the people anew: one number may mean two."""
+    if len(selections) == 1:
+        return dict(selections[0])
+    # Each tracking method numbers the people separately: a number is ambiguous.
     there = sorted((tracking.TrackingSelection & {"video_id": video_id}).to_arrays("tracking_method"))
-    return PblError(
+    raise PblError(
         "USAGE",
         found=f"video_id {video_id} is tracked by {len(there)} methods"
         + (f", not by {tracking_method}" if tracking_method else ", each with its own numbers"),

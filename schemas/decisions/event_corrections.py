@@ -1,4 +1,4 @@
-"""Events that a person corrects: what the page shows, saving them, and going back to the detected ones."""
+"""Correction of gait events: their state on the page, saving, and return to the detected ones."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _SAME_S = 0.0015
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class ShownEvents:
     """The events of a trial that the page shows, and where they come from."""
 
     #: Key of the row of GaitEvents.
     key: Mapping[str, Any]
     detected: tuple[Event, ...]
-    #: The events as a person set them; None where no one corrected any of the person who is measured.
+    #: The events as a person set them; None if no one corrected any of the person who is measured.
     hand: tuple[Event, ...] | None
     #: Who corrected, when (UTC), and how many events.
     by: str
@@ -59,8 +59,8 @@ class Shown:
         return self.detected if self.hand is None else self.hand
 
 
-def shown(video_id: int) -> Shown | None:
-    """The events of a recording; None where none were detected in a current fit of it yet."""
+def shown_events(video_id: int) -> ShownEvents | None:
+    """Return the events of a recording; None before any were detected in a current fit."""
     trial = fit.trial_key(fit.trial_of(video_id))
     key = None if trial is None else gait.newest_events(trial)
     if key is None:
@@ -71,7 +71,7 @@ def shown(video_id: int) -> Shown | None:
     hand = [] if counts is None else (gait.EventCorrection.Event & counts).to_dicts(order_by="corrected_no")
     last = (Decision & {"video_id": key["video_id"], "decision_what": "events"}).to_arrays("decision_id")
     computed = (gait.GaitEvents & key).fetch1("events_computed")
-    return Shown(
+    return ShownEvents(
         key=key,
         detected=tuple(tuple(e[f"event_{k}"] for k in _COLUMNS) for e in detected),
         hand=None if counts is None else tuple(tuple(e[f"corrected_{k}"] for k in _COLUMNS) for e in hand),
@@ -84,23 +84,19 @@ def shown(video_id: int) -> Shown | None:
 
 
 def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen: str) -> dict[str, int]:
-    """Write the events of a trial as a person set them, with a row of Decision: one transaction.
+    """Write the events that a person set in a trial, with a row of Decision, in one transaction.
 
-    The detected events stay, and so do earlier corrections. Events that are the detected ones again are no correction:
-    the last one is withdrawn, as by `take_back`. Cycles, measures and indices that were computed from other
-    events of this trial are deleted and pending again.
+    The detected events stay, and so do earlier corrections. Restoring the detected events withdraws the last
+    correction, as `take_back` does. Cycles, measures and indices that were computed from other events of this trial are
+    deleted and pending again.
 
     Raises `PblError` EVENTS_IMPLAUSIBLE, which names the event; DECIDED_MEANWHILE; DB_NOT_FOUND for a recording without
     events; USAGE where nothing was changed.
 
     Returns the number of deleted rows by table.
 
-    Parameters
-    ----------
-    events
-        Time (s), side and kind of all events that there are now.
-    seen
-        `Shown.state` of the page on which they were set.
+    `events`: time (s), side and kind of all current events. `seen`: `ShownEvents.state` of the page on which they
+    were set.
     """
     from pbl_pipeline.gait import GaitEvent, check_correction
 
@@ -124,15 +120,13 @@ def save(video_id: int, events: Sequence[tuple[float, str, str]], by: str, seen:
 
 
 def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
-    """Go back to the detected events of a trial, with a row of Decision. Without a correction nothing happens.
-
-    Raises `PblError` DECIDED_MEANWHILE, DB_NOT_FOUND.
-    """
+    """Go back to the detected events of a trial, with a row of Decision. Without a correction nothing happens. Raises
+    `PblError` DECIDED_MEANWHILE, DB_NOT_FOUND."""
     return _decide(_must_be_shown(video_id), None, by, seen)
 
 
 @repeated
-def _decide(before: Shown, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
+def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
     trial = int(before.key["video_id"])
     with locked(int((video.Video & {"video_id": trial}).fetch1("session_id"))):
         now = _must_be_shown(trial)
@@ -165,7 +159,7 @@ def _of_events(key: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _standing(key: Mapping[str, Any]) -> list[Person]:
-    """The people of whose events the last correction was not withdrawn."""
+    """Return the people whose last correction was not withdrawn."""
     rows = (gait.EventCorrection & _of_events(key)).to_dicts(order_by="correction_no")
     last = {(r["correction_tracking"], r["correction_person"]): bool(r["correction_withdrawn"]) for r in rows}
     return [person for person, withdrawn in last.items() if not withdrawn]
@@ -205,8 +199,8 @@ def _listed(events: Sequence[Event]) -> list[list[Any]]:
     return [[round(t, 4), side, kind] for t, side, kind, _ in events]
 
 
-def _must_be_shown(video_id: int) -> Shown:
-    found = shown(video_id)
+def _must_be_shown(video_id: int) -> ShownEvents:
+    found = shown_events(video_id)
     if found is None:
         raise PblError(
             "DB_NOT_FOUND",

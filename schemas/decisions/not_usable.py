@@ -14,7 +14,7 @@ from .. import video
 
 @dataclasses.dataclass(frozen=True)
 class Unusable:
-    """A recording that is marked as not usable. reason: one of `words.UNUSABLE`; note: more of it."""
+    """A recording that is marked as not usable. reason: one of `words.UNUSABLE`; note: details."""
 
     video_id: int
     reason: str
@@ -24,19 +24,19 @@ class Unusable:
 
     @property
     def text(self) -> str:
-        """Why, in words."""
+        """Return the reason in words."""
         said = UNUSABLE[self.reason]
         return self.note if self.reason == "other" and self.note else f"{said} ({self.note})" if self.note else said
 
 
 def unusable(videos: Iterable[int]) -> dict[int, Unusable]:
-    """Those of these recordings that are marked, by number."""
+    """Return the marks of these recordings by number."""
     keys = [{"video_id": int(v)} for v in videos]
     return {m.video_id: m for m in _marks(keys)} if keys else {}
 
 
 def all_unusable(most: int = 200) -> list[Unusable]:
-    """Every recording that is marked, the last first."""
+    """Return all marked recordings, newest first."""
     return _marks(True, order_by="unusable_created DESC, video_id", limit=most)
 
 

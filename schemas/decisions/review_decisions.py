@@ -1,4 +1,4 @@
-"""Decisions of people who look at results, each with a row that says who decided, when, and what was before."""
+"""Decisions about results, each with a row of its author, time, and the previous state."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.words import UNUSABLE
 
-from .. import fit, gait, qc, tracking, video
+from .. import fit, gait, qc, session, tracking, video
 from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
-from ..review import Decision
+from ..review import Decision, Viewing
 from ..rows import delete_below, utc_now
-from ..transactions import next_id, repeated
+from ..transactions import in_transaction, next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
@@ -76,25 +76,21 @@ def person_state(video_id: int, tracking_method: str) -> str:
 def decide_person(
     video_id: int, person: int, tracking_method: str | None = None, by: str = "", seen: str | None = None
 ) -> dict[str, int]:
-    """Measure `person` of a video: write the override, delete what was computed for another person, add a Decision.
+    """Measure `person` of a video: write the override, delete the results of another person, add a Decision.
 
     All in one transaction. An error row of the choice (a number that did not exist) becomes pending again.
 
-    Raises `PblError` DECIDED_MEANWHILE where the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
+    Raises `PblError` DECIDED_MEANWHILE if the state is another one by now; SUBJECT_UNKNOWN_PERSON; what
     `selection_of` raises.
 
-    Returns the number of deleted rows by table, which the next populate computes anew.
+    Returns the number of deleted rows by table, which the next populate recomputes.
 
-    Parameters
-    ----------
-    tracking_method
-        Tracking in which the person has this number; needed where several methods track the video.
-    seen
-        `person_state` of the page on which it was decided; None where nothing was shown.
+    `tracking_method`: tracking in which the person has this number; needed where several methods track the video.
+    `seen`: `person_state` of the page on which it was decided; None if nothing was shown.
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # who decides meanwhile waits here
+    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # concurrent decisions wait here
         if seen is not None and person_state(video_id, selection["tracking_method"]) != seen:
             raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
@@ -122,14 +118,10 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     brings back what was computed; frozen slices stay as they are.
 
     Raises `PblError` USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
-    DECIDED_MEANWHILE where `seen` is another state than the tables'.
+    DECIDED_MEANWHILE if `seen` is another state than the tables'.
 
-    Parameters
-    ----------
-    reason, note
-        One of `words.UNUSABLE`, and more in free words (no names), which "other" asks for.
-    seen
-        `usable_state` of the page on which it was decided; None: whatever it is.
+    `reason`, `note`: one of `words.UNUSABLE`, and more in free words (no names), which "other" asks for. `seen`:
+    `usable_state` of the page on which it was decided; None: not compared.
     """
     note = " ".join(note.split())[:500]
     if reason not in UNUSABLE or (reason == "other" and not note):
@@ -146,7 +138,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
 def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
     """Use a recording again that was marked as not usable, with a row of Decision: one transaction.
 
-    The session is planned with it again; what was computed with it before is there at once. Not marked: nothing
+    The session is planned with it again; what was computed with it before is there immediately. Not marked: nothing
     happens. Raises `PblError` as `mark_not_usable`.
     """
     _decide_usable(video_id, None, by, seen)
@@ -182,18 +174,13 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
     """Accept a check of a visit that asks for attention, with one's name and a reason.
 
     It holds for this result: when the checks are computed again, they ask again. Accepted already: nothing happens.
-    An unusual cadence is accepted although it failed: the cycles that it left out are deleted with what was computed
-    from them, and the next populate uses them; it holds while the recordings have this cadence.
+    An unusual cadence is accepted although it failed: the cycles that it left out are deleted with their dependent
+    results, and the next populate uses them; it holds while the recordings have this cadence.
 
-    Raises `PblError` DB_NOT_FOUND where there is no such check (any more), USAGE for one that is not WARN, and without
+    Raises `PblError` DB_NOT_FOUND if there is no such check (any longer), USAGE for one that is not WARN, and without
     a reason or with one of more than 500 characters.
 
-    Parameters
-    ----------
-    key, number
-        Key of SessionQc and `qc_no` of the check.
-    by, reason
-        Who accepts it, and why (no names).
+    `key`, `number`: key of SessionQc and `qc_no` of the check. `by`, `reason`: who accepts it, and why (no names).
     """
     reason = " ".join(reason.split())
     if not 0 < len(reason) <= 500:
@@ -289,6 +276,15 @@ def record(what: str, by: str, about: dict, before: dict, after: dict, reason: s
             "decision_reason": reason[:500],
         }
     )
+
+
+def record_viewing(of: str, number: int, what: str, by: str) -> None:
+    """Insert a row of Viewing, unless the number is unknown. `of`, `number`: "video_id" or "session_id", and which;
+    `what`: the viewed part of it, such as "video" or "report"."""
+    if not {"video_id": video.Video, "session_id": session.Session}[of] & {of: number}:
+        return
+    row = {of: number, "viewing_what": what[:16], "viewing_by": by[:64], "viewing_at": utc_now()}
+    in_transaction(lambda: Viewing.insert1({"viewing_id": next_id(Viewing, "viewing_id"), **row}))
 
 
 def _decided(row: Mapping[str, Any]) -> Decided:

@@ -1,8 +1,8 @@
 """Calibrations of cameras as rows, and those that serve every video of a phone's lens (`pbl camera`).
 
 Which one counts for a video is `video.camera_of`, asked when its keypoints are computed. A calibration that is
-registered, corrected or removed deletes exactly the keypoints that were made with another one than counts now, and what
-was computed from them; the next populate computes them anew.
+registered, corrected or removed deletes exactly the keypoints that were made with another one than counts now, and
+dependent results; the next populate recomputes them.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
 
 
 def known_camera(camera: Mapping[str, Any]) -> int | None:
-    """Number of the calibration of this `camera_row`; None where it is not registered."""
+    """Number of the calibration of this `camera_row`; None if it is not registered."""
     known = (lab.CameraCalibration & {"camera_sha256": camera["camera_sha256"]}).keys()
     return int(known[0]["camera_id"]) if known else None
 
@@ -103,9 +103,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
 
 def remove_calibration(camera_id: int) -> list[Change]:
     """Withdraw a calibration from the devices that it is registered for. Videos that have it as their own keep it.
-
-    Raises `PblError` DB_NOT_FOUND: no device has this calibration.
-    """
+    Raises `PblError` DB_NOT_FOUND: no device has this calibration."""
     rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
     if not rows:
         there = sorted({int(n) for n in lab.DeviceCalibration.to_arrays("camera_id")})

@@ -1,4 +1,4 @@
-"""A video that was registered under the wrong person or visit, put where it belongs."""
+"""Move a video that was registered under the wrong person or visit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _kept = functools.partial(PblError, "FILE_UNWRITABLE", expected="the recording i
 
 @dataclasses.dataclass(frozen=True)
 class Move:
-    """The changes that moving a video would make."""
+    """Changes that moving a video would make."""
 
     video_id: int
     files: Mapping[int, Path]  # number -> path of the videos that move: of several cameras all of the trial
@@ -42,16 +42,13 @@ class Move:
     new_subject: bool  # whether it is to be made
     new_session: bool
     sets: tuple[dict[str, Any], ...]  # keys of the sets of the old visit that hold one of them: deleted
-    deleted: dict[str, int]  # rows by table, with all that was computed from these sets
+    deleted: dict[str, int]  # rows by table, with all dependent results
     left: int  # videos that the old visit keeps
 
 
 def plan_move(video_id: int, subject: str, session_label: str) -> Move:
-    """What `carry_out` would do; changes nothing.
-
-    Raises `PblError` DB_NOT_FOUND for a number that no video has; USAGE for a subject code that could be a name, a
-    label too long, or the visit that the video is in already.
-    """
+    """Return what `carry_out` would do; change nothing. Raises `PblError` DB_NOT_FOUND for a number that no video has;
+    USAGE for a subject code that could be a name, a label too long, or the visit that the video is in already."""
     check_subject(subject, "pass --to SUBJECT/SESSION with such a code")
     check_label("session", session_label, 64, 1)
     rows = (video.Video * session.Session.proj("subject", "session_label") & {"video_id": video_id}).to_dicts()
@@ -87,11 +84,11 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
 
 
 def carry_out(plan: Move) -> None:
-    """Put the video into its new visit, with the plans of the methods that it went through.
+    """Move the video into its new visit, with the plans of its methods.
 
     Detection and keypoints stay: they depend on the video alone. The sets of fits that hold it are deleted with all
-    that was computed from them; the rest of the old visit, and the new one, are fitted by the next populate. A
-    recording in the archive goes to the folder of its new person, so that `pbl forget` finds it there.
+    dependent results; the rest of the old visit, and the new one, are fitted by the next populate. A recording in the
+    archive goes to the folder of its new person, so that `pbl forget` finds it there.
 
     Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
     cannot be moved, or another process is changing the archive. Nothing is changed then.
@@ -121,20 +118,20 @@ def carry_out(plan: Move) -> None:
 
 @contextlib.contextmanager
 def _moved_files(plan: Move) -> Iterator[Mapping[int, Path]]:
-    """Paths of the recordings in their visit. One in the archive gets a name there and loses its old one at the end."""
+    """Yield the paths of the recordings in their new visit; one in the archive keeps its old name until the end."""
     archive = archive_dir()
     kept = [path for path in plan.files.values() if path.is_relative_to(archive) and path.is_file()]
     if not kept:
         yield plan.files
         return
-    with worker.alone(LOCK, video.Video.connection) as obtained:
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
         if not obtained:
             raise _kept("uploads are being taken over now", next_step="repeat this in a minute", key=kept[0])
         names: dict[Path, Path] = {}
         try:
             folder = private_folder(folder_of(archive, "", plan.after[0]) / plain_name(plan.after[1]))
             for path in kept:
-                for old in path.parent.glob(f"{glob.escape(path.stem)}.*"):  # its log, too
+                for old in path.parent.glob(f"{glob.escape(path.stem)}.*"):  # also its log
                     names[old] = folder / old.name
                     os.link(old, names[old])
             sync_folders(folder, archive)

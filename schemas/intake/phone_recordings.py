@@ -6,7 +6,6 @@ import dataclasses
 import datetime
 import functools
 import hashlib
-import json
 import secrets
 from collections.abc import Mapping
 from typing import Any
@@ -25,7 +24,7 @@ HOURS, MOST_HOURS = 2.0, 24.0
 PART_BYTES, MOST_PARTS, MOST_LOG_BYTES = 2**20, 900, 32 * 2**20
 #: Recordings that one link takes.
 MOST_RECORDINGS = 100
-#: What a phone may state of a recording: the longest text of each (characters), and its whole numbers.
+#: Statements of a phone about a recording: longest text of each (characters), and whole numbers.
 TEXTS = {"activity": 32, "pace": 32, "aid": 64, "step": 64, "note": 500, "camera": 128, "sensor": 64}
 NUMBERS = ("frames", "dropped")
 _refused = functools.partial(
@@ -50,7 +49,7 @@ class Phone:
 
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """A recording that a phone sends. `about`: what the phone states of it; `error`: why it was refused, or empty."""
+    """A recording that a phone sends. `about`: statements of the phone; `error`: reason of a refusal, or empty."""
 
     number: int
     session_id: int
@@ -70,10 +69,8 @@ class Sent:
 
 # --------------------------------------------------------------------------------------------------------------- links
 def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | None = None) -> tuple[int, str]:
-    """Insert a link for a visit; return its number and its key, which is kept nowhere.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit or protocol, USAGE for a time that is too long.
-    """
+    """Insert a link for a visit; return its number and its key, which is kept nowhere. Raises `PblError` DB_NOT_FOUND
+    for an unknown visit or protocol, USAGE for a time that is too long."""
     session.registered_visit(session_id)
     if protocol is not None and not Protocol & {"protocol": protocol}:
         raise PblError(
@@ -109,12 +106,6 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
     return in_transaction(insert), key
 
 
-def open_links(session_id: int) -> list[dict[str, Any]]:
-    """Return the links of a visit that have not ended, the newest first."""
-    rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
-    return [row for row in rows if row["link_expires"] > utc_now()]
-
-
 def end_link(session_id: int, number: int) -> None:
     """End a link of a visit; one that has ended or that the visit does not have is left alone."""
     if PhoneLink & {"phone_link": number, "session_id": session_id} & "link_ended IS NULL":
@@ -122,7 +113,7 @@ def end_link(session_id: int, number: int) -> None:
 
 
 def use_link(key: str, cookie: str) -> str | None:
-    """Open a link by its key; return the cookie that the phone gets, None where it already has the right one.
+    """Open a link by its key; return the cookie that the phone gets, None if it already has the right one.
 
     The phone that opens a link first is the only one that it opens for. Raises `PblError` PHONE_LINK.
     """
@@ -141,7 +132,7 @@ def use_link(key: str, cookie: str) -> str | None:
 
 
 def phone_of(cookie: str) -> Phone:
-    """Return the phone with a cookie. Raises `PblError` PHONE_LINK where its link has ended or never was."""
+    """Return the phone with a cookie. Raises `PblError` PHONE_LINK if its link has ended or never was."""
     link = _valid(PhoneLink & {"link_phone_sha256": hashed(cookie)})
     visit = (session.Session & {"session_id": link["session_id"]}).fetch1()
     number = int(link["session_id"])
@@ -170,10 +161,7 @@ def begin(phone: Phone, stated: object) -> Sent:
     Raises `PblError` UPLOAD_REFUSED for a statement that cannot be, a recording that is too long, or too many of them;
     USAGE for a text with control characters or too long.
 
-    Parameters
-    ----------
-    stated
-        "sha256", "video_bytes", "log_bytes", and what `TEXTS` and `NUMBERS` name. Anything may stand there.
+    `stated`: "sha256", "video_bytes", "log_bytes", and what `TEXTS` and `NUMBERS` name. Not trusted.
     """
     if not isinstance(stated, dict):
         raise upload_refused("no statement of a recording")
@@ -235,7 +223,8 @@ def recordings(session_id: int) -> list[Sent]:
 def filming(session_id: int) -> dict[str, Any]:
     """Return how a visit is filmed with phones: "links" that are open, without their sums; the recordings "sent";
     "several", whether more than one phone sent some."""
-    links = open_links(session_id)
+    rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
+    links = [row for row in rows if row["link_expires"] > utc_now()]
     kept = ("phone_link", "link_by", "link_expires")
     sent = recordings(session_id)
     phones = {int(n) for n in (PhoneRecording & {"session_id": session_id}).to_arrays("phone_link")}
@@ -267,14 +256,13 @@ def upload_refused(found: str, next_step: str = "film again; if it happens again
 
 
 def _sent(row: Mapping[str, Any]) -> Sent:
-    about = row["phone_about"]
     return Sent(
         number=int(row["phone_recording"]),
         session_id=int(row["session_id"]),
         sha256=row["phone_sha256"],
         video_bytes=int(row["phone_video_size"]),
         log_bytes=int(row["phone_log_size"]),
-        about=json.loads(about) if isinstance(about, str) else about,
+        about=row["phone_about"],
         state=row["phone_state"],
         error=row["phone_error"],
         video_id=None if row["video_id"] is None else int(row["video_id"]),

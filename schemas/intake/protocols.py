@@ -34,15 +34,13 @@ class Step:
 
     @property
     def complete(self) -> bool:
-        """Whether the visit has all of its passes."""
+        """True if the visit has all of its passes."""
         return self.done >= self.passes
 
 
 def read_protocol(path: Path) -> list[Step]:
-    """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`.
-
-    Raises `PblError` FILE_MISSING, SHEET_FORMAT.
-    """
+    """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`. Raises `PblError`
+    FILE_MISSING, SHEET_FORMAT."""
     (sheet,) = read_sheets(path)[:1] or [None]
     steps = []
     for number, row in enumerate(sheet.rows if sheet else (), 1):

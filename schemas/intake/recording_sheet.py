@@ -47,7 +47,7 @@ _ONE_VISIT = "one value; two visits need two labels"
 
 
 def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = False) -> Imported:
-    """Register the videos of a sheet in one transaction, a row for each: all of them, or none where a row is refused.
+    """Register the videos of a sheet in one transaction, a row for each: all of them, or none if a row is refused.
 
     Paths are relative to the sheet's folder. A video that is registered already for the same visit is left as it is.
     Every file is read, also in a dry run.
@@ -65,7 +65,7 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
     for row, line, visit in track(list(zip(rows, lines, visits, strict=True)), "reading", unit="file"):
         if "file" not in row.cells:
             continue
-        with line.about():  # the file also of a row that is refused: all that is wrong is found at once
+        with line.about():  # the file also of a row that is refused: all errors are found together
             one = _recording(row, visit or _blank(row, sheet.absolute().parent), sheet.absolute().parent)
             one.read()
             sha256, file = one.files[0].sha256, row.cells["file"]
@@ -111,7 +111,7 @@ def _rows(path: Path) -> list[Row]:
 
 
 def _visit(row: Row, line: Line, folder: Path) -> VisitRecord | None:
-    """Return the visit that a row states; None where it is refused, with an error for each cell that is wrong."""
+    """Return the visit that a row states; None if it is refused, with an error for each cell that is wrong."""
     if row.error is not None:
         line.errors.append(row.error)
         return None
@@ -158,7 +158,7 @@ def _check_day(one: OneCamera, line: Line) -> None:
     day = visit.date or day_of(visit.session_label)
     try:
         said = recorded_utc(one.files[0].path) if day else None
-    except PblError:  # what is wrong with the video stands in the table of the stage that meets it
+    except PblError:  # errors of the video appear in the table of the stage that reads it
         return
     if day and said:
         at = datetime.datetime.fromisoformat(said)

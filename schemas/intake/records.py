@@ -1,4 +1,4 @@
-"""The records of intake: what is to be registered, what was read of it, the visit it belongs to, what became of it."""
+"""Records of intake: recordings and their visits, their files, and the outcome."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def set_condition(video_id: int, activity: str | None = None, pace: str | None =
     returns what changed, in words.
 
     Where a session's measures pool the video now and did not before, or the other way round, they are deleted, so that
-    the next populate computes them anew; likewise the measures of a video that is or was one of a task. Call it inside
+    the next populate recomputes them; likewise the measures of a video that is or was one of a task. Call it inside
     a transaction.
 
     Raises `PblError` DB_NOT_FOUND for an unknown number; USAGE for labels of more than 32 characters.
@@ -79,7 +79,7 @@ class Methods:
 
 @dataclasses.dataclass(frozen=True)
 class VisitRecord:
-    """What is stated of a recording and its visit. None: the subject's and the visit's columns are left as they are."""
+    """Statements about a recording and its visit. None leaves a column of subject or visit unchanged."""
 
     subject: str
     session_label: str = UNLABELLED
@@ -172,8 +172,8 @@ class Recording:
         self.visit.check()
 
     def read(self) -> None:
-        """Read its files, without a look at the tables. Raises `PblError`, or `RefusedFile` where one of them cannot be
-        registered, and the others with it."""
+        """Read its files, without any tables. Raises `PblError`, or `RefusedFile` if one of them, and so all of them,
+        cannot be registered."""
         raise NotImplementedError
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -294,14 +294,14 @@ def set_population(subject: str, population: str | None) -> list[str]:
 def set_height(subject: str, height_m: float | None) -> list[str]:
     """State the body height (m) of a registered person (None: as it is); returns what changed, in words.
 
-    Fits of videos of one camera that were told another height are deleted with what was computed from them, so that the
-    next populate computes them anew. Call it inside a transaction.
+    Fits of videos of one camera that were told another height are deleted with their dependent results, so that the
+    next populate recomputes them. Call it inside a transaction.
     """
     return [] if height_m is None else replace_height(subject, height_m)
 
 
 def replace_height(subject: str, height_m: float | None) -> list[str]:
-    """As `set_height`; None removes the height."""
+    """Set the height as `set_height` does; None removes it."""
     key = {"subject": subject}
     if number((lab.Subject & key).fetch1("subject_height")) == height_m:
         return []
@@ -316,14 +316,14 @@ def replace_height(subject: str, height_m: float | None) -> list[str]:
 def set_mass(session_id: int, mass_kg: float | None) -> list[str]:
     """State the body mass (kg) of the person at a visit (None: as it is); returns what changed, in words.
 
-    Forces that were told another mass are deleted, so that the next populate computes them anew. Call it inside a
+    Forces that were told another mass are deleted, so that the next populate recomputes them. Call it inside a
     transaction.
     """
     return [] if mass_kg is None else replace_mass(session_id, mass_kg)
 
 
 def replace_mass(session_id: int, mass_kg: float | None) -> list[str]:
-    """As `set_mass`; None removes the mass."""
+    """Set the mass as `set_mass` does; None removes it."""
     key = {"session_id": session_id}
     session.lock(session_id)  # who inserts forces waits here, then reads this mass
     stored = (session.BodyMass & key).to_arrays("body_mass")

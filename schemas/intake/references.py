@@ -1,4 +1,4 @@
-"""Registering reference movements: what `pbl validate add` does."""
+"""Registration of reference movements (`pbl validate add`)."""
 
 from __future__ import annotations
 
@@ -41,19 +41,15 @@ class Added:
 
 
 def read_reference(path: str | Path, source: str | None = None, shift_s: float = 0.0) -> lib.Reference:
-    """The library's `Reference` from a file, by what the file is.
+    """Return the library's `Reference` from a file of one of several formats.
 
     Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), the `truth.npz` of
     `pbl synth`, rotations of bodies (`.json.gz`), OpenSim `.mot`.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (also what the readers raise).
 
-    Parameters
-    ----------
-    source
-        Instrument; None takes what the file says. A fit without a camera comes from markers, one with from several.
-    shift_s
-        Added to its time stamps (s), so that they are on the clock of the video.
+    `source`: instrument; None: as the file states. A fit without a camera comes from markers, one with cameras from
+    several. `shift_s`: added to its time stamps (s), so that they are on the clock of the video.
     """
     from pbl_pipeline import validation as lib
 
@@ -125,13 +121,8 @@ def add_reference(
     Raises `PblError` DB_NOT_FOUND for an unknown video, USAGE for a name that several videos have or a text too long,
     and what `read_reference` raises.
 
-    Parameters
-    ----------
-    about
-        The video: its number, its path, or the name of its file where that is unique.
-    dataset, source, origin
-        Collection it is reported with (None: as it was, else "unnamed"), instrument (None: what the file says), where
-        it comes from (None: the path).
+    `about`: number, path or unique file name of the video. `dataset`, `source`, `origin`: collection it is reported
+    with (None: as it was, else "unnamed"), instrument (None: as the file states), origin (None: the path).
     """
     from pbl_pipeline.video import sha256_of
 
@@ -142,7 +133,8 @@ def add_reference(
     path = Path(path).absolute()
     truth = read_reference(path, source, shift_s)
     sha256 = sha256_of(path)
-    key = {"video_id": video_id, "reference": _hash(truth, sha256, shift_s)}
+    what = {"source": truth.source, "convention": truth.convention, "sha256": sha256, "shift_s": float(shift_s)}
+    key = {"video_id": video_id, "reference": hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]}
     of_source = {"video_id": video_id, "reference_source": truth.source[:64]}
     table = validation.ReferenceKinematics
     with table.connection.transaction:
@@ -177,18 +169,14 @@ def add_trial(
     shift_s: float = 0.0,
     fit_method: str | None = None,
 ) -> Added:
-    """`add_reference` with the current fit of another recording as it is in the tables: what several cameras or a
-    laboratory's markers say of the movement that a video shows. The reference stays as it is when that fit is redone.
+    """Register the current fit of another recording in the tables, of several cameras or laboratory markers, as the
+    reference of a video, by `add_reference`. The reference stays unchanged when that fit is redone.
 
-    Raises `PblError` DB_NOT_FOUND where it has no current fit; USAGE where it is a video of one camera, or has several
+    Raises `PblError` DB_NOT_FOUND if it has no current fit; USAGE where it is a video of one camera, or has several
     fits; what `add_reference` raises.
 
-    Parameters
-    ----------
-    trial
-        Number of the trial of several cameras, or of the marker recording.
-    fit_method
-        Key of the fit's method, where the trial was fitted by several.
+    `trial`: number of the trial of several cameras, or of the marker recording. `fit_method`: key of the fit's method,
+    where the trial was fitted by several.
     """
     trial = fit.trial_of(trial)
     current = fit.current().proj() * fit.FitSet.proj("fit_set_kind")
@@ -238,13 +226,8 @@ def _insert(row: dict[str, Any], truth: lib.Reference, path: Path, sha256: str, 
         )
 
 
-def _hash(truth: lib.Reference, sha256: str, shift_s: float) -> str:
-    what = {"source": truth.source, "convention": truth.convention, "sha256": sha256, "shift_s": float(shift_s)}
-    return hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]
-
-
 def find_video(about: int | str | Path) -> int:
-    """Number of a registered video, from its number, its path, or its file's name. Raises DB_NOT_FOUND, USAGE."""
+    """Return the number of a registered video by its number, path, or file name. Raises DB_NOT_FOUND, USAGE."""
     from pbl_pipeline.video import sha256_of
 
     text = str(about)

@@ -1,7 +1,7 @@
-"""Registration of recordings and their plans: the one way into the tables, whatever names them.
+"""Registration of recordings and their plans: the only way into the tables.
 
-The commands, sheets, the drop folder and archives make records (`OneCamera`, `SeveralCameras`, `LaboratoryMarkers`);
-their files are read and checked (`Recording.read`), and then written, or compared with what is registered.
+Commands, sheets, the drop folder and pages make records (`OneCamera`, `SeveralCameras`, `LaboratoryMarkers`), whose
+files are read and checked (`Recording.read`), and then written, or compared with what is registered.
 """
 
 from __future__ import annotations
@@ -35,30 +35,16 @@ from .records import (
     set_population,
 )
 
-#: Key of a selection or plan -> field of `Methods` that names it.
-METHOD_FIELDS = {
-    "tracking_method": "tracking",
-    "keypoint_method": "keypoint",
-    "fit_method": "fit",
-    "gait_method": "gait",
-    "gdi_method": "gdi",
-    "norm": "norm",
-    "kinetics_method": "kinetics",
-}
+#: Keys of selections and plans that name a method: fields of `Methods` with this ending.
+_ENDING = "_method"
+METHOD_KEYS = ("norm", *(f"{name}{_ENDING}" for name in ("tracking", "keypoint", "fit", "gait", "gdi", "kinetics")))
 #: Method of the fit that markers get where none is named (`pbl_pipeline.fit.default_fit`).
 DEFAULT_MARKER_FIT = "markers"
 
 
-def named_keys(methods: Methods) -> set[str]:
-    """Keys of the selections and plans whose methods are named."""
-    return {key for key, field in METHOD_FIELDS.items() if getattr(methods, field) is not None}
-
-
 def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
-    """Keys of the method rows of a video, or of laboratory markers; defaults filled in.
-
-    Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN.
-    """
+    """Return the keys of the method rows of a video, or of laboratory markers, with defaults filled in. Raises
+    `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
 
     def key(table: Any, name: str | None) -> str:
         return resolve_method(table, name or of_stage(table.stage).default)
@@ -80,14 +66,8 @@ def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
     }
 
 
-def plan_all(videos: Sequence[int], sessions: Collection[int], chosen: Mapping[str, str]) -> None:
-    """Enter new recordings into the selections and plans of all their methods (keys, from `resolve`)."""
-    for table, rows in _selections(videos, sessions, chosen, set(METHOD_FIELDS)):
-        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
-
-
 def plan_named(video_id: int, session_id: int, chosen: Mapping[str, str], named: Collection[str]) -> list[str]:
-    """Enter a registered recording into those of the methods whose keys are `named`; returns what is new, in words."""
+    """Enter a registered recording into those of the methods whose keys are `named`; return the additions in words."""
     added = []
     for table, rows in _selections([video_id], [session_id], chosen, set(named)):
         for values in rows:
@@ -102,7 +82,7 @@ def plan_named(video_id: int, session_id: int, chosen: Mapping[str, str], named:
 def _selections(
     videos: Sequence[int], sessions: Collection[int], chosen: Mapping[str, str], named: set[str]
 ) -> Iterable[tuple[Any, list[dict[str, Any]]]]:
-    """(table, rows) that recordings and their sessions need for the methods `named`; without a tracking method in
+    """Yield (table, rows) that recordings and their sessions need for the methods `named`; without a tracking method in
     `chosen` the recordings are laboratory markers."""
     if "tracking_method" in chosen:
         yield from _of_videos(videos, sessions, chosen, named)
@@ -117,7 +97,7 @@ def _selections(
 def _of_videos(
     videos: Sequence[int], sessions: Collection[int], chosen: Mapping[str, str], named: set[str]
 ) -> Iterable[tuple[Any, list[dict[str, Any]]]]:
-    """Keypoints are selected for the tracking that is selected with them, or else for every tracking of the videos."""
+    """Yield (table, rows) of videos: keypoints of the tracking selected with them, else of every tracking."""
     points = {"keypoint_method": chosen["keypoint_method"]}
     trackings: list[Any] = [{"video_id": v, "tracking_method": chosen["tracking_method"]} for v in videos]
     if "tracking_method" in named:
@@ -143,7 +123,7 @@ def _keypoint_methods(session_id: int) -> list[str]:
     return sorted((dj.U("keypoint_method") & selected).to_arrays("keypoint_method"))
 
 
-#: Errors that say that the file was not where, or what, it should be.
+#: Errors about a file that is missing or changed.
 _FILE_ERRORS = ("VIDEO_MISSING", "VIDEO_CHANGED")
 
 
@@ -165,11 +145,12 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
     for recording in recordings:
         recording.check(named)
     chosen = {markers: resolve(named, markers) for markers in {r.markers for r in recordings}}
+    keys = {key for key in METHOD_KEYS if getattr(named, key.removesuffix(_ENDING)) is not None}
     done: list[Registered] = []
     for recording in recordings:
         try:
             recording.read()
-            done += _register(recording, chosen[recording.markers], named_keys(named))
+            done += _register(recording, chosen[recording.markers], keys)
         except RefusedFile as wrong:
             done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
         except PblError as error:
@@ -197,7 +178,7 @@ def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
 
 
 def check_owner(one: Recording, known: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raise `PblError` VIDEO_DUPLICATE where the bytes of a file are registered (`known`) for another subject."""
+    """Raise `PblError` VIDEO_DUPLICATE if the bytes of a file are registered (`known`) for another subject."""
     visit = one.visit
     for file in one.files:
         row = known.get(file.sha256)
@@ -231,7 +212,8 @@ def write(recordings: Sequence[Recording], chosen: Mapping[str, str]) -> list[Re
     for number, pace in paced:
         set_condition(number, pace=pace)
     notes = [one.insert(own) for one, _, own in new]
-    plan_all([n for own in numbers for n in own], {*of_session}, chosen)
+    for table, rows in _selections([n for own in numbers for n in own], {*of_session}, chosen, set(METHOD_KEYS)):
+        table.insert(rows, skip_duplicates=True)  # the session may have its plans already
     for one, _, own in new:
         if one.visit.person is not None:
             tracking.set_override({"video_id": own[0], "tracking_method": chosen["tracking_method"]}, one.visit.person)

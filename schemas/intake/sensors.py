@@ -25,7 +25,7 @@ NONE = "none"
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """What is registered with one video; None and () leave things as they are. attitude: a log, or `NONE`."""
+    """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`."""
 
     attitude: Path | None = None
     depth: Path | None = None
@@ -36,14 +36,12 @@ class Sensors:
 
     @property
     def has_log(self) -> bool:
-        """Whether a log comes with it."""
+        """True if a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
     def read(self) -> PhoneLog | None:
-        """Read the log, if there is one, and check that the other files exist.
-
-        Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file without bytes.
-        """
+        """Read the log, if there is one, and check that the other files exist. Raises `PblError` FILE_MISSING,
+        PHONE_LOG; FILE_FORMAT for a file without bytes."""
         from pbl_pipeline.video import read_phone_log
 
         for path in (self.depth, *self.imu):
@@ -105,8 +103,8 @@ def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
 
 
 def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:
-    """Insert a copy of a file as the row with this key, in the place of an older one: "attached" or "replaced"; ""
-    where that has the same bytes."""
+    """Insert a copy of a file as the row with this key; return "attached", "replaced" for an older one, or "" for the
+    same bytes."""
     from pbl_pipeline.video import sha256_of
 
     before = (table & key).to_dicts()
@@ -134,7 +132,7 @@ def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[
 
 
 def delete_keypoints(video_id: int) -> str:
-    """Delete the keypoints of a video with what was computed from them; returns it in words, "" for none."""
+    """Delete the keypoints of a video with their dependent results; returns it in words, "" for none."""
     key = {"video_id": video_id}
     rows = counted(delete_below(keypoints.Keypoints, (keypoints.Keypoints & key).keys()))
     return f", and what depends on it was deleted: {rows}" if rows else ""

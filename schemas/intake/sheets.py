@@ -1,4 +1,4 @@
-"""Sheets as rows of texts (CSV, and XLSX without anything that hides a value), and what becomes of each row."""
+"""Sheets as rows of text (CSV, and XLSX without hidden values), and the outcome of each row."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Line:
 
     @contextlib.contextmanager
     def about(self) -> Iterator[Line]:
-        """An error in the block is one of this row; its key begins with the row."""
+        """Record an error of the block as one of this row; its key begins with the row."""
         try:
             yield self
         except PblError as error:
@@ -80,7 +80,7 @@ class Imported:
 
     @property
     def errors(self) -> list[PblError]:
-        """Why rows are refused."""
+        """Errors of all rows."""
         return [e for line in self.lines for e in line.errors]
 
 
@@ -125,7 +125,7 @@ def similar_codes(stated: Iterable[str], registered: Iterable[str]) -> dict[str,
 
 
 def needed(row: Row, column: str) -> str:
-    """The cell of a row in a column. Raises `PblError` SHEET_FORMAT where it is empty."""
+    """The cell of a row in a column. Raises `PblError` SHEET_FORMAT if it is empty."""
     if column not in row.cells:
         raise refused(f"no {column}", f"a value in the column {column}", "write it, or remove the row", row.where)
     return row.cells[column]

@@ -1,7 +1,7 @@
-"""The drop folder: what phones upload, in a folder of this machine or under a prefix of an object store.
+"""The drop folder: uploads of phones, in a folder of this machine or under a prefix of an object store.
 
-The person who uploads decides which files lie there and when they change. A folder is therefore read through handles of
-its folders, no link is followed, and only a regular file of the account that owns the drop folder is opened.
+Its content is not trusted: people who upload decide which files it holds and when they change. A folder is therefore
+read through handles, no link is followed, and only a regular file of the account that owns the drop folder is opened.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import fsspec
 from pbl_pipeline.errors import PblError, os_errors_as
 
 from ..operations.folders import secret
-from ..store import purge, store_error
+from ..store import purge, store_errors
 
-#: What is a sensor log, by the ending.
+#: Endings of sensor logs.
 LOG_ENDINGS = (".csv", ".json", ".zip")
-#: A larger recording or log is not taken (bytes).
+#: Largest recording and log that are accepted (bytes).
 LARGEST, LARGEST_LOG = 20 * 10**9, 4 * 10**8
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-#: O_NONBLOCK: what became a pipe since it was looked at does not wait for its writer.
+#: O_NONBLOCK: a file that became a pipe since it was listed does not wait for its writer.
 _FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class StillChanging(Exception):
-    """A file is not what it was when it was listed."""
+    """A file that changed since it was listed."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -46,7 +46,8 @@ class Upload:
 
 
 def incoming_url() -> str:
-    """Where phones upload to: PBL_INCOMING, a folder or s3://BUCKET/PREFIX. Raises USAGE where it is not set."""
+    """Return the upload target of phones: PBL_INCOMING, a folder or s3://BUCKET/PREFIX. Raises USAGE if it is not
+    set."""
     value = os.environ.get("PBL_INCOMING")
     if not value:
         raise PblError(
@@ -64,7 +65,7 @@ def drop_folder(url: str) -> Folder | Bucket:
 
 
 class Folder:
-    """A drop folder of this machine. Files lie three levels deep; nothing below them is looked at."""
+    """A drop folder of this machine. Files lie three levels deep; deeper ones are not read."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -98,20 +99,13 @@ class Folder:
         except OSError as error:
             if not parts:
                 raise
-            if error.errno != errno.ENOENT:  # a folder that may not be entered, or is none any more
+            if error.errno != errno.ENOENT:  # a folder that may not be entered, or is no longer one
                 yield Upload(PurePosixPath(*parts), file=False)
 
     @contextlib.contextmanager
     def open(self, upload: Upload) -> Iterator[BinaryIO]:
-        """Open a file for reading.
-
-        Raises
-        ------
-        PblError
-            UPLOAD_REFUSED: it is not a regular file of the folder's owner, or too large.
-        StillChanging
-            It is another one than was listed.
-        """
+        """Open a file for reading. Raises `PblError` UPLOAD_REFUSED: it is not a regular file of the folder's owner, or
+        too large; StillChanging: the file is not the one that was listed."""
         with contextlib.ExitStack() as stack:
             try:
                 handle = stack.enter_context(self._open(upload.name.parts[:-1]))
@@ -145,7 +139,7 @@ class Folder:
             raise StillChanging
 
     def unchanged(self, upload: Upload) -> bool:
-        """Whether the same file still lies there."""
+        """Return whether the file is unchanged."""
         try:
             with self._open(upload.name.parts[:-1]) as handle:
                 about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
@@ -154,7 +148,7 @@ class Folder:
         return (about.st_size, _stamp(about)) == (upload.size, upload.stamp)
 
     def remove(self, upload: Upload) -> None:
-        """Remove a file; one that took its place meanwhile stays. Raises OSError."""
+        """Remove a file, unless another one replaced it meanwhile. Raises OSError."""
         if self.unchanged(upload):
             with self._open(upload.name.parts[:-1]) as handle:
                 os.unlink(upload.name.name, dir_fd=handle)
@@ -170,13 +164,7 @@ class Folder:
 
     def move(self, upload: Upload, to: Path) -> None:
         """Move a file out of the drop folder without opening it. An entry that is not a regular file, or has another
-        name, is removed.
-
-        Raises
-        ------
-        OSError
-            It cannot be moved: another disk, no right.
-        """
+        name, is removed. Raises OSError if it cannot be moved (another disk, no right)."""
         with self._open(upload.name.parts[:-1]) as handle:
             about = os.stat(upload.name.name, dir_fd=handle, follow_symlinks=False)
             if stat.S_ISREG(about.st_mode) and about.st_nlink == 1:
@@ -188,7 +176,7 @@ class Folder:
 
     @contextlib.contextmanager
     def _open(self, parts: tuple[str, ...]) -> Iterator[int]:
-        """A handle of a folder below the drop folder; no link is followed on the way."""
+        """Yield a handle of a folder below the drop folder; no link is followed on the way."""
         handle = os.open(self.root, _FOLDER)
         try:
             for part in parts:
@@ -207,22 +195,18 @@ class Bucket:
         endpoint = os.environ.get("PBL_S3_ENDPOINT")
         login: dict[str, Any] = {"key": secret("PBL_S3_KEY"), "secret": secret("PBL_S3_SECRET")}
         login |= {"client_kwargs": {"endpoint_url": endpoint}} if endpoint else {}
-        try:
+        with store_errors():
             fs, root = fsspec.core.url_to_fs(url, **(login if url.startswith("s3://") else {}))
-        except Exception as error:
-            raise store_error(error) from error
         self.fs, self.root = fs, str(root).rstrip("/")
 
     def uploads(self, subject: str | None = None) -> Iterator[Upload]:
-        """Every object below the prefix, or in the folder of one person."""
-        try:
+        """Yield every object below the prefix, or in the folder of one person."""
+        with store_errors():
             self.fs.invalidate_cache()
             found = self.fs.find(f"{self.root}/{subject}" if subject else self.root, detail=True)
-        except Exception as error:
-            raise store_error(error) from error
         for path, about in found.items():
             name = PurePosixPath(str(path).removeprefix(self.root).lstrip("/"))
-            # A key with empty parts or dots is another one than its name.
+            # A key with empty parts or dots differs from its name.
             yield Upload(name, int(about["size"] or 0), _object_stamp(about), self._path(name) == str(path))
 
     @contextlib.contextmanager
@@ -233,7 +217,7 @@ class Bucket:
             yield source
 
     def unchanged(self, upload: Upload) -> bool:
-        """Whether the same object still lies there."""
+        """Return whether the object is unchanged."""
         self.fs.invalidate_cache()
         try:
             about = self.fs.info(self._path(upload.name))
@@ -242,17 +226,17 @@ class Bucket:
         return (int(about["size"] or 0), _object_stamp(about)) == (upload.size, upload.stamp)
 
     def remove(self, upload: Upload) -> None:
-        """Remove an object; one that took its place meanwhile stays. Raises OSError."""
+        """Remove an object, unless another one replaced it meanwhile. Raises OSError."""
         if self.unchanged(upload):
             self.fs.rm(self._path(upload.name))
 
     def remove_folders(self, subject: str) -> None:
-        """An object store has none, but may keep older versions."""
+        """Remove older versions that the object store keeps; it has no folders."""
         if self.fs.protocol[0] == "s3":
             purge(self.fs, f"{self.root}/{subject}")
 
     def move(self, upload: Upload, to: Path) -> None:
-        """An object that is not read stays where it is. Raises OSError."""
+        """Raise OSError: an object that is not read stays where it is."""
         raise OSError(errno.EXDEV, "it stays in the object store", str(to))
 
     def _path(self, name: PurePosixPath) -> str:

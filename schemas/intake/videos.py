@@ -59,13 +59,8 @@ class SeveralCameras(Recording):
         """Read the calibration, the bytes and first picture of each video, and the time stamps of its container: videos
         that were not started together are refused.
 
-        Raises
-        ------
-        PblError
-            CAMERA_INVALID (calibration, or files that are not one of each camera), FIT_INPUT (fewer than two, or other
-            frames or times), USAGE.
-        RefusedFile
-            One of the videos cannot be read.
+        Raises `PblError` CAMERA_INVALID (calibration, or files that are not one of each camera), FIT_INPUT (fewer than
+        two, or other frames or times), USAGE; RefusedFile: one of the videos cannot be read.
         """
         from pbl_pipeline.keypoints import cameras_of_files, check_same_times
         from pbl_pipeline.video import load_camera_poses, packet_times, sha256_of
@@ -200,7 +195,7 @@ class OneCamera(Recording):
         if self.sensors:
             done += in_transaction(lambda: self._new_sensors(row))
         if done:
-            forget_errors(int(row["video_id"]))  # what failed with the other camera or log may succeed with this one
+            forget_errors(int(row["video_id"]))  # a failure with the other camera or log may not recur
         return done
 
     def _new_camera(self, row: Mapping[str, Any]) -> list[str]:
@@ -252,16 +247,13 @@ def ingest(
 ) -> list[Registered]:
     """Register videos of one visit: `register` for a list of paths. At most one picture of each is decoded.
 
-    Files that are not videos are taken as well: their failure then stands in the table of the stage that meets it,
-    with a code and a next step. Missing and empty files are refused at once; the other files are still registered.
+    Files that are not videos are also accepted: their error then appears in the table of the stage that reads them,
+    with a code and a next step. Missing and empty files are refused immediately; the other files are still registered.
 
     Raises `PblError` USAGE for the number of a person with several videos, or sensor files of some of them; what
     `register` raises. Errors of single files are in the result.
 
-    Parameters
-    ----------
-    files
-        Sensor files of each path, in their order; empty for none at all.
+    `files`: sensor files of each path, in their order; empty for none at all.
     """
     if files and len(files) != len(paths):
         raise usage(

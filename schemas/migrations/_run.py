@@ -25,15 +25,15 @@ _error = functools.partial(PblError, "DB_MIGRATION")
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """What a table lacks or has beyond its definition. table: its full name on the server. known: False where the
-    definition refers to what the server does not have, so that the rest is unknown."""
+    """A difference between a table and its definition. table: its full name on the server. known: False if the
+    definition refers to something that the server lacks, so that the rest is unknown."""
 
     table: str
     what: str
     known: bool = True
 
     def text(self) -> str:
-        """As one line."""
+        """Return it as one line."""
         return f"{self.table}: {self.what}"
 
 
@@ -76,7 +76,7 @@ class Migration:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a run did, or (dry run) would do. open: differences that no migration removes, as text."""
+    """Outcome of a run, or of a dry run. open: differences that no migration removes, as text."""
 
     steps: list[tuple[str, list[str]]]
     created: list[str]
@@ -98,10 +98,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     when the database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
     account may not alter tables.
 
-    Parameters
-    ----------
-    dry_run
-        Change nothing, return what would be done.
+    `dry_run`: change nothing, return what would be done.
     """
     refuse_newer()
     if dry_run:

@@ -1,12 +1,12 @@
-"""The archive of uploaded recordings: where everything lies in it, and what of a person.
+"""Layout of the archive of uploaded recordings, and the files of a person in it.
 
-    SUBJECT/SESSION/HASH-FILE    registered recordings, with the logs beside them
-    _refused/SUBJECT/HASH-FILE   what could not be registered, with its reason in HASH-FILE.txt
+    SUBJECT/SESSION/HASH-FILE    registered recordings, with their logs
+    _refused/SUBJECT/HASH-FILE   refused uploads, with the reason in HASH-FILE.txt
     _phone/SUBJECT/NUMBER/       parts of a recording that a phone sends, until it is registered
-    .incoming/SUBJECT/           copies that are being made; while no import runs, the remains of a killed one
-    .incoming/seen.json          what lay in the drop folder when it was last listed
+    .incoming/SUBJECT/           copies in progress; while no import runs, the remains of a killed one
+    .incoming/seen.json          content of the drop folder when it was last listed
 
-SUBJECT is `_` for what was uploaded under a name that is not a code.
+SUBJECT is `_` for uploads under a name that is not a code.
 """
 
 from __future__ import annotations
@@ -22,31 +22,27 @@ from pbl_pipeline import settings
 from ..subject_codes import SUBJECT_CODE
 from .folders import private_folder, remove_empty, write_json
 
-#: Name of the installation-wide lock that whoever changes the archive holds (`worker.alone`).
+#: Name of the installation-wide lock that every process holds while it changes the archive
+#: (`worker.installation_lock`).
 LOCK = "incoming"
 REFUSED, COPIES, PHONE = "_refused", ".incoming", "_phone"
 _SEEN = "seen.json"
 
 
 def archive_dir() -> Path:
-    """Where recordings are kept: PBL_ARCHIVE (default: recordings/ in PBL_HOME)."""
+    """Return the folder of the recordings: PBL_ARCHIVE (default: recordings/ in PBL_HOME)."""
     return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings").absolute()
 
 
 def folder_of(archive: Path, part: str, subject: str) -> Path:
-    """The folder of a person in a part of the archive ("", `REFUSED`, `PHONE`, `COPIES`); made if missing.
-
-    Raises
-    ------
-    OSError
-        It cannot be made.
-    """
+    """Return the folder of a person in a part of the archive ("", `REFUSED`, `PHONE`, `COPIES`); made if missing.
+    Raises OSError if it cannot be made."""
     private_folder(archive)
     return private_folder(private_folder(archive / part) / (subject if SUBJECT_CODE.fullmatch(subject) else "_"))
 
 
-def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED, PHONE)) -> list[Path]:
-    """All files in the folders of a person, by default without `COPIES`; links are listed, not followed."""
+def files_of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED, PHONE)) -> list[Path]:
+    """Return all files in the folders of a person, by default without `COPIES`; links are listed, not followed."""
     folders = [archive / part / subject for part in parts]
     return sorted(
         path
@@ -58,7 +54,7 @@ def of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", REFUSED
 
 
 def remove_folders(archive: Path, subject: str) -> None:
-    """Remove the folders of a person as far as they are empty."""
+    """Remove the empty folders of a person."""
     for part in ("", REFUSED, PHONE):
         folder = archive / part / subject
         for path in (*sorted(folder.rglob("*"), reverse=True), folder):
@@ -66,7 +62,7 @@ def remove_folders(archive: Path, subject: str) -> None:
 
 
 def remove_copies(archive: Path, subject: str | None = None) -> None:
-    """Remove copies that a killed import left, of one person or of all; for the holder of the lock."""
+    """Remove copies of a killed import, of one person or of all; only for the holder of the lock."""
     kept = archive / COPIES
     for path in [kept / subject] if subject else sorted(kept.glob("*")):
         if path.is_dir() and not path.is_symlink():
@@ -76,7 +72,7 @@ def remove_copies(archive: Path, subject: str | None = None) -> None:
 
 
 def load_seen(archive: Path) -> dict[str, list[Any]]:
-    """What `save_seen` wrote; empty where there is nothing to read."""
+    """Return what `save_seen` wrote; empty if there is no such file."""
     try:
         return dict(json.loads((archive / COPIES / _SEEN).read_text(encoding="utf-8")))
     except (OSError, ValueError):
@@ -84,18 +80,13 @@ def load_seen(archive: Path) -> dict[str, list[Any]]:
 
 
 def save_seen(archive: Path, seen: dict[str, list[Any]]) -> None:
-    """Write which files lay in the drop folder: name -> size, stamp, time when they were first seen so (s).
-
-    Raises
-    ------
-    OSError
-        It cannot be written.
-    """
+    """Write the files of the drop folder: name -> size, stamp, time when it was first seen like this (s). Raises
+    OSError if it cannot be written."""
     private_folder(archive)
     write_json(private_folder(archive / COPIES) / _SEEN, seen)
 
 
 def plain_name(text: str) -> str:
-    """A name for a file or folder of ours from one that came from outside: ASCII, no separator, no leading dot."""
+    """Return a safe name of a file or folder for an external one: ASCII, no separator, no leading dot."""
     kept = "".join(c if c.isascii() and (c.isalnum() or c in "-_. ") else "_" for c in text).lstrip(". ").rstrip()
     return kept[-100:] or "_"

@@ -1,10 +1,10 @@
-"""The database and its object store as one folder that belongs together, and back.
+"""Back up the database and its object store into one folder, and restore them.
 
-    manifest.json        what it is: time, server, rows of every table, checksums; written last: it marks the end
+    manifest.json        time, server, rows of every table, checksums; written last: it marks a complete backup
     database.sql.gz      every table and row, in the state of one moment
     store.sha256         SHA-256 and path of every file of `store/`, as `sha256sum -c` reads it
-    store/               the files that rows of that moment name; files that no row names are not kept
-    recordings.sha256, recordings/    where asked for: the registered videos (`backup_files.py`)
+    store/               the files that rows of that moment name; files without a row are not kept
+    recordings.sha256, recordings/    on request: the registered videos (`backup_files.py`)
 
 The rows are read in one transaction, then the files they name are copied. A file never changes once its row is there,
 so both are of the same moment while workers go on.
@@ -30,14 +30,14 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.operations.folders import make_private, private_folder, write_json
-from schemas.store import check_store, store_error
+from schemas.store import check_store, store_error, store_errors
 
 from . import backup_files, catalog
 from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
 from .catalog import Column, quote
 
 FORMAT = 1
-#: Schema (after the prefix) with the marker of a restore that has not ended.
+#: Schema (after the prefix) that marks an unfinished restore.
 _MARKER = "restoring"
 
 Say = Callable[[str], None]
@@ -65,17 +65,17 @@ def backup(
     with_recordings: bool = False,
     previous: Path | None = None,
 ) -> Backup:
-    """Save the database and the store into a new folder, where asked for with the recordings.
+    """Save the database and the store into a new folder, and the recordings on request.
 
-    Raises `PblError` FILE_UNWRITABLE; BACKUP_INVALID where a file that a row names is lost (all are named);
-    STORE_UNAVAILABLE; DB_REFUSED when a table was changed in the middle.
+    Raises `PblError` FILE_UNWRITABLE; BACKUP_INVALID if a file that a row names is lost (all are named);
+    STORE_UNAVAILABLE; DB_REFUSED if a table was created or altered meanwhile.
 
     Parameters
     ----------
     folder
         Must not exist, or be empty.
     store
-        False leaves the files out, where the object store is saved by other means.
+        False leaves the files out, for an object store that is saved by other means.
     with_recordings
         Also save the registered videos. One that is gone or changed is left out and named.
     previous
@@ -135,10 +135,8 @@ def backup(
 
 
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
-    """Compare every byte of a backup with its checksums; return the manifest.
-
-    Raises `PblError` BACKUP_INVALID, which names the missing or changed files.
-    """
+    """Compare every byte of a backup with its checksums; return the manifest. Raises `PblError` BACKUP_INVALID, which
+    names the missing or changed files."""
     try:
         manifest = read_json(folder / "manifest.json")
         parts = dict(manifest["sha256"])
@@ -178,13 +176,10 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
 def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
     """Restore a backup into an empty database and its store. Everything is checked before anything is written.
 
-    Raises `PblError` BACKUP_INVALID; DB_REFUSED when there are tables under this prefix already, when PBL_DB_PREFIX is
-    another one than the backup's, or when a file of the store has other bytes than the backup's; STORE_UNAVAILABLE.
+    Raises `PblError` BACKUP_INVALID; STORE_UNAVAILABLE; DB_REFUSED if this prefix has tables already, PBL_DB_PREFIX
+    differs from the backup's, or a file of the store from the backup's.
 
-    Parameters
-    ----------
-    again
-        After an interrupted restore: remove the tables it left, then start again.
+    `again`: after an interrupted restore: remove the tables it left, then start again.
     """
     manifest = check(folder, say)
     connection.connect(start=True)  # a new place has no server yet
@@ -208,7 +203,11 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
                 for statement in backup_files.read_lines(folder / "database.sql.gz"):
                     n = cursor.execute(statement)
                     update(n if statement.startswith("INSERT") else 0)
-            _check_rows(cursor, manifest["rows"])
+            for name, expected in manifest["rows"].items():
+                cursor.execute(f"SELECT COUNT(*) FROM {quote(*name.split('.', 1))}")  # noqa: S608
+                if (found := cursor.fetchone()[0]) != expected:
+                    said = f"{found} rows in {name} after the restore"
+                    raise _refused(said, f"{expected}", "run the same with --again")
             cursor.execute(f"DROP DATABASE {quote(f'{prefix}_{_MARKER}')}")
     except pymysql.err.Error as error:
         raise _refused(
@@ -224,7 +223,7 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
 
 # ----------------------------------------------------------------------------------------------------------- saving
 def _snapshot(server: pymysql.Connection[Any]) -> str:
-    """Fix the rows that this connection sees to those of this moment; return the version of the server."""
+    """Begin a snapshot of all rows for this connection; return the version of the server."""
     with server.cursor() as cursor:
         cursor.execute("SELECT VERSION()")
         version = str((cursor.fetchone() or ("",))[0])
@@ -295,7 +294,7 @@ def _save_files(paths: list[str], folder: Path) -> int:
 
 # -------------------------------------------------------------------------------------------------------- restoring
 def _make_room(cursor: Any, prefix: str, again: bool) -> None:
-    """Refuse where there are tables, and set the marker; a marker that is there is from an interrupted restore."""
+    """Refuse a database with tables, and set the marker; an existing marker is that of an interrupted restore."""
     marker = f"{prefix}_{_MARKER}"
     if marker in catalog.schemas():
         if not again:
@@ -323,27 +322,14 @@ def _restore_files(folder: Path) -> None:
     store, files = connection.store_backend(), list(listed(folder, "store"))
     with progress.bar("store", total=len(files), unit="file") as update:
         for sha, path in files:
-            try:
+            with store_errors():
                 if not store.exists(path):
                     store.put_file(folder / "store" / path, path)
                 elif hashlib.sha256(store.get_buffer(path)).hexdigest() != sha:
                     raise _refused(
                         f"the store has another {path}", "no such file, or the same", "restore into an empty store"
                     )
-            except PblError:
-                raise
-            except Exception as error:
-                raise store_error(error) from error
             update(1)
-
-
-def _check_rows(cursor: Any, rows: dict[str, int]) -> None:
-    for name, expected in rows.items():
-        schema, table = name.split(".", 1)
-        cursor.execute(f"SELECT COUNT(*) FROM {quote(schema, table)}")  # noqa: S608
-        found = cursor.fetchone()[0]
-        if found != expected:
-            raise _refused(f"{found} rows in {name} after the restore", f"{expected}", "run the same with --again")
 
 
 # ------------------------------------------------------------------------------------------------------------ files

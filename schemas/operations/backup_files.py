@@ -1,11 +1,10 @@
-"""Files of a backup: listings with checksums, rows as SQL, recordings below `recordings/` at their own path, and back.
+"""Files of a backup: listings with checksums, rows as SQL statements, recordings below `recordings/` at their own path.
 
-All rows of the database as SQL statements, one per line, and back: the basis of `pbl db backup` and `restore`.
-
-By hand, and not with mariadb-dump or mysqldump, for three reasons. A backup counts the rows and collects the files that
-they name in the transaction that reads them; a dump program has a snapshot of its own, so that a row deleted in between
-would be restored without its file. mariadb-dump 10.11 writes the single-precision number 0.12345679 as 0.123457. And it
-is in no package that the embedded server needs (Debian: mariadb-client, 63 MB with Perl), nor in the workers' image.
+By hand instead of with mariadb-dump or mysqldump, for three reasons. A backup counts the rows and collects the files
+that they name in the transaction that reads them; a dump program has a separate snapshot, so that a row deleted in
+between would be restored without its file. mariadb-dump 10.11 writes the single-precision number 0.12345679 as
+0.123457. And it is in none of the packages that the embedded server needs (Debian: mariadb-client, 63 MB with Perl),
+nor in the workers' image.
 
 The file is plain SQL: `zcat database.sql.gz | mariadb -h HOST -u USER -p` restores it without this module.
 """
@@ -34,7 +33,7 @@ from pbl_pipeline.errors import PblError, os_errors_as
 
 from .catalog import Column, quote
 
-#: A statement of inserts is ended when it is longer than this (characters); the server takes far more.
+#: Length from which an INSERT statement is ended (characters); the server accepts far more.
 STATEMENT = 1_000_000
 _FETCH = 500
 #: For a block that writes a backup to a path.
@@ -54,7 +53,7 @@ HEADER = (
 
 
 def create_statement(server: pymysql.Connection[Any], schema: str, table: str) -> str:
-    """The statement that makes the table, on one line (comments have their line breaks written out already)."""
+    """Return the CREATE statement of a table on one line (line breaks in comments are escaped already)."""
     with server.cursor() as cursor:
         cursor.execute(f"SHOW CREATE TABLE {quote(schema, table)}")
         row = cursor.fetchone()
@@ -64,7 +63,7 @@ def create_statement(server: pymysql.Connection[Any], schema: str, table: str) -
 
 
 def rows_of(server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[Column]) -> Iterator[tuple]:
-    """The rows of a table, read from the server as they are needed.
+    """Yield the rows of a table, read from the server as they are needed.
 
     The connection must have been opened with `conv={}`: values are text as the server prints it, or bytes.
     """
@@ -79,7 +78,8 @@ def rows_of(server: pymysql.Connection[Any], schema: str, table: str, columns: S
 def save_table(
     server: pymysql.Connection[Any], schema: str, table: str, columns: Sequence[Column], out: gzip.GzipFile
 ) -> tuple[int, set[str]]:
-    """Write the statements that make a table and insert its rows; returns how many rows, and the files they name."""
+    """Write the statements that create a table and insert its rows; return the number of rows and the files they
+    name."""
     stored = [i for i, column in enumerate(columns) if column.names_files]
     write_line(out, f"USE {quote(schema)}")
     write_line(out, create_statement(server, schema, table))
@@ -101,21 +101,21 @@ def save_table(
 
 
 def literal(value: str | bytes | None) -> str:
-    """A value as a statement has it."""
+    """Return a value as an SQL literal."""
     if value is None:
         return "NULL"
     return f"X'{value.hex()}'" if isinstance(value, bytes) else f"'{escape_string(value)}'"
 
 
 def write_line(out: gzip.GzipFile, statement: str) -> None:
-    """One statement on one line. Raises ValueError where it would not stay one."""
+    """Write one statement on one line. Raises ValueError for a statement with a line break."""
     if "\n" in statement or "\r" in statement:
         raise ValueError("a statement with a line break in it")
     out.write(statement.encode() + b";\n")
 
 
 def read_lines(path: Path) -> Iterator[str]:
-    """The statements of a file that `write_line` wrote."""
+    """Yield the statements of a file that `write_line` wrote."""
     with gzip.open(path, "rb") as lines:
         for line in lines:
             yield line.decode().rstrip("\n").removesuffix(";")
@@ -127,7 +127,7 @@ PARTS = ("store", RECORDINGS)
 
 
 def safe_path(path: str) -> PurePosixPath:
-    """Return a path of the store, checked not to leave it and to be one that a disk takes. Raises BACKUP_INVALID."""
+    """Return a path of the store if it stays inside and a disk can hold it. Raises BACKUP_INVALID."""
     parts = PurePosixPath(path)
     too_long = len(path) > 3000 or any(len(os.fsencode(part)) > 255 for part in parts.parts)
     if parts.is_absolute() or ".." in parts.parts or not parts.parts or "\n" in path or "\\" in path or too_long:
@@ -142,15 +142,16 @@ def safe_path(path: str) -> PurePosixPath:
 
 
 def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
-    """Yield SHA-256 and path of the files of a part of a backup. A path that is not UTF-8 names a file that is missing.
-    Raises BACKUP_INVALID for a path that leaves it."""
+    """Yield SHA-256 and path of the files of a part of a backup. Raises BACKUP_INVALID for a path that leaves it.
+
+    A path that is not UTF-8 comes out as that of a missing file."""
     for line in (folder / f"{part}.sha256").read_text(encoding="utf-8", errors="replace").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file in hex (light, unlike `pbl_pipeline.video`, which has the same for recordings)."""
+    """Return the SHA-256 of a file in hex, without the libraries that `pbl_pipeline.video.sha256_of` loads."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -167,7 +168,7 @@ class Recordings:
 def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: Path | None = None) -> Recordings:
     """Copy videos, given as (path, SHA-256), into a backup, and list them in `recordings.sha256`.
 
-    Those that an earlier backup holds are linked, which takes no room. A video that is gone or changed is left out.
+    Videos that an earlier backup holds are linked, which takes no space. Missing and changed ones are left out.
 
     Raises `PblError` FILE_UNWRITABLE: the backup.
     """
@@ -195,7 +196,7 @@ def save_recordings(videos: Iterable[tuple[str, str]], folder: Path, previous: P
 
 
 def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str:
-    """Link or copy one recording; return the reason where it was left out, else ""."""
+    """Link or copy one recording; return the reason if it was left out, else ""."""
     try:
         safe_path(str(path).lstrip("/"))
         with path.open("rb"):
@@ -217,10 +218,8 @@ def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str
 
 
 def restore_recordings(folder: Path) -> Recordings:
-    """Copy the recordings of a backup back to where they were registered. A file that is there is never changed.
-
-    Raises `PblError` FILE_UNWRITABLE.
-    """
+    """Copy the recordings of a backup back to where they were registered. Existing files are never changed. Raises
+    `PblError` FILE_UNWRITABLE."""
     done = Recordings()
     if not (folder / f"{RECORDINGS}.sha256").exists():
         return done

@@ -1,4 +1,4 @@
-"""Schemas, tables and columns that the server has under the prefix of this installation, and their names in SQL."""
+"""Schemas, tables and columns of this installation on the server, and their names in SQL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Column:
 
     @property
     def names_files(self) -> bool:
-        """True where values are JSON whose `path` names a file or folder of the store."""
+        """True if values are JSON whose `path` names a file or folder of the store."""
         return _STORED.match(self.comment) is not None
 
 

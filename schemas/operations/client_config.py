@@ -1,4 +1,4 @@
-"""The configuration with which plain `import datajoint` reaches this database: what `pbl db config` writes."""
+"""Configuration files by which plain `import datajoint` connects to this database (`pbl db config`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from schemas.tables_version import refuse_other_version
 
 #: Names that DataJoint looks for, in the working directory and above it.
 CONFIG, SECRETS = "datajoint.json", ".secrets"
-#: What makes `A.aggr(B)` work for plain DataJoint on MariaDB: its configuration has no place for it.
+#: Statement without which `A.aggr(B)` of plain DataJoint fails on MariaDB; its configuration cannot hold it.
 AGGREGATE = """dj.conn().query("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")"""
 #: Attributes of a store that are secret.
 _SECRET = ("access_key", "secret_key", "account_key", "connection_string", "token", "password")
@@ -29,12 +29,7 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
     Raises `PblError` FILE_UNWRITABLE: it exists already, or cannot be written; DB_MIGRATION for tables of another
     version; what `connection.connect` raises.
 
-    Parameters
-    ----------
-    folder
-        Made where it is missing.
-    overwrite
-        Replace the files of an earlier call; without it they are left.
+    `folder`: made if it is missing. `overwrite`: replace the files of an earlier call; without it they are left.
     """
     connection.connect()
     refuse_other_version()
@@ -60,7 +55,7 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
 
 
 def is_mariadb() -> bool:
-    """Return True for MariaDB, which plain DataJoint needs a repair for (`schemas.datajoint_setup`)."""
+    """Return True for MariaDB, on which plain DataJoint needs a repair (`schemas.datajoint_setup`)."""
     return "MariaDB" in str(connection.connect().query("SELECT VERSION()").fetchone()[0])
 
 

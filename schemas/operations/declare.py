@@ -1,4 +1,4 @@
-"""Everything declared at once: what an account without the right to create tables relies on."""
+"""Declare all tables and queues at once, for accounts without the right to create them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def declare_all() -> None:
     activate()
     log = logging.getLogger("datajoint")
     level = log.level
-    log.setLevel(logging.ERROR)  # it warns of the types that it takes itself for the keys of a queue
+    log.setLevel(logging.ERROR)  # it warns of types that it chooses itself for the keys of a queue
     try:
         for table in computed_tables():
             jobs_of(table)  # declares it

@@ -1,4 +1,4 @@
-"""Folders whose content only their account may read; JSON files that are never half written; passwords from files."""
+"""Folders with private content, JSON files that are written completely or not at all, passwords from files."""
 
 from __future__ import annotations
 
@@ -17,20 +17,15 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
     write_text(path, json.dumps(content, indent=1), mode)
 
 
-def write_text(path: Path, text: str, mode: int = 0o600) -> None:
-    """Write a file with these permissions: aside and renamed, so that no reader and no power cut leaves half of it.
-
-    Raises
-    ------
-    OSError
-        It cannot be written; the file that was there is unchanged.
-    """
+def write_text(path: Path, content: str | bytes, mode: int = 0o600) -> None:
+    """Write a file with these permissions, atomically: no reader, and no power cut, leaves half of it. Raises OSError
+    if it cannot be written; the file that was there is unchanged."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "w", encoding="utf-8") as out:
+        with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as out:
             if hasattr(os, "fchmod"):  # not on Windows before Python 3.13
                 os.fchmod(out.fileno(), mode)
-            out.write(text)
+            out.write(content.encode() if isinstance(content, str) else content)
             out.flush()
             os.fsync(out.fileno())
         aside.replace(path)
@@ -52,7 +47,7 @@ def secret(name: str) -> str | None:
     try:
         text = Path(file).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        # An OSError names the file; what is wrong with the bytes of another is not repeated, they are the secret.
+        # An OSError names the file; the bytes of an undecodable file are the secret and are not repeated.
         said = (error.strerror or "it cannot be read") if isinstance(error, OSError) else "it is not text in UTF-8"
         raise PblError(
             "FILE_MISSING",
@@ -73,22 +68,19 @@ def secret(name: str) -> str | None:
     return text
 
 
-#: POSIX access control list (version 2, then tag, rights and no id of each entry) by which whatever is made in a folder
-#: belongs to its owner alone: owner rwx, group and others nothing.
+#: POSIX access control list (version 2, then tag, rights and no id of each entry) that gives the owner alone access to
+#: new content of a folder: owner rwx, group and others nothing.
 _OWNER_ONLY = struct.pack("<I", 2) + b"".join(
     struct.pack("<HHI", tag, rights, 0xFFFFFFFF) for tag, rights in ((0x01, 7), (0x04, 0), (0x20, 0))
 )
 
 
 def private_folder(path: Path) -> Path:
-    """Make a folder (0700) as far as it is missing, in which new files are 0600 and new folders 0700 under any umask.
+    """Make a missing folder (0700), in which new files are 0600 and new folders 0700 under any umask.
 
-    A folder that is there is not changed: who made it decided who may read it.
+    An existing folder is not changed: its maker decided who may read it.
 
-    Raises
-    ------
-    OSError
-        It cannot be made.
+    Raises OSError if it cannot be made.
     """
     if not path.is_dir():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -98,10 +90,10 @@ def private_folder(path: Path) -> Path:
 
 
 def make_private(path: Path) -> None:
-    """Make a folder 0700, and by default 0600 and 0700 what is made in it later.
+    """Make a folder 0700, and by default its later files 0600 and folders 0700.
 
-    A default access control list, which takes the umask's place, does the latter on the file systems of Linux that
-    have them; on others the folder's own mode keeps all others out.
+    A default access control list, which replaces the umask, does the latter on Linux file systems that support it; on
+    others the folder's own mode keeps all others out.
     """
     path.chmod(0o700)
     if hasattr(os, "setxattr"):
@@ -110,7 +102,7 @@ def make_private(path: Path) -> None:
 
 
 def sync_folders(path: Path, root: Path) -> None:
-    """Have the names in a folder, and in those above it up to `root`, on disk when this returns."""
+    """Flush the names in a folder, and in those above it up to `root`, to disk."""
     for folder in (path, *(p for p in path.parents if p.is_relative_to(root))):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -120,7 +112,7 @@ def sync_folders(path: Path, root: Path) -> None:
 
 
 def remove_empty(folder: Path, levels: int) -> None:
-    """Remove this folder and at most `levels - 1` above it, as far as they are empty."""
+    """Remove this folder and at most `levels - 1` above it while they are empty."""
     for _ in range(max(levels, 0)):
         try:
             folder.rmdir()

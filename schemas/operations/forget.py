@@ -1,11 +1,11 @@
 """Remove a person: every row, every queued job, every stored file, and write a list that proves it.
 
-Recordings (in the archive, the drop folder and where they were registered) go only where that is asked for; copies and
-temporary files that killed processes left go in any case.
+Recordings (in the archive, the drop folder and where they were registered) are deleted on request only; copies and
+temporary files of killed processes in any case.
 
 The columns of a row identify its person: a subject's code, or the number of a session, video or set of videos of that
-person. Every table that depends on a person has one of them (a test checks all foreign keys), also the queues, which
-have no foreign keys at all; DataJoint's cascading delete reaches neither queues nor files.
+person. Every table that depends on a person has one of them (a test checks all foreign keys). So do the queues, which
+have no foreign keys; DataJoint's cascading delete reaches neither queues nor files.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
 from schemas.operations import archive
 from schemas.operations.archive import archive_dir
 from schemas.operations.folders import remove_empty, write_json
-from schemas.rows import delete_below
-from schemas.store import files_below, purge, store_error
+from schemas.rows import delete_below, inside
+from schemas.store import files_below, purge, store_errors
 from schemas.subject_codes import check_subject
 
 from . import catalog
@@ -59,12 +59,6 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
     return gone, kept
 
 
-def find_recordings(subject: str) -> list[str]:
-    """Return the person's files in the archive, copies of a killed import included, and in the drop folder."""
-    parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)
-    return [str(p) for p in archive.of_person(archive_dir(), subject, parts)] + list(_uploads(_drop(), subject))
-
-
 def _drop() -> Folder | Bucket | None:
     url = os.environ.get("PBL_INCOMING")
     return drop_folder(url) if url else None
@@ -80,7 +74,7 @@ def delete_uploads(subject: str) -> list[str]:
     if drop is None:
         return gone
     for name, upload in _uploads(drop, subject).items():
-        with contextlib.suppress(OSError):  # what cannot be removed is found again, and named
+        with contextlib.suppress(OSError):  # a file that cannot be removed is found again, and named
             drop.remove(upload)
             gone.append(name)
     drop.remove_folders(subject)
@@ -90,7 +84,7 @@ def delete_uploads(subject: str) -> list[str]:
 def delete_archived(subject: str) -> tuple[list[str], dict[str, str]]:
     """Delete the person's files in the archive; return deleted paths, and path -> reason of those kept."""
     gone, kept = [], {}
-    for path in archive.of_person(archive_dir(), subject):
+    for path in archive.files_of_person(archive_dir(), subject):
         if video.Video & {"video_path": str(path)}:  # a file that was moved here
             kept[str(path)] = "another row names this path"
             continue
@@ -119,7 +113,7 @@ Ids = dict[str, list[Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """Everything there is of a person."""
+    """All that is stored of a person."""
 
     rows: dict[str, int]  # table -> number of rows
     files: list[str]  # paths in the store, including files without a row
@@ -152,12 +146,13 @@ def manifest_path(subject: str) -> Path:
 
 
 def find(subject: str) -> tuple[Ids, Found]:
-    """Return everything there is of a person; change nothing.
-
-    Raises `PblError` DB_NOT_FOUND when neither the database nor a list of an earlier run knows the subject.
-    """
+    """Return all that is stored of a person; change nothing. Raises `PblError` DB_NOT_FOUND when neither the database
+    nor a list of an earlier run knows the subject."""
     ids, earlier = _identities(subject), read_manifest(subject)
-    recordings = find_recordings(subject)
+    parts = ("", archive.REFUSED, archive.PHONE, archive.COPIES)  # copies are of a killed import
+    recordings = [str(p) for p in archive.files_of_person(archive_dir(), subject, parts)] + list(
+        _uploads(_drop(), subject)
+    )
     if not lab.Subject & {"subject": subject} and not earlier and not recordings:
         raise PblError(
             "DB_NOT_FOUND",
@@ -166,8 +161,11 @@ def find(subject: str) -> tuple[Ids, Found]:
             expected="the code of a subject",
             next_step="the codes are in `schemas.lab.Subject`; they are case-sensitive",
         )
-    for name, values in _still_free(earlier.get("ids", {})).items():
-        ids[name] = list(dict.fromkeys([*ids[name], *values]))
+    owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
+    for name, values in earlier.get("ids", {}).items():
+        # In a rebuilt database numbers of an earlier run may be another person's.
+        free = [v for v in values if name not in owners or not owners[name] & {name: v}]
+        ids[name] = list(dict.fromkeys([*ids[name], *free]))
     return ids, _find(ids, earlier, recordings)
 
 
@@ -177,13 +175,10 @@ def forget(subject: str, videos: bool = False, say: Say = lambda _: None) -> For
     Raises `PblError` DB_NOT_FOUND; DB_REFUSED while a worker computes something of this person or uploads are taken
     over, or without the right to delete; STORE_UNAVAILABLE.
 
-    Parameters
-    ----------
-    videos
-        Delete the video files as well, where they still are what was registered.
+    `videos`: also delete the video files that are unchanged since registration.
     """
     try:
-        with worker.alone(archive.LOCK, connection.connect()) as obtained:
+        with worker.installation_lock(archive.LOCK, connection.connect()) as obtained:
             if not obtained:
                 raise PblError(
                     "DB_REFUSED",
@@ -251,14 +246,6 @@ def _identities(subject: str) -> Ids:
     }
 
 
-def _still_free(ids: Ids) -> Ids:
-    """Return the numbers of an earlier run that are unused now: in a rebuilt database another person may have them."""
-    owners = {"session_id": session.Session, "video_id": video.Video, "fit_set": fit.FitSet}
-    return {
-        name: [v for v in values if name not in owners or not owners[name] & {name: v}] for name, values in ids.items()
-    }
-
-
 def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
     conn = connection.connect()
     rows: dict[str, int] = {}
@@ -282,7 +269,8 @@ def _find(ids: Ids, earlier: dict[str, Any], recordings: list[str]) -> Found:
     # All files in the person's folders: a computation that was killed leaves some without a row.
     store = connection.store_backend()
     files.update(path for folder in _folders(ids) for path in files_below(store, folder))
-    files.update(path for path in earlier.get("files", []) if path not in files and _exists(path))
+    with store_errors():
+        files.update(path for path in earlier.get("files", []) if path not in files and store.exists(path))
     return Found(rows, sorted(files), _videos(ids, earlier), running, recordings)
 
 
@@ -293,7 +281,7 @@ def personal_tables() -> list[tuple[str, str, list[Column]]]:
 
 
 def _whose(columns: Sequence[Column], ids: Ids) -> tuple[str, tuple]:
-    """Return an SQL condition for the person's rows, and its values; empty where the table can hold none."""
+    """Return an SQL condition for the person's rows, and its values; empty if the table can hold none."""
     names = {c.name for c in columns}
     parts, values = [], []
     for name in IDENTITIES:
@@ -320,15 +308,8 @@ def _folders(ids: Ids) -> list[str]:
     ]
 
 
-def _exists(path: str) -> bool:
-    try:
-        return bool(connection.store_backend().exists(path))
-    except Exception as error:
-        raise store_error(error) from error
-
-
 def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
-    rows = (video.Video & [{"video_id": v} for v in ids["video_id"]]).to_dicts() if ids["video_id"] else []
+    rows = (video.Video & inside("video_id", ids["video_id"])).to_dicts()
     now = [{"path": r["video_path"], "sha256": r["video_sha256"], "size": int(r["video_size"])} for r in rows]
     return now + [v for v in earlier.get("videos", []) if v not in now]
 
@@ -336,7 +317,9 @@ def _videos(ids: Ids, earlier: dict[str, Any]) -> list[dict[str, Any]]:
 # --------------------------------------------------------------------------------------------------------- removing
 def _delete_rows(subject: str, ids: Ids, say: Say) -> None:
     """Delete queued jobs first (no worker takes one then), the person with what depends on it, and the rest."""
-    cameras = _cameras(ids)
+    # Calibrations of the person's videos: their notes may name a file.
+    rows = video.Video & inside("video_id", ids["video_id"]) & "camera_id IS NOT NULL"
+    cameras = sorted({int(c) for c in rows.to_arrays("camera_id")})
     conn = connection.connect()
     tables = personal_tables()
     queues = [t for t in tables if t[1].startswith("~~")]
@@ -355,23 +338,13 @@ def _delete_where(conn: Any, tables: Sequence[tuple[str, str, list[Column]]], id
             conn.query(f"DELETE FROM {quote(schema, table)} WHERE {where}", args=values)  # noqa: S608
 
 
-def _cameras(ids: Ids) -> list[int]:
-    """Return the calibrations of the person's videos, whose note may name a file."""
-    if not ids["video_id"]:
-        return []
-    rows = video.Video & [{"video_id": v} for v in ids["video_id"]] & "camera_id IS NOT NULL"
-    return sorted({int(c) for c in rows.to_arrays("camera_id")})
-
-
 def _delete_files(files: Sequence[str], ids: Ids, say: Say) -> None:
     store = connection.store_backend()
     say(f"Removing {len(files)} files from the store")
     with progress.bar("files", total=len(files), unit="file") as update:
         for path in files:
-            try:
+            with store_errors():
                 store.remove(path)
-            except Exception as error:
-                raise store_error(error) from error
             if store.protocol == "file":
                 # The names of the folders carry the person's numbers.
                 remove_empty(Path(full_path(store, path)).parent, len(PurePosixPath(path).parts) - 4)
@@ -407,12 +380,12 @@ def _mentions(subject: str, videos: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def read_manifest(subject: str) -> dict[str, Any]:
-    """Return the list that an earlier run wrote; empty where there is none."""
+    """Return the list that an earlier run wrote; empty if there is none."""
     try:
         found = json.loads(manifest_path(subject).read_text(encoding="utf-8"))
         kinds = {"ids": dict, "files": list, "videos": list, "rows": dict}
         if not isinstance(found, dict) or not all(isinstance(found.get(n, k()), k) for n, k in kinds.items()):
-            raise TypeError("no list of a person's rows and files")
+            raise TypeError("not a list of a person's rows and files")
         return found
     except FileNotFoundError:
         return {}

@@ -1,4 +1,4 @@
-"""Files of the store that no row names, and rows whose file is gone; killed computations and full disks leave them."""
+"""Files of the store without a row, and rows without their file: remains of killed computations and full disks."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class Report:
 
 
 def orphans(young_s: float = YOUNG_S) -> Report:
-    """Compare the store with the rows. The rows are read after the files, so that no file is new to them.
+    """Compare the store with the rows, which are read after the files.
 
-    A row's file is written before the row and never changes: a file without a row that is older than a computation
-    can take to insert was left behind.
+    A file is written before its row and never changes: one without a row that is older than any insert takes is an
+    orphan.
     """
     files = {f.path: f for f in _files()}
     named = set(_named())
@@ -55,7 +55,7 @@ def orphans(young_s: float = YOUNG_S) -> Report:
 
 
 def remove(found: Report, older_than_s: float) -> int:
-    """Delete orphans of that age, after asking the database once more about each; returns how many."""
+    """Delete orphans of that age that are still without a row; return how many."""
     store, n = connection.store_backend(), 0
     named = set(_named())
     for file in found.orphans:
@@ -82,7 +82,7 @@ def _files() -> Iterator[StoredFile]:
 
 
 def _named() -> Iterator[str]:
-    """Yield the paths of the store that rows name, read through a separate connection, a row at a time."""
+    """Yield the paths of the store that rows name, streamed through a separate connection."""
     with closing(connection.plain_connection()) as server:
         for (schema, table), columns in tables().items():
             for column in (quote(c.name) for c in columns if c.names_files):

@@ -1,4 +1,4 @@
-"""Accounts on the database server that have only the rights their work needs.
+"""Accounts on the database server with only the rights that their work needs.
 
 | role | may |
 |---|---|
@@ -6,8 +6,8 @@
 | worker | read, insert, change and delete rows; no table is created, changed or dropped |
 | analyst | read |
 
-The statements are the same on MySQL 8 and MariaDB. DataJoint creates tables when it first meets them, so an admin
-declares all of them before (`pbl db init`, `pbl db migrate`).
+The statements are the same on MySQL 8 and MariaDB. DataJoint creates tables on first use, so an admin declares all of
+them before (`pbl db init`, `pbl db migrate`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Account:
     role: str
     user: str
     host: str  # where it may connect from, as in MySQL: `%` is anywhere
-    schemas: tuple[str, ...] = ()  # custom schemas, without the prefix, with all rights; `mylab` includes `mylab_...`
+    schemas: tuple[str, ...] = ()  # custom schemas with all rights, without the prefix; `mylab` includes `mylab_...`
 
     def __post_init__(self) -> None:
         for name in self.schemas:
@@ -117,10 +117,8 @@ def _own(name: str) -> str:
 
 
 def password_file(folder: Path, account: Account) -> Path:
-    """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600).
-
-    Raises `PblError` FILE_UNWRITABLE, FILE_MISSING.
-    """
+    """Return the file with the account's password; a missing one is made, with 192 random bits (mode 0600). Raises
+    `PblError` FILE_UNWRITABLE, FILE_MISSING."""
     path = folder / account.user
     expected, next_step = "a folder for passwords that you may write to", "pass another folder with --secrets"
     with os_errors_as("FILE_UNWRITABLE", expected, next_step, path), contextlib.suppress(FileExistsError):
@@ -148,10 +146,8 @@ def read_password(path: Path) -> str:
 
 
 def apply(accounts: Sequence[tuple[Account, str]], require_tls: bool = False) -> None:
-    """Create the accounts or bring them to these passwords and the rights of their roles.
-
-    Raises `PblError` DB_REFUSED when the login (DJ_USER) may not manage accounts; what `connection.connect` raises.
-    """
+    """Create the accounts or bring them to these passwords and the rights of their roles. Raises `PblError` DB_REFUSED
+    when the login (DJ_USER) may not manage accounts; what `connection.connect` raises."""
     _run([s for account, password in accounts for s in statements(account, password, require_tls)])
 
 

@@ -31,7 +31,7 @@ def values_by(old: str, new: str) -> tuple[list[pd.DataFrame], pd.DataFrame]:
     """Return index and measures of the current results by each of two methods, whose other methods are the same, as
     `validation.bridge_pairs` takes them, and the comparisons of visits that the change touches (`validation.touched`).
 
-    old, new: keys of methods, such as "blazepose-v6". Raises `PblError` SOLVER_UNKNOWN where no column has both.
+    old, new: keys of methods, such as "blazepose-v6". Raises `PblError` SOLVER_UNKNOWN if no column has both.
     """
     import pandas as pd
 
@@ -105,7 +105,7 @@ class Cycle:
 @dataclasses.dataclass(frozen=True)
 class Score:
     """A clinical score. change: against the reference; important: whether that is at least the minimal important change
-    of the instrument for a score like that of the reference, None where none is taken over."""
+    of the instrument for a score like that of the reference, None if none is taken over."""
 
     value: float
     change: float | None
@@ -126,7 +126,7 @@ class Side:
 
     @property
     def far_leg(self) -> str:
-        """The leg whose curves are less certain, as one camera saw it behind the other; empty where there is none."""
+        """The leg whose curves are less certain, as one camera saw it behind the other; empty if there is none."""
         filming = None if self.about.result is None else self.about.result.filming
         return "" if filming is None else filming.far_leg
 
@@ -142,7 +142,7 @@ class Comparison:
 
     @property
     def same_methods(self) -> bool:
-        """Whether one chain of methods made all results that there are."""
+        """True if one chain of methods made all results."""
         return len({(r.kind, r.methods) for c in self.compared if (r := c.about.result) is not None}) <= 1
 
 
@@ -151,13 +151,8 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
 
     Raises `PblError` USAGE for fewer than two or more than six, DB_NOT_FOUND for an unknown visit or result.
 
-    Parameters
-    ----------
-    chosen
-        `session_id` of each, and which of its results (the order of `visit_list.results_of`); None: by the chain of
-        methods that most of the visits have.
-    reference
-        One of `chosen`; None: the earliest.
+    `chosen`: `session_id` of each, and which of its results (the order of `visit_list.results_of`); None: by the chain
+    of methods that most of the visits have. `reference`: one of `chosen`; None: the earliest.
     """
     chosen = list(dict.fromkeys(chosen))
     if not FEWEST <= len(chosen) <= MOST:

@@ -1,4 +1,4 @@
-"""How the walks of results were filmed, from the rows of their recordings: a few queries for many visits."""
+"""Circumstances of filming of results, from the rows of their recordings: a few queries for many visits."""
 
 from __future__ import annotations
 

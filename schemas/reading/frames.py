@@ -74,13 +74,9 @@ def visit_frame(restriction: Any = True, chain: Any = True) -> pd.DataFrame:
     is in the study, measures and index of the current set, and every clinical score as a column of its instrument's
     name.
 
-    Parameters
-    ----------
-    restriction
-        Of the visits: `study.Visit`, subject, session label and date, population.
-    chain
-        Of the methods and the kind, such as `{"fit_method": "blazepose-v5", "fit_set_kind": "single"}`, where the
-        tables hold several chains.
+    `restriction` of the visits: `study.Visit`, subject, session label and date, population. `chain` of the methods
+    and the kind, such as `{"fit_method": "blazepose-v5", "fit_set_kind": "single"}`, where the tables hold several
+    chains.
     """
     visits = study.Visit * _sessions() & restriction
     sets = newest_sets()
@@ -124,7 +120,7 @@ def frame_of(query: Any) -> Any:
 def force_frame(restriction: Any = True) -> pd.DataFrame:
     """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
     the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
-    null with the reason in `force_missing`."""
+    null if unknown, with the reason in `force_missing`."""
     from pbl_pipeline.kinetics.types import WIDTH_SD
 
     forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
@@ -235,7 +231,7 @@ def video_summary(restriction: Any = True) -> pd.DataFrame:
 
 
 def quality_summary(restriction: Any = True) -> pd.DataFrame:
-    """Every check of the current visits that is not PASS, with its value, threshold and advice."""
+    """Return all checks of the current visits that are not PASS, with value, threshold and advice."""
     checks = qc.SessionQc.Check & "qc_check_outcome != 'PASS'"
     return (current_sets() * checks & restriction).to_pandas(order_by="session_id, qc_no").reset_index()
 
@@ -260,15 +256,13 @@ def validation_curves(frame: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     from pbl_pipeline import validation as lib
-    from pbl_pipeline.fit import TrialFit
 
     wanted = set(zip(frame["trial"], frame["detector"], frame["solver"], strict=True))
     parts = [pd.DataFrame(columns=list(lib.CURVE_COLUMNS))]
     for key, row in _compared():
         if (row.trial, row.detector, row.solver) not in wanted:
             continue
-        with stored_file(file_ref((fit.SessionFit.Trial & key).fetch1("trial_file"))) as path:
-            trial = TrialFit.load(path)
+        trial = fit.load_trial(file_ref((fit.SessionFit.Trial & key).fetch1("trial_file")))
         references = validation.ReferenceKinematics
         with stored_file(file_ref((references & key).fetch1("reference_file"))) as path:
             truth = lib.Reference.load(path)

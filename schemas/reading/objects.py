@@ -33,7 +33,7 @@ def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
-    """The library's `Keypoints` of one row, named by its key or by a query that holds it alone."""
+    """Return the library's `Keypoints` of one row, by its key or a query of it alone."""
     from pbl_pipeline.keypoints import Keypoints
 
     ref = file_ref(row_of(keypoints.Keypoints, _keys(key), rows)["keypoints_file"])
@@ -42,16 +42,12 @@ def load_keypoints(key: Any, rows: Rows = stored_rows) -> Keypoints:
 
 
 def load_trial_fit(key: Any, rows: Rows = stored_rows) -> TrialFit:
-    """The library's `TrialFit` of one row of SessionFit.Trial, named by its key or by a query that holds it alone."""
-    from pbl_pipeline.fit import TrialFit
-
-    ref = file_ref(row_of(fit.SessionFit.Trial, _keys(key), rows)["trial_file"])
-    with stored_file(ref) as path:
-        return TrialFit.load(path)
+    """Return the library's `TrialFit` of one row of SessionFit.Trial, by its key or a query of it alone."""
+    return fit.load_trial(file_ref(row_of(fit.SessionFit.Trial, _keys(key), rows)["trial_file"]))
 
 
 def _keys(key: Any) -> Any:
-    """A query without its other columns, by which DataJoint joins no table; any other restriction as it is."""
+    """Return a query without its other columns, on which DataJoint joins no table; any other restriction unchanged."""
     return key.proj() if hasattr(key, "proj") else key
 
 
@@ -112,7 +108,7 @@ def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     """The library's `GaitMetrics` of one row of SessionGdi, from the rows of its trials and its own: nothing is
-    computed anew but the checks of a trial's cycles."""
+    recomputed but the checks of a trial's cycles."""
     from pbl_pipeline import gait as lib
     from pbl_pipeline.gait.metrics_file import INDEX_CHECKS
 
@@ -224,7 +220,7 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
 
 
 def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics | None:
-    """The library's `Kinetics` of one row of SessionGdi, of several methods the one that was computed last; None where
+    """The library's `Kinetics` of one row of SessionGdi, of several methods the one that was computed last; None if
     there are none."""
     from pbl_pipeline import kinetics as lib
 

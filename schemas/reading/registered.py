@@ -1,4 +1,4 @@
-"""What is registered: people, visits, videos and methods as frames, a row for each."""
+"""Registered people, visits, videos and methods as frames, a row for each."""
 
 from __future__ import annotations
 
@@ -112,8 +112,8 @@ def videos(restriction: Any = True) -> pd.DataFrame:
 
 
 def decisions(restriction: Any = True) -> pd.DataFrame:
-    """One row per decision of a person about a visit or a video, the newest first; what it is about, was before and is
-    now as JSON."""
+    """One row per decision of a person about a visit or a video, the newest first; its subject, the state before and
+    after as JSON."""
     return _of_visits(review.Decision, "decision", restriction)
 
 
@@ -124,10 +124,7 @@ def looks(restriction: Any = True) -> pd.DataFrame:
 
 def method_rows(stage: str | None = None) -> pd.DataFrame:
     """One row per method: the stage, its key and short name (which means the newest version), and whether it is the
-    stage's default.
-
-    Raises `PblError` SOLVER_UNKNOWN for an unknown stage.
-    """
+    stage's default. Raises `PblError` SOLVER_UNKNOWN for an unknown stage."""
     import pandas as pd
 
     tables = {table.stage: table for table in METHOD_TABLES}
@@ -170,7 +167,7 @@ def _visits() -> Any:
 
 
 def _counted(rows: Any, key: str, *counts: Any) -> Any:
-    """Rows with the columns of queries that count by `key`; 0 where a query has no row."""
+    """Rows with the columns of queries that count by `key`; 0 if a query has no row."""
     for query in counts:
         rows = rows.merge(frame_of(query), how="left", on=key)
         for name in set(query.heading.names) - {key, "first", "last"}:

@@ -1,4 +1,4 @@
-"""Visits and recordings as pages show them: the library's `Visit` or `Recording` with what people decided around it."""
+"""Visits and recordings as pages show them: the library's `Visit` or `Recording` with the decisions about it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ShownCheck:
 
     @property
     def may_be_accepted(self) -> bool:
-        """Whether a person can accept it (`review_decisions.may_be_accepted`)."""
+        """True if a person can accept it (`review_decisions.may_be_accepted`)."""
         return may_be_accepted(self.check.check, self.check.outcome)
 
 
@@ -45,7 +45,7 @@ class ShownVisit:
 
     row: VisitRow  # its line in the list of visits
     recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
-    load_visit: Callable[[], Visit] | None = None  # loads `visit`; None where nothing is computed yet
+    load_visit: Callable[[], Visit] | None = None  # loads `visit`; None if nothing is computed yet
     results: tuple[Result, ...] = ()  # by every chain of methods
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
@@ -97,7 +97,7 @@ class ShownRecording:
     lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
 
     def fitted(self) -> Recording:
-        """Return the recording, which has a fit. Raises `PblError` DB_NOT_FOUND where it has none."""
+        """Return the recording, which has a fit. Raises `PblError` DB_NOT_FOUND if it has none."""
         if self.recording.fitted:
             return self.recording
         raise PblError(
@@ -125,10 +125,8 @@ def _problem(video_id: int) -> str:
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
-    """Return a visit by its number; `shown`: which of its results.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit or result.
-    """
+    """Return a visit by its number; `shown`: which of its results. Raises `PblError` DB_NOT_FOUND for an unknown visit
+    or result."""
     of_person = visits_of(str(session.registered_visit(session_id)["subject"]))
     results = tuple(results_of([session_id])[session_id])
     if not 0 <= shown < max(1, len(results)):
@@ -147,7 +145,11 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     )
     if not results:
         return about
-    key = _key_of(session_id, results[shown])
+    names = ("fit_method", "gait_method", "gdi_method", "norm")
+    chain = dict(zip(names, results[shown].methods, strict=True))
+    # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
+    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": results[shown].kind}).proj()
+    key = dict((gdi.SessionGdi.proj() & (fit.current().proj() * sets).proj() & chain).keys()[0])
     of_result = {"session_id": session_id, **key, "fit_set_kind": results[shown].kind}
     return dataclasses.replace(
         about,
@@ -163,7 +165,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
 
 
 def computed_visit(session_id: int, shown: int) -> ShownVisit:
-    """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND where it has none."""
+    """Return `shown_visit` of a visit that has a result. Raises also `PblError` DB_NOT_FOUND if it has none."""
     about = shown_visit(session_id, shown)
     if about.load_visit is None:
         raise PblError(
@@ -176,10 +178,8 @@ def computed_visit(session_id: int, shown: int) -> ShownVisit:
 
 
 def shown_recording(video_id: int) -> ShownRecording:
-    """Return a recording by its number, without opening its arrays.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown number.
-    """
+    """Return a recording by its number, without opening its arrays. Raises `PblError` DB_NOT_FOUND for an unknown
+    number."""
     recording = load_recording(video_id)
     visits = video.Video.proj("session_id") * session.Session.proj("subject", "session_label")
     named = (visits & {"video_id": video_id}).fetch1()
@@ -200,17 +200,15 @@ def shown_recording(video_id: int) -> ShownRecording:
 
 
 def video_facts(recording: Recording) -> dict[str, Any]:
-    """Return duration (s), number of frames, width and height (px) of a recording's video; empty where not known."""
+    """Return duration (s), number of frames, width and height (px) of a recording's video; empty if not known."""
     info = recording.video
     names = ("duration_s", "n_frames", "width_px", "height_px")
     return {} if info is None else {name: getattr(info, name) for name in names}
 
 
 def computations(video_id: int) -> tuple[Any, ...]:
-    """Return what tells apart the computations that the shown fit of a recording and its events come from.
-
-    Raises as `ShownRecording.fitted`.
-    """
+    """Return the identity of the computations of the shown fit of a recording and its events. Raises as
+    `ShownRecording.fitted`."""
     key = fit.trial_key(video_id)
     if key is None:
         shown_recording(video_id).fitted()
@@ -220,15 +218,6 @@ def computations(video_id: int) -> tuple[Any, ...]:
     events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
     correction = None if found is None else gait.correction_of(found)
     return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, correction)))
-
-
-def _key_of(session_id: int, result: Result) -> dict[str, Any]:
-    names = ("fit_method", "gait_method", "gdi_method", "norm")
-    chain = dict(zip(names, result.methods, strict=True))
-    # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.
-    sets = (fit.FitSet & {"session_id": session_id, "fit_set_kind": result.kind}).proj()
-    current = fit.current().proj() * sets
-    return dict((gdi.SessionGdi.proj() & current.proj() & chain).keys()[0])
 
 
 def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]]:

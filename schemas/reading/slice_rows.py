@@ -24,10 +24,8 @@ def slice_row(name: str) -> dict[str, Any]:
 
 
 def chain_of(name: str) -> tuple[dict[str, str], list[str]]:
-    """Kind and methods of a slice's results, from the fit on, and the sets of the visits that count.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown slice.
-    """
+    """Kind and methods of a slice's results, from the fit on, and the sets of the visits that count. Raises `PblError`
+    DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     own = study.StudySliceVisit & {"study_slice": name, "slice_included": True} & "slice_fit_set != ''"
     later = ("fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")

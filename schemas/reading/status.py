@@ -1,4 +1,4 @@
-"""How far the tables are: counts, errors with their next step, videos that wait for a choice."""
+"""State of the tables: counts, errors with their next step, videos that wait for a choice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..operations.catalog import quote
 #: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
 
-#: Columns that say "ran well, nothing to produce": table -> (status, values, reason or None where a table above says).
+#: Columns that mean "ran well, nothing to produce": table -> (status, values, column of the reason or None).
 EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
     "SubjectChoice": ("choice_status", ("NO_PERSON",), "choice_reason"),
     "GaitEvents": ("events_status", ("EMPTY",), "events_reason"),
@@ -134,13 +134,9 @@ class Status:
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     """Query the state of all computed tables. `schemas.activate()` must have been called.
 
-    Parameters
-    ----------
-    exact
-        Also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000 videos).
-        None: where there are fewer than `SMALL` videos.
-    most
-        Errors, empty, waiting and not usable rows that are listed, each; the counts are of all.
+    `exact`: also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000
+    videos). None: where there are fewer than `SMALL` videos. `most`: errors, empty, waiting and not usable rows that
+    are listed, each; the counts are of all.
     """
     n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
     exact = n_videos < SMALL if exact is None else exact
@@ -178,7 +174,7 @@ def _table_status(
 
 
 def _side_by_side(questions: Sequence[Callable[[Any], Any]], at_once: int = 4) -> list[Any]:
-    """Answers of functions of a connection, in their order, so many at a time: each thread has its own connection."""
+    """Return the answers of functions of a connection, in their order, `at_once` at a time on separate connections."""
     free: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def ask(question: Callable[[Any], Any]) -> Any:
@@ -196,7 +192,7 @@ def _side_by_side(questions: Sequence[Callable[[Any], Any]], at_once: int = 4) -
 
 
 def camera_kinds(server: Any) -> dict[str, int]:
-    """Where the intrinsics of the keypoints come from, and of how many."""
+    """Return the sources of the intrinsics of the keypoints, with how many each has."""
     table = keypoints.Keypoints.full_table_name
     rows = server.query(
         f"SELECT camera_kind, COUNT(*) FROM {table} GROUP BY camera_kind ORDER BY COUNT(*) DESC, camera_kind"  # noqa: S608
@@ -205,8 +201,8 @@ def camera_kinds(server: Any) -> dict[str, int]:
 
 
 def queue_name(table: Any) -> tuple[str, str]:
-    """Schema and name of a computed table's queue, as DataJoint names it. It reads all foreign keys of the server for
-    the object (`jobs_of`), which takes longer than to count a queue's rows."""
+    """Return schema and name of a computed table's queue. The object of the queue (`jobs_of`) would read all foreign
+    keys of the server, which takes longer than counting its rows."""
     return str(table.database), "~~" + str(table.table_name).lstrip("_")
 
 
@@ -217,8 +213,8 @@ def queues(server: Any) -> set[tuple[str, str]]:
 
 
 def queue_counts(server: Any) -> dict[str, dict[str, int]]:
-    """Job rows of each computed table by status; none where the queue was never used. Only `server` is asked, so that
-    a thread may call it with a connection of its own."""
+    """Return the numbers of job rows of each computed table by status. Only `server` is queried, so that a thread can
+    use its own connection."""
     there, out = queues(server), {}
     for table in computed_tables():
         out[table.__name__] = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
@@ -229,7 +225,7 @@ def queue_counts(server: Any) -> dict[str, dict[str, int]]:
 
 
 def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
-    """Jobs an hour of each table, over the last `minutes` in which workers finished any of it."""
+    """Return the jobs an hour of each table over the last `minutes`, from the first finished one."""
     table = worker.Throughput.full_table_name
     rows = server.query(
         f"SELECT stage, SUM(n_done), TIMESTAMPDIFF(SECOND, MIN(minute), CURRENT_TIMESTAMP) FROM {table}"  # noqa: S608
@@ -240,7 +236,7 @@ def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
 
 
 def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
-    """Workers whose heart beat lately: host, process, resource, what they do."""
+    """Return the workers with a recent heartbeat: host, process, resource, current job."""
     alive = worker.Worker & "worker_stopped IS NULL"
     alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
     names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
@@ -248,7 +244,7 @@ def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
 
 
 def running(most: int = 200) -> list[Running]:
-    """Jobs in workers' hands, the oldest first; of each table as many as are asked for."""
+    """Return the running jobs, oldest first; at most so many of each table."""
     out = []
     for table, counts in zip(computed_tables(), queue_counts(video.Video.connection).values(), strict=True):
         if counts["reserved"]:
@@ -261,7 +257,7 @@ def running(most: int = 200) -> list[Running]:
 
 
 def span(seconds: float | None) -> str:
-    """A duration in the largest unit of which it has at least 1: 45 s, 12 min, 3.5 h, 2.1 d."""
+    """Return a duration in a suitable unit: 45 s, 12 min, 3.5 h, 2.1 d."""
     if seconds is None:
         return "-"
     for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
@@ -272,7 +268,7 @@ def span(seconds: float | None) -> str:
 
 
 def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
-    """Age (s) of the oldest pending job, and why jobs that were put back wait."""
+    """Return the age (s) of the oldest pending job, and the reason for which jobs were put back."""
     jobs = quote(*queue_name(table))
     age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
@@ -285,7 +281,7 @@ def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
 
 
 def _rows(table: Any, server: Any) -> tuple[int, int, int]:
-    """All rows, those that are empty, those that wait for a choice. Narrow indexes answer, the rows are not read."""
+    """Return the numbers of all, empty and waiting rows of a table, from narrow indexes."""
     if table.__name__ not in EMPTY_COLUMNS:
         return int(server.query(f"SELECT COUNT(*) FROM {table.full_table_name}").fetchone()[0]), 0, 0  # noqa: S608
     column, values, _ = EMPTY_COLUMNS[table.__name__]
@@ -295,7 +291,7 @@ def _rows(table: Any, server: Any) -> tuple[int, int, int]:
 
 
 def empty_rows(table: Any) -> Any:
-    """Rows of a computed table that say "ran well, nothing to produce"."""
+    """Return the rows of a computed table that mean "ran well, nothing to produce"."""
     if table.__name__ not in EMPTY_COLUMNS:
         return table & False
     column, values, _ = EMPTY_COLUMNS[table.__name__]
@@ -308,7 +304,7 @@ def _empty(names: Collection[str], most: int) -> list[EmptyRow]:
         reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
         if reason is None or table.__name__ not in names or "video_id" not in table.primary_key:
             continue
-        said = {e.video_id for e in out}  # the first table that has nothing knows why
+        said = {e.video_id for e in out}  # the first empty table has the reason
         for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id", limit=most):
             if int(row["video_id"]) in said:
                 continue

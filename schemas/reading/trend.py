@@ -1,4 +1,4 @@
-"""All visits of a person in time: the index or a measure of each, with its interval and its changes."""
+"""Visits of a person in time: the index or a measure of each, with its interval and changes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INDEX = "gdi"
 class Point:
     """The value of a visit.
 
-    value: None where it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
+    value: None if it is not known, for the reason. bounds: its 90 % interval, of its whole error where error and
     least, its minimal detectable change, are known, else of the spread of its cycles or repetitions alone. before: the
     change since the visit before with a value; first: since the first one.
     """
@@ -58,10 +58,8 @@ class Trend:
 
 
 def trend_of(session_id: int, measure: str = INDEX) -> Trend:
-    """Return all visits of the person of a visit.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an unknown measure.
-    """
+    """Return all visits of the person of a visit. Raises `PblError` DB_NOT_FOUND for an unknown visit, USAGE for an
+    unknown measure."""
     from pbl_pipeline.gait import TASK_MEASURES
 
     subject = str(session.registered_visit(session_id)["subject"])

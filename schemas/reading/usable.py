@@ -1,4 +1,4 @@
-"""Whether a recording can be used, as soon as something is known: while the person is still there."""
+"""Early verdict on a recording, while the person is still present."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .. import gait, keypoints, qc, video
 from .shown import shown_visit
 from .why import why
 
-#: Verdicts on a recording: nothing is known yet; it can be used; it can, with remarks; it cannot.
+#: Verdicts on a recording: not known yet; usable; usable with remarks; unusable.
 PENDING, USABLE, REMARKS, UNUSABLE = "pending", "usable", "remarks", "unusable"
 
 
@@ -26,8 +26,8 @@ class Usable:
 
 @dataclasses.dataclass(frozen=True)
 class Next:
-    """What one more pass would bring: half the 90 % interval of the index now and after it, and the side from which it
-    is filmed ("left", "right", or "" for front and back)."""
+    """Gain of one more pass: half the 90 % interval of the index now and after it, and the side from which it is filmed
+    ("left", "right", or "" for front and back)."""
 
     side: str
     now: float
@@ -35,7 +35,8 @@ class Next:
 
 
 def usable(video_id: int) -> Usable:
-    """Return what is known of a recording by the checks of its keypoints, its gait cycles, or what stopped it."""
+    """Return the verdict on a recording by the checks of its keypoints, its gait cycles, or the error that stopped
+    it."""
     key = {"video_id": video_id}
     if video.NotUsable & key:
         return Usable(UNUSABLE, ((video.NotUsable & key).fetch1("unusable_reason"),))
@@ -77,7 +78,7 @@ def next_pass(session_id: int) -> Next | None:
 
 
 def computed(session_id: int) -> tuple[str, ...]:
-    """Return what tells apart the results of a visit."""
+    """Return the identity of the results of a visit."""
     return tuple(str(t) for t in (qc.SessionQc & {"session_id": session_id}).to_arrays("qc_computed"))
 
 

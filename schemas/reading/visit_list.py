@@ -1,7 +1,7 @@
-"""A list of visits to look through: searched, filtered, a page at a time, each with its index, its trend and its state.
+"""List of visits: searched, filtered, a page at a time, each with its index, its trend and its state.
 
-Plain SQL with arguments: what a person types is never part of a statement, and a page of 50,000 visits is one question
-for the numbers and a few for the rows that are shown (`python -m research.benchmarks.visit_list`).
+Plain SQL with arguments: user input is never part of a statement, and a page of 50,000 visits is one query for the
+numbers and a few for the rows that are shown (`python -m research.benchmarks.visit_list`).
 """
 
 # Names of tables are DataJoint's own, quoted, and every value is an argument.
@@ -30,7 +30,7 @@ from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: States of a visit to filter by. empty: no one is in any of its usable videos; unusable: it has no usable video.
+#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video.
 STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
@@ -62,8 +62,8 @@ class Result:
     """Index and checks of the current set of a visit by one chain of methods.
 
     sd: of the error of the index; minimal_change: minimal detectable change between two such visits (90 %).
-    outcome: worst check, empty before the checks are computed, ACCEPTED where a person accepted every one that asked
-    for attention; worst: the names of those that nobody accepted. corrected: a person corrected events.
+    outcome: worst check, empty before the checks are computed, ACCEPTED if a person accepted every one that asked
+    for attention; worst: the names of those that no one accepted. corrected: a person corrected events.
     """
 
     kind: str
@@ -76,7 +76,7 @@ class Result:
     outcome: str
     worst: tuple[str, ...]
     corrected: bool = False
-    filming: Filming | None = None  # how it was filmed; None where it was not looked up
+    filming: Filming | None = None  # how it was filmed; None if it was not looked up
 
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
@@ -89,8 +89,8 @@ class Change:
     """Change of a value against that of another result.
 
     real: probability that the true change goes the same way; important: that it does by at least the minimal important
-    change, None where there is none for the value. Both are None where the change cannot be judged. sure: whether it is
-    at least `least`, None where it cannot be judged. differs: why it cannot, with what is not alike in the two results:
+    change, None if there is none for the value. Both are None if the change cannot be judged. sure: whether it is
+    at least `least`, None if it cannot be judged. differs: why it cannot, with what is not alike in the two results:
     "checks" (one is not to be used, or in doubt by `DOUBTS`), "methods", "corrected" (events), "error" (not known), or
     what `filming.differences` finds; with a verdict it is at most the view, by which `least` is that of visits filmed
     from other sides.
@@ -151,10 +151,7 @@ class Page:
 def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int = PAGE) -> Page:
     """A page of the visits that `wanted` lets through, newest day first, then highest number.
 
-    Parameters
-    ----------
-    after
-        `Page.after` of the page before: a day (ISO) and a number. None: the first page.
+    `after`: `Page.after` of the page before: a day (ISO) and a number. None: the first page.
     """
     joins, where, args = _asked(wanted)
     if after is not None:
@@ -178,7 +175,7 @@ def visit_page(wanted: Filter, after: tuple[str, int] | None = None, size: int =
 
 
 def change_since(result: Result, before: Result) -> Change | None:
-    """The change of the index from one result to another; None where one of them has no index.
+    """The change of the index from one result to another; None if one of them has no index.
 
     Filmed alike, a change is more than chance from the larger of the two minimal changes on. Filmed from other sides,
     the errors of the two views do not cancel: from Z90 sqrt(sd1^2 + sd2^2) on, of the sds of their whole errors.
@@ -199,12 +196,8 @@ def judged(
 ) -> Change:
     """Judge a change.
 
-    Parameters
-    ----------
-    errors
-        Standard deviation of the error, and minimal detectable change, of both values; None where one is not known.
-    differs
-        What was not alike (`not_alike`).
+    `errors`: standard deviation of the error, and minimal detectable change, of both values; None if one is not
+    known. `differs`: what was not alike (`not_alike`).
     """
     from pbl_pipeline.gait import Z90, chances, change_sd
 
@@ -236,7 +229,7 @@ def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
-    """All visits of a person, newest first."""
+    """Return all visits of a person, newest first."""
     newest_first = "ORDER BY s.session_date DESC, s.session_id DESC"
     rows = _ask(f"SELECT {_VISIT} FROM {_visits()} WHERE s.subject = %s {newest_first}", [subject])
     return _visit_rows(rows)
@@ -297,8 +290,8 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
 
 
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
-    """Checks that ask for attention and that nobody accepted, by the key of a result of these visits of which somebody
-    accepted one since it was computed."""
+    """Return the open checks (WARN, not accepted) of the results of these visits of which at least one was accepted
+    since they were computed, by the key of the result."""
     accepted: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
         about = row["decision_about"]
@@ -310,14 +303,6 @@ def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
         if any(is_accepted(r, about) for r in rows for about in decided):
             found[of] = {r["qc_check"] for r in rows if not any(is_accepted(r, about) for about in decided)}
     return found
-
-
-def _settled() -> set[int]:
-    """Visits in which a person accepted every check that asked for attention."""
-    asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
-    found = results_of(int(i) for i in asked.to_arrays("session_id"))
-    outcomes = {i: {r.outcome for r in results} for i, results in found.items()}
-    return {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
 
 
 # --------------------------------------------------------------------------------------------------------- the filter
@@ -359,13 +344,17 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
     if wanted.quality:
         only("j", f"{_judged()} WHERE q.qc_outcome = %s", "WARN" if wanted.quality == "ACCEPTED" else wanted.quality)
         if wanted.quality in ("WARN", "ACCEPTED"):
-            settled = _settled()
+            asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
+            of_visits = results_of(int(i) for i in asked.to_arrays("session_id"))
+            outcomes = {i: {r.outcome for r in results} for i, results in of_visits.items()}
+            # Visits in which a person accepted every check that asked for attention.
+            settled = {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
             if wanted.quality == "WARN":
                 outside(settled)
             else:
                 add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
     if wanted.state in ("computed", "pending"):
-        # Asked for first: as a part of the question the server would answer them for each visit.
+        # Queried first: as subqueries the server would evaluate them for each visit.
         questions = (_waiting(), _failed(), _empty(), _unusable())
         apart = {int(i) for question in questions for (i,) in _ask(question, [])}
         unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
@@ -420,10 +409,10 @@ def _waiting() -> str:
 def _empty() -> str:
     """Visits without a person in any of their usable videos."""
     videos, chosen = _name(video.Video), _name(tracking.SubjectChoice)
-    nobody = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
-    some = f"SELECT b.session_id FROM {videos} b JOIN ({nobody}) c ON c.video_id = b.video_id"
+    without = f"SELECT t.video_id FROM {chosen} t WHERE t.choice_status = 'NO_PERSON' AND {_is_usable('t')}"
+    some = f"SELECT b.session_id FROM {videos} b JOIN ({without}) c ON c.video_id = b.video_id"
     return (
-        f"SELECT o.session_id FROM {videos} o LEFT JOIN ({nobody}) n ON n.video_id = o.video_id"
+        f"SELECT o.session_id FROM {videos} o LEFT JOIN ({without}) n ON n.video_id = o.video_id"
         f" WHERE o.session_id IN ({some}) AND {_is_usable('o')}"
         " GROUP BY o.session_id HAVING SUM(n.video_id IS NULL) = 0"
     )
@@ -452,7 +441,7 @@ def _failed(column: str = "") -> str:
         if queue_name(table) not in there:
             continue
         jobs, names = quote(*queue_name(table)), table.heading.primary_key
-        if "fit_set" in names:  # of an older set nobody waits for
+        if "fit_set" in names:  # jobs of older sets do not count
             same = "c.fit_set = e.fit_set AND c.fit_method = e.fit_method AND c.fit_current = 1"
             of = f"{_name(fit.FitSet)} o USING (fit_set) JOIN {_name(fit.FitSelection)} c ON {same}"
             failed = f"{jobs} e JOIN {of} WHERE e.status = 'error'"

@@ -1,4 +1,4 @@
-"""What is still to be computed of a visit: what waits, what runs where, what failed and what helps."""
+"""Pending computations of a visit: queued, running and failed jobs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Scope:
     current: bool = False
 
     def where(self, table: Any) -> str | None:
-        """Condition on the first column of a table's key; None where nothing of it belongs to these."""
+        """Return the condition on the first column of a table's key; None if no row can belong to these."""
         if "fit_set" not in table.heading.primary_key:
             return f"video_id in ({','.join(map(str, self.videos))})" if self.videos else None
         rows: Any = fit.FitSet & f"session_id in ({','.join(map(str, self.sessions))})" if self.sessions else None
@@ -39,7 +39,7 @@ def of_visit(session_id: int) -> Scope:
 
 @dataclasses.dataclass(frozen=True)
 class Failed:
-    """A computation that failed: of which table, the code of its error, what was found and what to do."""
+    """A failed computation: its table, the code of the error, what was found, and the remedy."""
 
     table: str
     code: str
@@ -58,12 +58,12 @@ class Progress:
 
     @property
     def pending(self) -> bool:
-        """Whether something waits or runs."""
+        """True if a job waits or runs."""
         return self.queued > 0 or bool(self.running)
 
 
 def visit_progress(session_id: int) -> Progress:
-    """Of the usable recordings of a visit and its current sets, as far as it is queued."""
+    """Return the queued computations of the usable recordings of a visit and its current sets."""
     scope, server = of_visit(session_id), Video.connection
     counts = queue_counts(server)
     queued, running, failed = 0, [], []

@@ -1,4 +1,4 @@
-"""Visits from the tables as the library's `Visit`, and their reports; nothing is computed anew."""
+"""Visits from the tables as the library's `Visit`, and their reports; nothing is recomputed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
-    """Return everything that the tables hold of one visit. Arrays are loaded when they are asked for.
+    """Return everything that the tables hold of one visit. Arrays are loaded on first access.
 
     Raises `PblError` DB_NOT_FOUND when no session matches, USAGE when several sessions or chains match, SOLVER_UNKNOWN
     and NORM_UNKNOWN for unknown methods.
@@ -101,10 +101,8 @@ def load_visit(restriction: Any, *, measures: bool = True) -> Visit:
 
 
 def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) -> Visit:
-    """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`.
-
-    Raises what `load_visit` raises, and `PblError` DB_NOT_FOUND where it is not computed yet.
-    """
+    """Return a visit that has a fit: with its measures where `gait`, and not without them where `whole`. Raises what
+    `load_visit` raises, and `PblError` DB_NOT_FOUND if it is not computed yet."""
     visit = load_visit(restriction, measures=gait)
     if visit.solution is None or (whole and visit.measures is None):
         problems = "; ".join(f"{r.name}: {r.problem}" for r in visit.left_out if r.problem)
@@ -128,12 +126,8 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     Raises `PblError` DB_NOT_FOUND for an unknown slice or where no visit is left, USAGE where a visit has several kinds
     of recordings or chains of methods, SOLVER_UNKNOWN and NORM_UNKNOWN.
 
-    Parameters
-    ----------
-    restriction
-        Subject, session, methods (short names too), `fit_set_kind`.
-    slice_name
-        The visits that count in this slice alone, with the sets and methods that it was frozen with.
+    `restriction`: subject, session, methods (short names too), `fit_set_kind`. `slice_name`: the visits that count in
+    this slice alone, with the sets and methods that it was frozen with.
     """
     sets: Any = fit.current()
     restriction = with_keys(restriction)
@@ -205,7 +199,7 @@ def load_recording(video_id: int) -> Recording:
     events = None if key is None else gait.newest_events(key)
     if events is None:
         return recording
-    # Corrected events at once, before anything is computed from them.
+    # Corrected events immediately, before anything is computed from them.
     counting = gait.events_of(row_of(gait.GaitEvents, events), gait.correction_of(events))
     cycles = load_cycles(events, recording.name) if gait.GaitCycle & events else ()
     return dataclasses.replace(recording, events=counting, cycles=tuple(cycles))
@@ -263,7 +257,7 @@ def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Row
 
 
 def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows) -> Recording:
-    """Return a recording: row of its video, and key of its fit, None where it has none."""
+    """Return a recording: row of its video, and key of its fit, None if it has none."""
     from pbl_pipeline.visit import Recording
 
     number = int(row["video_id"])
@@ -327,7 +321,7 @@ def _problem(video_id: int, choice: SubjectChoice | None) -> str:
 
 
 def _of(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a key belongs to a table; empty where it lacks a part."""
+    """Return what of a key belongs to a table; empty if it lacks a part."""
     found = {name: key[name] for name in table.primary_key if name in key}
     return found if len(found) == len(table.primary_key) else {}
 
@@ -350,7 +344,7 @@ def _single(rows: list[dict], what: str, columns: Sequence[str]) -> dict:
 
 def write_visit(restriction: Any, out: Path, language: str = LANGUAGES[0]) -> list[Path]:
     """Write the files of `pbl_pipeline.pipeline.write_results` for one visit, the report in a language; nothing is
-    computed anew.
+    recomputed.
 
     Raises `PblError` DB_NOT_FOUND when the visit is unknown or not computed yet, USAGE when several match; what
     `to_show` raises; VIDEO_MISSING when a recording is no longer where it was.
@@ -366,7 +360,7 @@ def to_show(visit: Visit, open_files: contextlib.ExitStack) -> Visit:
     """Return a visit of the tables with the recordings whose pictures may be shown.
 
     `open_files` holds the de-identified copies where PBL_DEIDENTIFY is set: close it when all is drawn. Raises, where
-    it is set, `PblError` DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND where nothing was covered in it.
+    it is set, `PblError` DB_NOT_FOUND without a de-identified copy, HEAD_NOT_FOUND if nothing was covered in it.
     """
     recordings = tuple(
         dataclasses.replace(r, shown=open_files.enter_context(privacy.shown(r.number)))

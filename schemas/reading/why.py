@@ -1,4 +1,4 @@
-"""Where one video stands: every stage, its row, its job or its error, and what would happen next."""
+"""State of one video: every stage with its row, job or error, and the next step."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Why:
 
     @property
     def waits(self) -> bool:
-        """Whether it waits for a worker alone, not for another video, a choice, another try or a mark taken back."""
+        """True if it waits for a worker alone, not for another video, a choice, a retry or a withdrawn mark."""
         left = [s for s in self.steps if s.what != DONE]
         stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or bool(unusable([self.video_id]))
         return bool(left) and not stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
@@ -55,10 +55,8 @@ class Why:
 
 
 def why(video_id: int) -> Why:
-    """Look a registered video up in every table. `schemas.activate()` must have been called.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown video.
-    """
+    """Return the state of a registered video in every table. `schemas.activate()` must have been called. Raises
+    `PblError` DB_NOT_FOUND for an unknown video."""
     row = video.registered_video(video_id)
     # One of several cameras: from the fit on the trial counts, before it every camera.
     trial = fit.trial_of(video_id)

@@ -1,4 +1,4 @@
-"""Slices: the visits and methods that figures were made of, frozen, and their rows as the library's `StudyData`."""
+"""Slices: frozen visits and methods of figures, and their rows as the library's `StudyData`."""
 
 from __future__ import annotations
 
@@ -124,10 +124,10 @@ def freeze(
 
 
 def study_data(name: str, curves: bool = True) -> StudyData:
-    """The rows of a slice as frames: its visits, whether they count, and its methods are the frozen ones, values those
-    that the tables hold now (`changes` says whether they are the same).
+    """Return the rows of a slice as frames: visits, their inclusion and methods as frozen, values as the tables hold
+    them now (`changes` compares them).
 
-    Set-based but for the curves, whose files are read one by one (`curves` False leaves them out).
+    Set-based except for the curves, whose files are read one by one (`curves` False leaves them out).
 
     Raises `PblError` DB_NOT_FOUND for an unknown slice; STUDY_INVALID as `StudyData`.
     """
@@ -151,8 +151,8 @@ def study_data(name: str, curves: bool = True) -> StudyData:
 
 
 def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
-    """Of each visit, how what was pooled was filmed, and how many videos it has and how many are marked as not usable,
-    with the reasons. No part of the frozen hash."""
+    """Return for each visit how its pooled recordings were filmed, and the numbers of its videos and of those marked as
+    not usable, with the reasons. Not part of the frozen hash."""
     import pandas as pd
 
     chain = {k: about[k] for k in ("fit_set_kind", "fit_method", "gait_method", "gdi_method")}
@@ -183,10 +183,8 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
 
 
 def changes(name: str) -> list[str]:
-    """Return in words which rows of a slice changed since it was frozen; empty where the same frames come out.
-
-    Raises `PblError` DB_NOT_FOUND for an unknown slice.
-    """
+    """Return in words which rows of a slice changed since it was frozen; empty if the same frames come out. Raises
+    `PblError` DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     rows = _frozen(about)
     out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]
@@ -264,7 +262,7 @@ def _decided(visits: Any, chain: Mapping[str, str | None], cohort: str | None) -
 
 
 def _absent(visits: Any, cohort: str | None) -> str:
-    """A sentence on the people of a cohort who have none of the visits; "" where there are none."""
+    """A sentence on the people of a cohort who have none of the visits; "" if there are none."""
     members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
     there = set(visits["subject"])
     absent = [m for m in members if m["subject"] not in there]
@@ -346,7 +344,7 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _groups(visits: Any, cohort: str | None) -> Any:
-    """Of each visit's person: the group in the cohort, else the population."""
+    """Return for each visit the person's group in the cohort, else the population."""
     if cohort is None:
         return visits["population"]
     members = study.CohortMember & {"cohort": cohort} & "member_group != ''"
@@ -446,7 +444,7 @@ def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
     for name in ("visits", "measures", "scores", "cycles"):
         frame = frames[name]
         columns = sorted(set(frame.columns) - {"subject", "visit"})
-        # One text for a number, whatever type its column has while other rows are there or not.
+        # The same text for a number whatever the type of its column, which depends on other rows.
         plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
         for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
             lines[key].append("\t".join((name, *row)))

@@ -1,4 +1,4 @@
-"""Visits, scores, cohorts and trials of a study from sheets (`pbl study import`, docs/files.md)."""
+"""Import of visits, scores, cohorts and trials of a study from sheets (`pbl study import`, docs/files.md)."""
 
 from __future__ import annotations
 
@@ -53,10 +53,7 @@ _NEEDED = (*list(TEXTS)[:3], *FLAGS)
 def add_instrument(values: Mapping[str, str], by: str) -> dict[str, PblError]:
     """Insert an instrument with a row of Decision; returns the errors by field, and with any of them inserts nothing.
 
-    Parameters
-    ----------
-    values
-        Text by field (`TEXTS`, `NUMBERS`, `FLAGS` as yes or no); an empty one is not stated.
+    `values`: text by field (`TEXTS`, `NUMBERS`, `FLAGS` as yes or no); an empty one is not stated.
     """
     return in_transaction(lambda: _add(Row("instrument", {k: t for k, v in values.items() if (t := v.strip())}), by))
 
@@ -148,19 +145,15 @@ def import_sheets(paths: Sequence[Path], dry_run: bool = False, distinct_codes: 
     Raises `PblError` FILE_MISSING, SHEET_FORMAT for a sheet that cannot be read. What is wrong with a row is in the
     result.
 
-    Parameters
-    ----------
-    dry_run
-        Change nothing; return what would be done.
-    distinct_codes
-        Codes that differ only in case, zeros or hyphens are different people.
+    `dry_run`: change nothing; return what would be done. `distinct_codes`: codes that differ only in case, zeros or
+    hyphens are different people.
     """
     sheets = [sheet for path in paths for sheet in read_sheets(path)]
     return in_transaction(lambda: import_rows(sheets, dry_run, distinct_codes))
 
 
 def import_rows(sheets: Sequence[Sheet], dry_run: bool = False, distinct_codes: bool = False) -> Imported:
-    """As `import_sheets`, of sheets that were read, inside a transaction of the caller."""
+    """Import sheets that were read as `import_sheets` does, inside a transaction of the caller."""
     plan = _Plan(sheets, distinct_codes)
     lines = list(plan.lines.values())
     done = not dry_run and not any(line.errors for line in lines)
@@ -596,17 +589,18 @@ def _flag(row: Row, column: str) -> bool:
     return text in _YES
 
 
+def check_role(text: str, where: str) -> str:
+    """Return a text that can be a role of a visit. Raises `PblError` SHEET_FORMAT."""
+    if not study.is_role(text):
+        expected = "baseline, pre, 6_weeks, 3_months, 6_months, or a word of small letters, digits and _"
+        raise refused(f"role {text[:40]!r}", expected, "write it so", where)
+    return text
+
+
 def _visit_value(row: Row, column: str) -> Any:
     text = row.cells[column]
     if column == "role":
-        if not study.is_role(text):
-            raise refused(
-                f"role {text!r}",
-                "baseline, pre, 6_weeks, 3_months, 6_months, or a word of small letters, digits and _",
-                "write it so",
-                row.where,
-            )
-        return text
+        return check_role(text, row.where)
     if text == CLEAR:
         return CLEAR
     if column == "intervention_date":

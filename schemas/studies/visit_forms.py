@@ -20,7 +20,7 @@ from ..intake.records import replace_height, replace_mass, set_condition, set_po
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
-from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, import_rows
+from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, check_role, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
 NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
@@ -28,7 +28,7 @@ NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
 DISTINCT = "distinct"
 #: Fields of a registered visit and the most characters; height (m) and population are of the person.
 FACTS = {"height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
-#: What the names of the fields of a recording begin with; its video_id follows.
+#: Prefixes of the names of the fields of a recording, followed by its video_id.
 ACTIVITY, PACE = "activity:", "pace:"
 _NUMBERS = ("height_m", "mass_kg")
 #: Kind of decision by the first part of a field's name.
@@ -51,28 +51,28 @@ USUAL_ROLES = (*study.FIRST_ROLES, "6_weeks", "3_months", "6_months", "12_months
 
 @dataclasses.dataclass(frozen=True)
 class Form:
-    """What is stored of a visit, as a form shows it."""
+    """Stored values of a visit, as a form shows them."""
 
     session_id: int
     subject: str
     label: str
-    values: dict[str, str]  # by field, empty where nothing is stored
+    values: dict[str, str]  # by field, empty if nothing is stored
     recordings: dict[int, str] = dataclasses.field(default_factory=dict)  # of the facts: name by video_id
     instruments: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)  # of the scores: rows by name
 
     @property
     def seen(self) -> str:
-        """Another text after each change."""
+        """Text that differs after each change."""
         text = json.dumps([self.session_id, self.values], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def stored(self, name: str, text: str) -> Any:
-        """Return what is stored of a field with this text, None where there is nothing."""
+        """Return what is stored of a field with this text, None if there is nothing."""
         numeric = name in _NUMBERS or name in self.instruments
         return number_of(Row(name, {}), name, text[:40]) if text and numeric else text or None
 
     def same(self, name: str, text: str) -> bool:
-        """Return whether a text is what is stored, also written otherwise: 1,80 for 1.8."""
+        """Return whether a text is the stored value, also in another notation: 1,80 for 1.8."""
         try:
             return text == self.values[name] or self.stored(name, text) == self.stored(name, self.values[name])
         except PblError:
@@ -82,12 +82,9 @@ class Form:
 def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
     """Register a visit, and its person where the code is new.
 
-    Returns the number of the visit, None where nothing was written; errors by field, "" for what is wrong with several.
+    Returns the number of the visit, None if nothing was written; errors by field, "" for what is wrong with several.
 
-    Parameters
-    ----------
-    values
-        Text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
+    `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
     given = {name: text for name, text in _stripped(values).items() if text}
     return in_transaction(lambda: _register(given, by))
@@ -102,7 +99,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": lambda text: check_label("visit", text, NEW["visit"]),
         "date": lambda text: date_of(Row("date", {"date": text}), "date"),
-        "role": _check_role,
+        "role": lambda text: check_role(text, "role"),
         "population": lambda text: check_label("population", text, NEW["population"]),
         "height_m": _height,
     }
@@ -122,13 +119,13 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         return None, {"": error.with_key(None)}
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)
-    now = facts(number)
+    now = facts_form(number)
     if "height_m" in given and not now.same("height_m", given["height_m"]):
         _write(now, {"height_m": given["height_m"]}, by, "")
     return number, {}
 
 
-def facts(session_id: int) -> Form:
+def facts_form(session_id: int) -> Form:
     """Return what can be stated of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
     visit = session.registered_visit(session_id)
     person = (lab.Subject & {"subject": visit["subject"]}).fetch1()
@@ -150,7 +147,7 @@ def facts(session_id: int) -> Form:
     return Form(session_id, visit["subject"], visit["session_label"], values, recordings=names)
 
 
-def entry(session_id: int) -> Form:
+def scores_form(session_id: int) -> Form:
     """Return role and scores of a visit. Raises `PblError` DB_NOT_FOUND for an unknown number."""
     visit = session.registered_visit(session_id)
     roles = (study.Visit & {"session_id": session_id}).to_arrays("visit_role")
@@ -166,7 +163,7 @@ def instruments() -> dict[str, dict[str, Any]]:
     return {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts(order_by="instrument")}
 
 
-def correct(
+def correct_facts(
     session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = ""
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
     """Bring what is stored of a visit, its person and its recordings to what was entered, all of it or nothing.
@@ -174,7 +171,7 @@ def correct(
     What was computed with another height, mass or walking aid, or pools other recordings now, is deleted and pending
     again.
 
-    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE where another value was stored
+    Raises `PblError` DB_NOT_FOUND; USAGE for an unknown field; DECIDED_MEANWHILE if another value was stored
     meanwhile.
 
     Returns the fields that were changed; the errors by field, with any of which nothing was written.
@@ -188,22 +185,24 @@ def correct(
     seen
         `Form.seen` of the form that was filled in.
     """
-    return in_transaction(lambda: _correct(_locked(facts, session_id, values, seen), _stripped(values), by, reason))
+    return in_transaction(
+        lambda: _correct(_locked(facts_form, session_id, values, seen), _stripped(values), by, reason)
+    )
 
 
-def enter(
+def enter_scores(
     session_id: int, values: Mapping[str, str], by: str, seen: str, reason: str = ""
 ) -> tuple[tuple[str, ...], dict[str, PblError]]:
-    """Bring role and scores of a visit to what was entered, all of it or nothing: as `correct`, of `entry`."""
-    return in_transaction(lambda: _enter(_locked(entry, session_id, values, seen), _stripped(values), by, reason))
+    """Bring role and scores of a visit to what was entered, all of it or nothing: as `correct_facts`, of
+    `scores_form`."""
+    given = _stripped(values)
+    return in_transaction(lambda: _enter(_locked(scores_form, session_id, values, seen), given, by, reason))
 
 
 def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str], seen: str) -> Form:
-    """Return what is stored, which is what the form showed.
-
-    Raises `PblError` DB_NOT_FOUND, USAGE, DECIDED_MEANWHILE.
-    """
-    session.lock(session_id)  # who enters at the same moment waits here
+    """Return what is stored, which is what the form showed. Raises `PblError` DB_NOT_FOUND, USAGE,
+    DECIDED_MEANWHILE."""
+    session.lock(session_id)  # a concurrent entry waits here
     now = read(session_id)
     if unknown := sorted(set(given) - set(now.values)):
         raise PblError(
@@ -261,7 +260,7 @@ def _enter(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tupl
     rows = {name: Row(name, {**of_visit, **cells[name]}) for name in changed if name not in errors}
     roles = Sheet(ROLE, ("subject", "visit", ROLE), tuple(r for n, r in rows.items() if n == ROLE))
     scores = Sheet("scores", SCORE_COLUMNS, tuple(r for n, r in rows.items() if n != ROLE))
-    # Codes that are alike are a question to who registers people, not to who enters a score.
+    # Similar codes are asked about at registration, not at the entry of a score.
     found = import_rows([s for s in (roles, scores) if s.rows], dry_run=bool(errors), distinct_codes=True)
     errors |= {line.where: line.errors[0] for line in found.lines if line.errors}
     if errors:
@@ -305,12 +304,6 @@ def _check(given: Mapping[str, str], checks: Mapping[str, Callable[[str], Any]],
 
 def _label(name: str, longest: int) -> Callable[[str], None]:
     return lambda text: check_label(name, text, longest)
-
-
-def _check_role(text: str) -> None:
-    if not study.is_role(text):
-        expected = "baseline, pre, 6_weeks, 3_months, or a word of small letters, digits and _"
-        raise refused(repr(text[:40]), expected, "write it so", "role")
 
 
 def _height(text: str) -> float:

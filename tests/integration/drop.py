@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from workers.incoming import Taken, take_over
+from workers.incoming import Imports, import_uploads
 
 from . import chain
 
@@ -15,14 +15,14 @@ def upload(drop: Path, where: str, name: str = "walk") -> Path:
     return chain.small_video(path.parent, name, n=60).rename(path)
 
 
-def look(drop: Path, archive: Path, settled_s: float = 0.0) -> Taken:
+def look(drop: Path, archive: Path, settled_s: float = 0.0) -> Imports:
     """One run of the import, which must not find another one."""
-    taken = take_over(str(drop), archive, settled_s)
+    taken = import_uploads(str(drop), archive, settled_s)
     assert taken is not None
     return taken
 
 
-def twice(drop: Path, archive: Path) -> Taken:
+def twice(drop: Path, archive: Path) -> Imports:
     """The run that sees a file for the first time, and the one that may take it."""
     first = look(drop, archive, settled_s=0.05)
     assert not first.registered
@@ -35,6 +35,6 @@ def files(folder: Path) -> list[str]:
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file() and ".incoming" not in p.parts)
 
 
-def codes(taken: Taken) -> dict[str, str]:
+def codes(taken: Imports) -> dict[str, str]:
     """Name -> code of what was refused."""
     return {name: error.code for name, error in taken.refused.items()}

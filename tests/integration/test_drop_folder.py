@@ -163,7 +163,7 @@ def test_a_lock_that_is_held_is_reported(drop: Path, tmp_path: Path, monkeypatch
     monkeypatch.setenv("PBL_INCOMING", str(drop))
     monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
     other = connection.another()
-    with worker.alone(layout.LOCK, other) as obtained:
+    with worker.installation_lock(layout.LOCK, other) as obtained:
         assert obtained
         held = pbl("cron", "import")
         assert (held.code, held.out) == (75, "")
@@ -185,7 +185,7 @@ def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, tmp_path: P
     archive = tmp_path / "archive"
     names = {str(upload(drop, f"P00{i}/1/walk.mp4", f"v{i}").relative_to(drop)) for i in range(3)}
     look(drop, archive)
-    none = incoming.take_over(str(drop), archive, 0.0, run_s=-1.0)
+    none = incoming.import_uploads(str(drop), archive, 0.0, run_s=-1.0)
     assert none is not None
     assert (none.later, none.registered) == (3, [])
     assert set(look(drop, archive).registered) == names

@@ -36,6 +36,14 @@ def home() -> Iterator[Path]:
     remove_home(path)
 
 
+@pytest.fixture
+def fresh() -> Iterator[Path]:
+    """A home for one test, without a database."""
+    path = new_home()
+    yield path
+    remove_home(path)
+
+
 def folder(home: Path) -> embedded.Folder:
     return embedded.Folder(home / "db")
 
@@ -158,42 +166,30 @@ def test_another_port_when_the_stored_one_is_taken(home: Path):
     assert now.port != port
 
 
-def test_a_long_path_is_no_obstacle():
+def test_a_long_path_is_no_obstacle(fresh: Path):
     # A socket's path may have 107 bytes; the folder's alone has more here.
-    home = new_home()
-    try:
-        deep = embedded.Folder(home / ("long-" * 30) / "db")
-        assert embedded.start(folder=deep).running
-        embedded.stop(folder=deep)
-    finally:
-        remove_home(home)
+    deep = embedded.Folder(fresh / ("long-" * 30) / "db")
+    assert embedded.start(folder=deep).running
+    embedded.stop(folder=deep)
 
 
-def test_a_server_that_cannot_start_says_why():
-    home = new_home()
-    try:
-        where = folder(home)
+def test_a_server_that_cannot_start_says_why(fresh: Path):
+    where = folder(fresh)
+    embedded.start(folder=where)
+    embedded.stop(folder=where)
+    (where.data / "ibdata1").write_bytes(b"not a tablespace")
+    with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
         embedded.start(folder=where)
-        embedded.stop(folder=where)
-        (where.data / "ibdata1").write_bytes(b"not a tablespace")
-        with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
-            embedded.start(folder=where)
-        assert "InnoDB" in caught.value.found  # the server's own words
-        assert "server.log" in caught.value.next_step
-    finally:
-        remove_home(home)
+    assert "InnoDB" in caught.value.found  # the server's own words
+    assert "server.log" in caught.value.next_step
 
 
-def test_too_little_space_is_said_before_anything_is_written(monkeypatch: pytest.MonkeyPatch):
-    home = new_home()
-    try:
-        monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
-        with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
-            embedded.start(folder=folder(home))
-        assert caught.value.found.startswith("30 MB")
-        assert list(folder(home).data.iterdir()) == []
-    finally:
-        remove_home(home)
+def test_too_little_space_is_said_before_anything_is_written(fresh: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
+    with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
+        embedded.start(folder=folder(fresh))
+    assert caught.value.found.startswith("30 MB")
+    assert list(folder(fresh).data.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -294,12 +290,10 @@ def test_the_server_is_not_root(database: Path):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root drops to another account")
-def test_a_folder_the_server_cannot_enter_is_named():
-    outer = new_home()
-    closed = outer / "closed"
+def test_a_folder_the_server_cannot_enter_is_named(fresh: Path):
+    closed = fresh / "closed"
     closed.mkdir(mode=0o700)
     done = pbl(closed / "home", "db", "start")
-    remove_home(outer)
     assert done.returncode == 1
     assert "DB_UNAVAILABLE" in done.stderr
     assert f"'nobody', which the database server runs as, cannot enter {closed}\n" in done.stderr.replace(
@@ -311,19 +305,14 @@ def test_a_folder_the_server_cannot_enter_is_named():
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root drops to another account")
 @pytest.mark.parametrize("umask", [0o000, 0o077], ids=oct)
-def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_umask(umask: int):
-    home, before = new_home(), os.umask(umask)
-    folder = embedded.Folder(home / "deeper/db")
+def test_the_server_enters_its_folder_and_nobody_else_writes_there_under_any_umask(fresh: Path, umask: int):
+    deeper, before = embedded.Folder(fresh / "deeper/db"), os.umask(umask)
     try:
-        folder.create(server_account(folder.data))
-        assert [stat.S_IMODE(p.stat().st_mode) for p in (folder.path.parent, folder.path, folder.data)] == [
-            0o755,
-            0o755,
-            0o700,
-        ]
+        deeper.create(server_account(deeper.data))
+        modes = [stat.S_IMODE(p.stat().st_mode) for p in (deeper.path.parent, deeper.path, deeper.data)]
+        assert modes == [0o755, 0o755, 0o700]
     finally:
         os.umask(before)
-        remove_home(home)
 
 
 def test_root_leaves_a_database_with_its_owner(tmp_path: Path):
@@ -344,8 +333,12 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
 # ---------------------------------------------------------------- getting the server
 
 
-def without_server(monkeypatch: pytest.MonkeyPatch, home: Path) -> None:
-    """Make this machine look like one without MariaDB."""
+def without_server(monkeypatch: pytest.MonkeyPatch, home: Path, apt: str = "") -> None:
+    """Make this machine look like one without MariaDB, whose apt is the script `apt` ("": it has none)."""
+    (home / "bin").mkdir()
+    for name in ("apt-get", "dpkg", "env", "sudo") if apt else ():
+        (home / "bin" / name).write_text(f"#!/bin/sh\n{apt}")
+        (home / "bin" / name).chmod(0o755)
     monkeypatch.setenv("PBL_HOME", str(home))
     monkeypatch.setenv("PATH", str(home / "bin"))
     monkeypatch.setattr(binaries, "PLACES", ())
@@ -360,24 +353,15 @@ def test_no_server_and_no_apt_points_to_docker(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_offline_fetches_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    without_server(monkeypatch, tmp_path)
-    (tmp_path / "bin").mkdir()
-    for name in ("apt-get", "dpkg"):
-        (tmp_path / "bin" / name).write_text("#!/bin/sh\nexit 1\n")
-        (tmp_path / "bin" / name).chmod(0o755)
+    without_server(monkeypatch, tmp_path, "exit 1\n")
     monkeypatch.setenv("PBL_OFFLINE", "1")
     with pytest.raises(PblError, match="PBL_OFFLINE"):
         embedded.get_server()
 
 
 def test_what_apt_says_reaches_the_reader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    without_server(monkeypatch, tmp_path)
-    (tmp_path / "bin").mkdir()
     refusal = "E: Unable to locate package mariadb-server-core"
-    script = f"#!/bin/sh\necho Reading package lists...\necho '{refusal}' >&2\nexit 100\n"
-    for name in ("apt-get", "dpkg", "env", "sudo"):
-        (tmp_path / "bin" / name).write_text(script)
-        (tmp_path / "bin" / name).chmod(0o755)
+    without_server(monkeypatch, tmp_path, f"echo Reading package lists...\necho '{refusal}' >&2\nexit 100\n")
     said: list[str] = []
     with pytest.raises(PblError, match="Unable to locate package") as caught:
         embedded.get_server(said.append)

@@ -54,7 +54,7 @@ def found() -> Kinetics:
 
 
 def correct(**values: str) -> tuple[str, ...]:
-    changed, errors = visit_forms.correct(1, values, "A. First", visit_forms.facts(1).seen)
+    changed, errors = visit_forms.correct_facts(1, values, "A. First", visit_forms.facts_form(1).seen)
     assert errors == {}
     return changed
 

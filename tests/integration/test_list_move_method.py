@@ -150,7 +150,7 @@ def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, t
     content = chain.small_video(tmp_path, "walk").read_bytes()
     path.write_bytes(content)
     for _ in range(2):
-        incoming.take_over(str(drop), archive, settled_s=0)
+        incoming.import_uploads(str(drop), archive, settled_s=0)
     number, old = video.Video.fetch1("video_id", "video_path")
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")

@@ -167,7 +167,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
 def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
     """Compute a visit whose events are corrected, and take migration 0004 back."""
     _visits(folder, "2026-03-01")
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     (time, side, kind, _), *others = found.events
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
     _compute()
@@ -340,7 +340,7 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert migrations.migrate().steps == []
     # Nothing is pending; going back to the detected events computes theirs again.
     assert not populate(_chain()).did_something
-    event_corrections.take_back(1, "B. Second", not_none(event_corrections.shown(1)).state)
+    event_corrections.take_back(1, "B. Second", not_none(event_corrections.shown_events(1)).state)
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 

@@ -16,7 +16,7 @@ from schemas.operations import backup, forget
 from schemas.operations.declare import declare_all
 from schemas.stored_files import file_ref, stored_file
 from tests.rows import remove_all
-from workers.incoming import take_over
+from workers.incoming import import_uploads
 
 from . import chain
 
@@ -123,8 +123,8 @@ def test_phones_may_upload_into_a_bucket(remote: None, tmp_path: Path, monkeypat
         fs.pipe_file(f"phones/in/{name}", b"" if "empty" in name else content)
     monkeypatch.setenv("PBL_INCOMING", "s3://phones/in")
     monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
-    take_over(settled_s=0.0)
-    taken = take_over(settled_s=0.0)
+    import_uploads(settled_s=0.0)
+    taken = import_uploads(settled_s=0.0)
     assert taken is not None
     first = video.Video.fetch1("video_path")
     assert Path(first).read_bytes() == content

@@ -257,7 +257,7 @@ def run_and_die(job: queue.Claim, monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(run_job, "remove_left_over", lambda *_: None)
         with pytest.raises(Killed):
             run_job.run(job)
-    queue.let_go_all()
+    queue.release_all()
 
 
 @pytest.mark.parametrize("table", [tracking.Tracking, fit.SessionFit])
@@ -374,7 +374,7 @@ def test_crashes_do_not_outlive_success(tmp_path: Path):
 def test_a_job_that_takes_its_whole_worker_down_is_not_tried_for_ever(tmp_path: Path):
     """As where a container is ended for its memory: no supervisor is left that could count."""
     job = first_job(tmp_path)
-    queue.let_go_all()
+    queue.release_all()
     with subprocess.Popen(["true"]) as dead:
         pass
     held = {"status": "reserved", "host": job.host, "pid": dead.pid, "connection_id": 0}

@@ -119,12 +119,12 @@ def another_norm(folder: Path, patch: pytest.MonkeyPatch) -> Both:
 def corrected_event(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     """A person moves an event by 0.1 s; on files the chain is given the same correction."""
     both = one_trial(folder, patch)
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     events = [e[:3] for e in found.events]
     time, side, kind = events[6]
     event_corrections.save(1, [*events[:6], (time + 0.1, side, kind), *events[7:]], "A. First", found.state)
     populate()
-    corrected = not_none(event_corrections.shown(1))
+    corrected = not_none(event_corrections.shown_events(1))
     by_hand = [GaitEvent(t, s, k, 1.0 if p is None else p) for t, s, k, p in not_none(corrected.hand)]
     detect = metrics.detect_events
     patch.setattr(metrics, "detect_events", lambda *args: apply_correction(detect(*args), by_hand, 1))

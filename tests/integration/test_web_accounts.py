@@ -143,7 +143,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
     client = browser(known)
     assert client.get("/visits").status_code == 401
     assert "<form" in client.get("/visits").text
-    assert "that the terminal shows" not in client.get("/visits").text  # links are no way in here
+    assert "by the link in the terminal" not in client.get("/visits").text  # links are no way in here
     key = client.app.state.sessions.new_link("X", "reviewer")  # type: ignore[attr-defined]
     assert client.get(f"/enter?key={key}", follow_redirects=False).status_code == 200
     assert client.get("/visits").status_code == 401
@@ -151,7 +151,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
         answer = sign_in(client, name, password)
         assert answer.status_code == 401
         assert "do not belong together" in answer.text
-        client.app.state.way_in.attempts._failures.clear()  # type: ignore[attr-defined]
+        client.app.state.sign_in.attempts._failures.clear()  # type: ignore[attr-defined]
     answer = sign_in(client)
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     cookie = answer.headers["set-cookie"].lower()

@@ -16,7 +16,7 @@ from schemas.datajoint_setup import dj
 from schemas.decisions import review_decisions
 from schemas.intake.records import set_height
 from schemas.operations import forget
-from schemas.reading import shown, visit_list
+from schemas.reading import visit_list
 from schemas.reading.usable import Usable, usable
 from schemas.review import Decision
 from schemas.rows import delete_below
@@ -26,6 +26,7 @@ from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything, register
 from workers.populate import populate
+from workers.web.source import TablesSource
 
 
 @computed_once
@@ -192,7 +193,7 @@ def test_a_fit_that_is_deleted_while_its_page_loads_is_pending(two_alike: int, m
     assert send(browser, two_alike, form_of(browser, two_alike), 2).status_code == 303
     populate()
     gone = lambda key: tuple(delete_below(fit.SessionFit, fit.SessionFit().keys()))  # noqa: E731
-    monkeypatch.setattr(shown, "computations", gone)
+    monkeypatch.setattr(TablesSource, "state", staticmethod(gone))
     answer = browser.get(f"/recordings/{two_alike}/movement")
     assert (answer.status_code, "DB_NOT_FOUND" in answer.text) == (404, True)
 

@@ -42,14 +42,14 @@ def visit(folder: Path) -> str:
 
 def moved(number: int = 1, by: float = 0.1, which: int = 6) -> list[tuple[float, str, str]]:
     """The events of a recording, one of them later by so many seconds."""
-    found = not_none(event_corrections.shown(number))
+    found = not_none(event_corrections.shown_events(number))
     events = [e[:3] for e in found.events]
     time, side, kind = events[which]
     return [*events[:which], (time + by, side, kind), *events[which + 1 :]]
 
 
 def save(number: int, events: list[tuple[float, str, str]], by: str = "A. First") -> dict[str, int]:
-    return event_corrections.save(number, events, by, not_none(event_corrections.shown(number)).state)
+    return event_corrections.save(number, events, by, not_none(event_corrections.shown_events(number)).state)
 
 
 def form_of(browser: Any, number: int) -> dict[str, str]:
@@ -124,7 +124,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     one, two = (t.events for t in not_none(found.measures).trials)
     assert (one.corrected, two.corrected) == (True, False)
     assert (one.method, one.params_hash) == (two.method, two.params_hash)
-    counting = not_none(event_corrections.shown(1))
+    counting = not_none(event_corrections.shown_events(1))
     assert [e.time_s for e in one.events] == [e[0] for e in (counting.hand or ())]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
     monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
@@ -152,7 +152,7 @@ def test_moving_an_event_back_leaves_nothing_set_by_hand(visit: str):
     detected = moved(by=0.0)
     save(1, moved(by=0.1))
     save(1, detected)
-    counting = not_none(event_corrections.shown(1))
+    counting = not_none(event_corrections.shown_events(1))
     assert counting.hand is None
     assert not counting.stale
     assert "events corrected by" not in web.client().get("/recordings/1").text
@@ -224,7 +224,7 @@ def test_what_is_refused_changes_nothing(visit: str):
 
 
 def test_two_people_correct_at_the_same_moment(visit: str):
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     calls = [(1, moved(by=d), name, found.state) for d, name in ((0.1, "A. First"), (0.05, "B. Second"))]
     late, done = decide_target.at_once("schemas.decisions.event_corrections.save", *calls)
     assert (done, late[0]) == (("done", ""), "DECIDED_MEANWHILE")
@@ -292,7 +292,7 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     populate()
     review_decisions.decide_person(1, 2)
     populate()
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     assert (found.hand, found.stale) == (None, True)
     assert (gait.GaitCycle & {"video_id": 1} & fit.current()).fetch1("correction_no") is None
     page = web.client().get("/recordings/1").text
@@ -304,9 +304,9 @@ def test_corrections_are_of_the_person_that_was_measured(visit: str):
     # The last correction of each person counts: of the other one there was none to take back.
     review_decisions.decide_person(1, 2)
     populate()
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     event_corrections.take_back(1, "A. First", found.state)
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     assert (found.hand, found.stale) == (None, False)
 
 
@@ -337,7 +337,7 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
 
 
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
-    before = not_none(event_corrections.shown(1))
+    before = not_none(event_corrections.shown_events(1))
     with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:
         page.goto("/recordings/1")
         page.wait_for_selector("[data-ready]")
@@ -395,7 +395,7 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
         with page.expect_navigation():
             page.get_by_role("button", name="Save the events").click()
         page.wait_for_selector("[data-ready]")
-    found = not_none(event_corrections.shown(1))
+    found = not_none(event_corrections.shown_events(1))
     assert found.hand is not None
     set_by_hand = [e for e in found.hand if e[3] is None]
     assert [(round(t * 30), s, k) for t, s, k, _ in set_by_hand] == [(frame - 2, *before.detected[6][1:3])]

@@ -300,7 +300,7 @@ def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tm
     browser, reviewer = phone(visit), web.client(target=nothing)
     send(browser, small_video(tmp_path, "walk").read_bytes())
     told = browser.get("/phone/state.json").json()
-    assert told["recordings"][0]["verdict"] == "The server has it and looks at it."
+    assert told["recordings"][0]["verdict"] == "The server has it and is checking it."
     assert told["next"] == ""
     send(browser, small_video(tmp_path, "empty", people="nobody").read_bytes())
     populate()

@@ -268,7 +268,7 @@ def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
 
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     with filming(camera, visit, orientation=False) as page:
-        page.get_by_text("tells no orientation").wait_for()
+        page.get_by_text("does not report its orientation").wait_for()
         film(page, 1.5)
         page.locator(".again").click()
         page.get_by_text("None yet").wait_for()

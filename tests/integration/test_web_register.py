@@ -12,7 +12,7 @@ from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from schemas import lab, session, study, video
 from schemas.review import Decision
-from schemas.studies.visit_forms import FACTS, NEW, facts
+from schemas.studies.visit_forms import FACTS, NEW, facts_form
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -32,7 +32,7 @@ def new(browser: Any, **values: str):
 
 
 def correct(browser: Any, number: int | str = 1, seen: str = "", **values: str):
-    return web.post(browser, f"/visits/{number}/facts", seen=seen or facts(int(number)).seen, **values)
+    return web.post(browser, f"/visits/{number}/facts", seen=seen or facts_form(int(number)).seen, **values)
 
 
 def upload(browser: Any, *files: Path | tuple[str, bytes], number: int | str = 1, **values: str):
@@ -223,7 +223,7 @@ def test_an_aid_asks_for_the_role_of_the_visit():
 def test_the_second_of_two_and_forged_forms_change_nothing(tmp_path: Path):
     browser, reader = web.client(name="A. First"), web.client(role="reader")
     new(browser)
-    seen = facts(1).seen
+    seen = facts_form(1).seen
     assert correct(browser, height_m="1.7").status_code == 303
     before = everything()
     late = correct(web.client(name="B. Second"), seen=seen, height_m="1.8")

@@ -84,7 +84,7 @@ def test_without_webgl_the_page_says_so_and_the_rest_works(chromium: Any, walk: 
         page.goto(f"/recordings/{walk}")
         page.wait_for_selector(".look[data-ready]")
         page.locator(".space").scroll_into_view_if_needed()
-        page.get_by_text("This browser draws no 3D").wait_for()
+        page.get_by_text("This browser cannot draw 3D").wait_for()
         assert not page.locator(".space-view").is_visible()
         page.locator("#position").fill("300")
         page.wait_for_selector("canvas.body[data-frame='300']")

@@ -10,7 +10,7 @@ import schemas
 from schemas import connection, video
 from schemas.jobs import jobs_of
 from schemas.reading import status
-from schemas.worker import alone
+from schemas.worker import installation_lock
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_counting_reads_narrow_indexes_and_no_rows(server: Any, monkeypatch: pyt
 
 
 def test_two_processes_do_not_do_the_same_work_at_once(server: Any):
-    with alone("refresh", server) as first, alone("refresh", video.Video.connection) as second:
+    with installation_lock("refresh", server) as first, installation_lock("refresh", video.Video.connection) as second:
         assert (first, second) == (True, False)
-    with alone("refresh", video.Video.connection) as third:
+    with installation_lock("refresh", video.Video.connection) as third:
         assert third

@@ -40,7 +40,7 @@ def build(folder: Path) -> None:
         dataclasses.replace(truth, angles_deg=bent).save(folder / "truth.npz")
         add_reference(first, folder / "truth.npz", dataset="LAB")
         _populate()
-        found = event_corrections.shown(first)
+        found = event_corrections.shown_events(first)
         assert found is not None
         (time, side, kind, _), *others = found.events
         event_corrections.save(first, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,9 @@ MANY = (1_000, 100_000, 1_000_000)
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """Recordings computed one after another by the processes of one worker, from the first job in hand to the last one
-    ended. processor_s: of all processes, with their start. jobs_s: time of the jobs by table, other processes beside
-    them. original_bytes: of the
-    recordings; result_bytes: of store and tables."""
+    """Recordings computed one after another by the processes of one worker, from the first report to the last one.
+    processor_s: of all processes, with their start. jobs_s: time of the jobs by table, with the other processes
+    running. original_bytes: of the recordings; result_bytes: of store and tables."""
 
     videos: int
     video_s: float
@@ -162,25 +160,20 @@ def _registered(folder: Path, film: bytes, first: int, n: int) -> list[Path]:
 
 
 def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, dict[str, float]]:
-    """Work until nothing is left: seconds from the first job in hand to the last one ended, processor time, and time
-    of the jobs by table. Raises the `PblError` of a job that failed, and INTERNAL where recordings have no index."""
+    """Work until nothing is left; return the seconds from the first report to the last one, processor time, and time of
+    the jobs by table. Raises the `PblError` of a failed job, and INTERNAL if recordings have no index."""
     from schemas import gdi
-    from workers.metrics import Metrics
+    from workers.metrics import KeptReports
     from workers.supervisor import Supervisor
 
-    heard, jobs_s, failed = list[float](), Counter[str](), list[Any]()
-
-    class Clock(Metrics):
-        def heard(self, job: Any, outcome: Any) -> None:
-            heard.append(time.monotonic())
-            if outcome is not None:
-                jobs_s[job.table.__name__] += outcome.seconds
-                failed.extend([outcome] if outcome.code else [])
-            super().heard(job, outcome)
-
-    had, begin = len(gdi.SessionGdi()), os.times()
-    Supervisor(options, Clock()).run()
+    metrics, had, begin = KeptReports(), len(gdi.SessionGdi()), os.times()
+    Supervisor(options, metrics).run()
     end = os.times()
+    outcomes = [outcome for _, _, outcome in metrics.reports if outcome is not None]
+    failed = [outcome for outcome in outcomes if outcome.code]
+    jobs_s: dict[str, float] = defaultdict(float)
+    for outcome in outcomes:
+        jobs_s[outcome.job.table.__name__] += outcome.seconds
     if failed or len(gdi.SessionGdi()) < had + len(recordings):
         raise PblError(
             failed[0].code if failed else "INTERNAL",
@@ -189,11 +182,11 @@ def _compute(recordings: Sequence[Path], options: Any) -> tuple[float, float, di
             next_step="try it alone with `pbl run`",
         )
     processor_s = end.children_user + end.children_system - begin.children_user - begin.children_system
-    return heard[-1] - heard[0], processor_s, dict(jobs_s)
+    return metrics.reports[-1][0] - metrics.reports[0][0], processor_s, dict(jobs_s)
 
 
 def _stored(folder: Path) -> int:
-    """Bytes of the store and the tables."""
+    """Return the bytes of the store and the tables."""
     from schemas import connection
 
     rows = connection.connect().query(

@@ -30,17 +30,17 @@ def import_(settled_s: float) -> None:
     """Take over recordings that were uploaded to PBL_INCOMING as SUBJECT/SESSION/FILE, and register them.
 
     Exit code 1 when an upload was refused or could not be taken, 75 when another process takes uploads over now. After
-    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run goes on.
+    30 minutes the process is ended by SIGALRM, whatever it waits for; the next run continues.
 
     Example: PBL_INCOMING=/srv/uploads pbl cron import
     """
     import schemas
-    from workers.incoming import take_over
+    from workers.incoming import import_uploads
 
     signal.alarm(AT_MOST_S)
     try:
         schemas.activate()
-        taken = take_over(settled_s=settled_s)
+        taken = import_uploads(settled_s=settled_s)
     finally:
         signal.alarm(0)
     if taken is None:
@@ -118,7 +118,7 @@ def reprocess() -> None:
 def backup(keep: int) -> None:
     """Save database, store and recordings into a new folder of PBL_BACKUP, and remove the oldest.
 
-    A person who was forgotten is gone from the backups, too, when the last one from before that is removed.
+    A person who was forgotten is also gone from the backups once the last older one is removed.
 
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
     """

@@ -23,7 +23,7 @@ SUBJECT, SESSION, PROJECT = "DEMO", "sports2d-demo", "demo"
 def demo(context: click.Context, out: Path, no_database: bool, language: str) -> None:
     """Set up what the default needs, put the demo recording through every table, show the rows and write the report.
 
-    Safe to repeat: what is there already is not computed again. The database is stopped at the end if it was not
+    Safe to repeat: existing results are not computed again. The database is stopped at the end if it was not
     running before; the next command that needs it starts it again.
     """
     if no_database:

@@ -1,4 +1,4 @@
-"""`pbl populate`: compute what is missing."""
+"""`pbl populate`: compute missing results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 @click.option("--retry-errors", is_flag=True, help="Clear error rows first and try their videos again.")
 @click.option("--visit", type=click.IntRange(min=1), metavar="NUMBER", help="Only this visit (`pbl list visits`).")
 def populate(tables: tuple[str, ...], limit: int | None, retry_errors: bool, visit: int | None) -> None:
-    """Compute what is missing, table after table. Safe to repeat and to run in several processes at once.
+    """Compute missing results, table after table. Safe to repeat and to run in several processes at once.
 
     A video that fails leaves an error row with a code and a next step (`pbl status` shows it) while all others finish;
     it is not tried again until --retry-errors. Ctrl-C puts the running computation back into the queue.

@@ -26,7 +26,7 @@ def reprocess(
     """Compute results again, with lower priority than new videos. Prints what it would do; --yes does it.
 
     With --new-method the old rows stay and the new method's are added beside them. Without, the chosen rows and all
-    that was computed from them are deleted, in small steps, and queued again.
+    dependent results are deleted, in small steps, and queued again.
 
     \b
     Example: pbl reprocess --table SessionFit --new-method gauss-newton

@@ -1,4 +1,4 @@
-"""`pbl retry`: try what failed once more."""
+"""`pbl retry`: try failed jobs again."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def password(name: str) -> None:
 @account.command(epilog="Example: pbl web account remove R.Viewer")
 @click.argument("name")
 def remove(name: str) -> None:
-    """Remove an account. Its sessions end; what it decided stays."""
+    """Remove an account. Its sessions end; its decisions stay."""
     from workers.web.accounts import Accounts
 
     Accounts().remove(name)
@@ -130,5 +130,5 @@ def list_() -> None:
 
 
 def _password() -> str:
-    """Asked for at the terminal, never an argument, which others would see among the processes."""
+    """Ask for a password at the terminal: an argument would be visible among the processes."""
     return click.prompt("Password (15 characters or more)", hide_input=True, confirmation_prompt=True)

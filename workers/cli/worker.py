@@ -78,8 +78,8 @@ def worker(
     """Runs continuously and takes jobs from all queues; start as many as you like, on any machine.
 
     SIGTERM or Ctrl-C ends it: the running job is finished within --grace, or put back. A job that crashes its process
-    is tried again and becomes an error row the third time; a job beyond its time limit becomes one at once. Logs are
-    JSON lines on stderr.
+    is tried again and becomes an error row the third time; a job beyond its time limit becomes one immediately. Logs
+    are JSON lines on stderr.
 
     \b
     Example: pbl worker --processes auto

@@ -1,4 +1,4 @@
-"""Who may open a page: one-time links, sessions, the token of each form, and the headers of every answer.
+"""Access to the pages: one-time links, sessions, the token of each form, and the headers of every answer.
 
 A request passes `Gate`, which finds its session, and then the right of its address (`address.Address`).
 """
@@ -6,7 +6,6 @@ A request passes `Gate`, which finds its session, and then the right of its addr
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import hmac
 import re
 import secrets
@@ -21,11 +20,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pbl_pipeline.names import check_label
+from schemas.intake.phone_recordings import hashed
 
-#: Hours after which a session ends, whatever was done in it; and where people sign in, hours without a request.
+#: Hours after which a session ends in any case, and, where people sign in, hours without a request.
 HOURS, IDLE_HOURS = 12.0, 1.0
-#: What a role may do: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees
-#: queues, errors and disks and tries again, for which nobody has to be looked at. Several roles: what each of them may.
+#: Rights by role: a reader looks at visits and recordings, a reviewer also decides and enters; an operator sees queues,
+#: errors and disks and retries, without any view of a person. Several roles add up.
 RIGHTS: dict[str, frozenset[str]] = {
     "reader": frozenset({"look"}),
     "reviewer": frozenset({"look", "decide"}),
@@ -33,13 +33,13 @@ RIGHTS: dict[str, frozenset[str]] = {
 }
 #: Longest body of a form (byte).
 BODY_BYTES = 65_536
-#: Addresses that the page can have: no character that would have to be escaped, numbers of rows in their shortest form.
+#: Valid addresses: without characters to escape, numbers of rows in their shortest form.
 _PATH = re.compile(r"/|(?:/(?:[A-Za-z_][A-Za-z0-9._-]*|[1-9][0-9]{0,8}(?:\.json)?))+")
 #: Searches that a session remembers.
 _SEARCHES = 200
 
-#: Everything comes from this server and nothing is written into a page: no script and no style of a text that a
-#: recording or a label brings along can run.
+#: Everything comes from this server, and nothing is inline: scripts and styles in a label or the name of a recording
+#: cannot run.
 CONTENT_POLICY = "; ".join(
     (
         "default-src 'none'",
@@ -85,7 +85,7 @@ class Session:
     searches: list[str] = dataclasses.field(default_factory=list)
 
     def may(self, right: str) -> bool:
-        """Whether one of her roles has a right of `RIGHTS`; any session has ""."""
+        """Return whether one of the roles has a right of `RIGHTS`; any session has ""."""
         return not right or any(right in RIGHTS.get(role, frozenset()) for role in self.roles)
 
     @property
@@ -103,7 +103,7 @@ class Session:
         return self.searches.index(text) + 1
 
     def search_text(self, number: int) -> str:
-        """The text of a number, empty where there is none."""
+        """The text of a number, empty if there is none."""
         return self.searches[number - 1] if 0 < number <= len(self.searches) else ""
 
 
@@ -132,12 +132,12 @@ class Sessions:
     def new_link(self, name: str, *roles: str) -> str:
         """The key of a link that opens one session, once."""
         key = secrets.token_urlsafe(32)
-        self._links[_hashed(key)] = (name, roles)
+        self._links[hashed(key)] = (name, roles)
         return key
 
     def enter(self, key: str) -> str | None:
         """A new session's cookie for the key of a link, which is used up; None for a key that opens nothing."""
-        found = self._links.pop(_hashed(key), None)
+        found = self._links.pop(hashed(key), None)
         return None if found is None else self.open(*found)
 
     def open(self, name: str, roles: tuple[str, ...], changed: str = "") -> str:
@@ -145,12 +145,12 @@ class Sessions:
         now = self._clock()
         self._sessions = {k: s for k, s in self._sessions.items() if self._lasts(s, now)}
         cookie = secrets.token_urlsafe(32)
-        self._sessions[_hashed(cookie)] = Session(name, roles, now + 3600 * self._hours, now, changed)
+        self._sessions[hashed(cookie)] = Session(name, roles, now + 3600 * self._hours, now, changed)
         return cookie
 
     def find(self, cookie: str) -> Session | None:
-        """The session of a cookie, None where it ended or never was."""
-        session, now = self._sessions.get(_hashed(cookie)), self._clock()
+        """The session of a cookie, None if it ended or never was."""
+        session, now = self._sessions.get(hashed(cookie)), self._clock()
         if session is None or not self._lasts(session, now):
             return None
         if self._still is not None and not self._still(session.name, session.changed):
@@ -163,7 +163,7 @@ class Sessions:
 
     def leave(self, cookie: str) -> None:
         """End a session."""
-        self._sessions.pop(_hashed(cookie), None)
+        self._sessions.pop(hashed(cookie), None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,10 +191,6 @@ class Cookie:
     def forget(self, response: Response) -> None:
         """Have a browser forget it."""
         response.delete_cookie(self.name, path="/", httponly=True, samesite="strict", secure=self.secure)
-
-
-def _hashed(secret: str) -> str:
-    return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
 
 
 class Gate:
@@ -240,7 +236,7 @@ class Gate:
     def _reason(self, request: Request) -> str:
         headers = request.headers
         request.state.session = None
-        # Another name that leads to 127.0.0.1 (DNS rebinding) would make a page of its own one of this server.
+        # Another name that leads to 127.0.0.1 (DNS rebinding) would make its page one of this server.
         if len(headers.getlist("host")) != 1 or host_of(headers["host"]) not in self._hosts:
             return "host"
         request.state.session = self._sessions.find(self._cookie.of(request))
@@ -258,7 +254,7 @@ def host_of(header: str) -> str:
 
 
 def _from_here(headers: Headers) -> bool:
-    """Whether what changes something was sent from a page of this server, as far as the browser says."""
+    """Return whether a changing request was sent from a page of this server, as far as the browser tells."""
     origin = headers.get("origin")
     if origin is not None and urlsplit(origin).netloc != headers.get("host"):
         return False
@@ -270,15 +266,8 @@ class Refused(Exception):
 
 
 async def form_of(request: Request) -> Mapping[str, str]:
-    """The fields of a form whose token is that of its sender's session.
-
-    Raises
-    ------
-    Refused
-        Another token or none, a body that is too long, broken off or no form.
-    PblError
-        USAGE for a text with control or invisible characters.
-    """
+    """The fields of a form whose token is that of its sender's session. Raises Refused: another token or none, a body
+    that is too long, broken off or no form; `PblError` USAGE for a text with control or invisible characters."""
     fields = await read_form(request)
     check_token(request, fields.pop("token", "") or request.headers.get("x-token", ""))
     check_fields(fields)
@@ -318,7 +307,8 @@ async def read_body(request: Request, most: int) -> bytes:
 
 
 async def read_form(request: Request) -> dict[str, str]:
-    """The fields of a form, whoever sent it. Raises `Refused` for a body that is too long, broken off or no form."""
+    """Return the fields of a form of any sender. Raises `Refused` for a body that is too long, broken off or no
+    form."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != "application/x-www-form-urlencoded":
         raise Refused("form")
     body = await read_body(request, BODY_BYTES)

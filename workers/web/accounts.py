@@ -1,7 +1,7 @@
 """Accounts of people who sign in with a password, where the page serves more than this machine.
 
-Passwords are hashed with `hashlib.scrypt` of Python's own library and not with argon2-cffi: both need memory for each
-guess, and the latter would come beside scrypt, by which those who have an account sign in, not instead of it.
+Passwords are hashed with `hashlib.scrypt` of the standard library instead of argon2-cffi: both need memory for each
+guess, and the latter would be an addition, since existing accounts need scrypt.
 
 They are in a file of the machine that serves the page, readable by its account alone, and not in a table: a backup, a
 slice, an analyst's account of the database never have them, and a database that was broken into opens no page.
@@ -98,7 +98,7 @@ class Accounts:
         return self._read[1]
 
     def add(self, name: str, roles: Sequence[str], password: str) -> None:
-        """A new account. Raises `PblError` WEB_ACCOUNT: a name that there is or that is none, no such role, a weak
+        """Add an account. Raises `PblError` WEB_ACCOUNT: an existing or invalid name, an unknown role, a weak
         password."""
         if not _NAME.fullmatch(name):
             raise _refused(
@@ -112,29 +112,29 @@ class Accounts:
             if name in known:
                 raise _refused(
                     f"an account {name!r}",
-                    "a name that there is not",
+                    "a name without an account",
                     "`pbl web account password` changes its password",
                 )
             known[name] = Account(name, tuple(dict.fromkeys(roles)), hashed(password), _now())
 
     def set_password(self, name: str, password: str) -> None:
-        """Another password; sessions of the account end. Raises `PblError` WEB_ACCOUNT as `add`."""
+        """Change a password; sessions of the account end. Raises `PblError` WEB_ACCOUNT as `add`."""
         with self._changing() as known:
             known[name] = dataclasses.replace(self._named(known, name), password=hashed(password), changed=_now())
 
     def remove(self, name: str) -> None:
-        """Remove an account; its sessions end. Raises `PblError` WEB_ACCOUNT where there is none."""
+        """Remove an account; its sessions end. Raises `PblError` WEB_ACCOUNT if there is none."""
         with self._changing() as known:
             del known[self._named(known, name).name]
 
     def check(self, name: str, password: str) -> Account | None:
-        """The account whose password it is. Takes as long for a name that there is not."""
+        """Return the account if the password is right. Takes as long for an unknown name."""
         account = self.all().get(name)
         right = matches(password, account.password if account is not None else _nobody())
         return account if right else None
 
     def current(self, name: str, changed: str) -> bool:
-        """Whether an account is still as it was when a session was opened; not where the file cannot be read."""
+        """Return whether an account is unchanged since a session was opened; False if the file cannot be read."""
         try:
             account = self.all().get(name)
         except PblError:  # who signs in then is told
@@ -153,7 +153,7 @@ class Accounts:
     @staticmethod
     def _named(known: dict[str, Account], name: str) -> Account:
         if name not in known:
-            raise _refused(f"no account {name!r}", "an account that there is", "`pbl web account list` prints them")
+            raise _refused(f"no account {name!r}", "an existing account", "`pbl web account list` prints them")
         return known[name]
 
     def _bad(self, expected: str, next_step: str, found: str) -> PblError:
@@ -161,10 +161,8 @@ class Accounts:
 
 
 def hashed(password: str, log_n: int | None = None) -> str:
-    """A salted hash of a password, with what it takes to compare another one with it.
-
-    Raises `PblError` WEB_ACCOUNT for one that is too short or long. The password is in no error.
-    """
+    """A salted hash of a password, with what it takes to compare another one with it. Raises `PblError` WEB_ACCOUNT for
+    one that is too short or long. The password is in no error."""
     if not SHORTEST <= len(password) <= LONGEST:
         raise _refused(
             f"a password of {len(password)} characters",
@@ -177,7 +175,7 @@ def hashed(password: str, log_n: int | None = None) -> str:
 
 
 def matches(password: str, stored: str) -> bool:
-    """Whether a hash is that of a password."""
+    """Return whether a hash is that of a password."""
     _, log_n, r, p, salt, key = stored.split("$")
     found = _key(password[: 4 * LONGEST], base64.b64decode(salt), int(log_n), int(r), int(p))
     return hmac.compare_digest(found, base64.b64decode(key))
@@ -190,7 +188,7 @@ def _key(password: str, salt: bytes, log_n: int, r: int, p: int) -> bytes:
 
 
 def _nobody() -> str:
-    """A hash that no password has, which costs what others cost."""
+    """Return a hash that no password has, and that takes as long to compare."""
     nothing = base64.b64encode(b"0" * 16).decode()
     return f"scrypt${LOG_N}${R}${P}${nothing}${nothing}"
 
@@ -229,7 +227,7 @@ class Attempts:
         return max(self._wait(of_address), self._wait(of_account) if guessed else 0.0)
 
     def failed(self, account: str, address: str) -> None:
-        """Count a failure. An attempt counts as one before its password is compared: many at once get no more tries."""
+        """Count a failure. An attempt counts as one before its password is compared: many at once gain no tries."""
         now = self._clock()
         for key in self._keys(account, address):
             found = self._failures.pop(key, None)
@@ -269,8 +267,8 @@ AT_ONCE = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class WayIn:
-    """Who may come in. accounts: None where links open the page."""
+class SignIn:
+    """Ways to sign in. accounts: None if links open the page."""
 
     sessions: Sessions
     cookie: Cookie
@@ -278,7 +276,7 @@ class WayIn:
     attempts: Attempts
 
 
-def routes(pages: Pages, way: WayIn, used: object = None) -> list[Address]:
+def routes(pages: Pages, way: SignIn, used: object = None) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
 

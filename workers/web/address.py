@@ -1,4 +1,4 @@
-"""Addresses of the page: each declares the right that it needs, and the look at a person that opening it is."""
+"""Addresses of the page: each declares its right, and the look at a person that it records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Address(Route):
         Of `access.RIGHTS`; "" for any session, `OPEN` without one, `FILM` for phones.
     look
         What is looked at of the recording (`{video_id:int}` in the path) or visit (`{session_id:int}`), such as
-        "video": a row of `schemas.review.Viewing` before it is shown. Empty where no person is looked at.
+        "video": a row of `schemas.review.Viewing` before it is shown. Empty if no person is looked at.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Address(Route):
 
 
 def page(path: str, answer: Callable[..., Any], right: str, *, look: str = "") -> list[Address]:
-    """Return the addresses of a page: as JSON of its values, and as HTML."""
+    """Return the addresses of a page: as JSON and as HTML."""
     return [Address(path + JSON, answer, right, look=look), Address(path, answer, right, look=look)]
 
 
@@ -85,7 +85,7 @@ def shown_of(request: Request) -> int:
 
 
 def interval(result: Result) -> str:
-    """Return the 90 % interval of an index as numbers, "78 to 87"; empty where its error is not known."""
+    """Return the 90 % interval of an index as numbers, "78 to 87"; empty if its error is not known."""
     from pbl_pipeline.gait import interval_90
 
     bounds = interval_90(result.index, result.sd)

@@ -1,4 +1,4 @@
-"""The application: which address is answered by which page, and what is said where something does not work."""
+"""The application: addresses with their pages, and the answers to errors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from . import (
     trend,
     visits,
 )
-from .accounts import Accounts, Attempts, WayIn
+from .accounts import Accounts, Attempts, SignIn
 from .accounts import routes as sign_in_routes
 from .address import OPEN, Address, own_address
 from .computing import Target, compute_visit
@@ -49,7 +49,7 @@ from .tables import Asks, Files, Tables
 
 log = logging.getLogger(__name__)
 
-#: Status of an answer by the code of its error; 409 for the others: what the tables hold does not allow it now.
+#: Status of an answer by the code of its error; 409 for the others: the present data do not allow it.
 STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNING": 503, "DB_REFUSED": 503} | {
     "PHONE_LINK": 403,
     "UPLOAD_REFUSED": 422,
@@ -61,10 +61,10 @@ _KEEP = "public, max-age=31536000, immutable"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """How the page is served. hosts: names in a Host header that are answered; name and roles: of who opens a link;
-    on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None where
-    links open the page; secure: browsers reach it by TLS; folder: results that are shown in place of the tables;
-    target: what the process runs that computes a visit."""
+    """Options of the page. hosts: names in a Host header that are answered; name and roles: of the person who opens a
+    link; on_entry: called when a link was used, with the key of the next one. accounts: of those who sign in, None
+    if links open the page; secure: browsers reach it by TLS; folder: results that are shown instead of the tables;
+    target: function that computes a visit in a process."""
 
     hosts: frozenset[str] = frozenset({"127.0.0.1", "localhost", "::1"})
     name: str = ""
@@ -82,7 +82,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     if sessions is None and accounts is not None:
         sessions = access.Sessions(idle_hours=access.IDLE_HOURS, still=accounts.current)
     sessions = sessions or access.Sessions()
-    way = WayIn(sessions, access.Cookie(options.secure), accounts, Attempts())
+    way = SignIn(sessions, access.Cookie(options.secure), accounts, Attempts())
     pages, tables, videos, making = Pages(accounts is not None), Tables(), Videos(), ProcessQueue(most=20, kept=8)
     visits_queue = ProcessQueue(most=50, kept=50)
 
@@ -181,7 +181,7 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
         ],
         lifespan=life,
     )
-    app.state.sessions, app.state.way_in = sessions, way
+    app.state.sessions, app.state.sign_in = sessions, way
     app.state.computing, app.state.phones = visits_queue, phones
     app.state.looks = audit.Looks(tables) if settings.audit_looks() and options.folder is None else None
     app.router.default, app.router.redirect_slashes = unknown, False

@@ -1,30 +1,28 @@
-"""Leaves a row for each look at a recording, before it is shown, where PBL_AUDIT_LOOKS asks for it."""
+"""A row for each look at a recording, before it is shown, if PBL_AUDIT_LOOKS asks for it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 
-from schemas.decisions.viewing_log import record_viewing
+from schemas.decisions.review_decisions import record_viewing
 
 from .access import Session
 from .tables import Tables
 
-#: Seconds in which what a page asks for again and again (ranges of a video) is one look.
+#: Seconds in which repeated requests of a page (ranges of a video) count as one look.
 AGAIN_S = 600.0
 
 
 class Looks:
-    """Records looks; `address.Address` says which address is one."""
+    """Record of looks; `address.Address` declares which addresses count."""
 
     def __init__(self, tables: Tables, clock: Callable[[], float] = time.monotonic) -> None:
         self._tables, self._clock = tables, clock
 
     async def record(self, session: Session, of: str, number: int, what: str) -> None:
         """Insert a row for what is looked at, one in `AGAIN_S` for all but a page; `of`: "video_id" or "session_id".
-
-        Raises `PblError` where it cannot be written.
-        """
+        Raises `PblError` where it cannot be written."""
         key, now = (of, str(number), what), self._clock()
         if what != "page" and now - session.looked.get(key, -AGAIN_S) < AGAIN_S:
             return

@@ -1,11 +1,10 @@
-"""The laboratory's own certificates (`pbl web --tls`): an authority, made once, which phones are told to trust, and the
-server's certificate, which it signs and which is renewed by itself."""
+"""The laboratory's own certificates (`pbl web --tls`): an authority, made once, that phones have to trust, and the
+server's certificate, which it signs and which is renewed automatically."""
 
 from __future__ import annotations
 
 import datetime
 import ipaddress
-import os
 import secrets
 import socket
 from collections.abc import Collection
@@ -18,7 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from pbl_pipeline import settings
-from schemas.operations.folders import private_folder
+from schemas.operations.folders import private_folder, write_text
 
 #: Days for which the authority and a server's certificate are good (browsers take at most 398 for the latter), and
 #: those before its end at which that is renewed.
@@ -31,7 +30,7 @@ def folder() -> Path:
 
 
 def authority() -> Path:
-    """Return where the authority's certificate lies, which is no secret; it may not be made yet."""
+    """Return where the authority's certificate lies, which is not secret and may not exist yet."""
     return settings.home_dir() / "web" / "tls" / "authority.crt"
 
 
@@ -48,7 +47,7 @@ def own_names() -> tuple[str, ...]:
 
 
 def server_certificate(names: Collection[str]) -> tuple[Path, Path]:
-    """Return the files of a certificate for these names and of its key, made and signed where there is none, where it
+    """Return the files of a certificate for these names and of its key, made and signed if there is none, where it
     is for other names, or ends soon. Raises OSError."""
     here = folder()
     cert, key = here / "server.crt", here / "server.key"
@@ -68,8 +67,8 @@ def server_certificate(names: Collection[str]) -> tuple[Path, Path]:
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signing_key.public_key()), critical=False)
     )
-    _write(key, _key_bytes(own))
-    _write(cert, builder.sign(signing_key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    write_text(key, _key_bytes(own))
+    write_text(cert, builder.sign(signing_key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
     return cert, key
 
 
@@ -79,7 +78,7 @@ def _authority(here: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey
         loaded = serialization.load_pem_private_key(key.read_bytes(), None)
         return x509.load_pem_x509_certificate(cert.read_bytes()), cast("ec.EllipticCurvePrivateKey", loaded)
     own = ec.generate_private_key(ec.SECP256R1())
-    # A name of its own: that of a laboratory's other machine is another authority.
+    # A unique name: another machine of the laboratory is another authority.
     name = f"Gait laboratory {secrets.token_hex(3)}"
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     made = (
@@ -89,8 +88,8 @@ def _authority(here: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(own.public_key()), critical=False)
         .sign(own, hashes.SHA256())
     )
-    _write(key, _key_bytes(own))
-    _write(cert, made.public_bytes(serialization.Encoding.PEM))
+    write_text(key, _key_bytes(own))
+    write_text(cert, made.public_bytes(serialization.Encoding.PEM))
     return made, own
 
 
@@ -126,12 +125,3 @@ def _key_bytes(key: ec.EllipticCurvePrivateKey) -> bytes:
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-
-
-def _write(path: Path, content: bytes) -> None:
-    new = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as target:
-        target.write(content)
-        target.flush()
-        os.fsync(target.fileno())
-    new.replace(path)

@@ -38,8 +38,6 @@ class Chart:
 
 
 def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
-    """The addresses of this part."""
-
     async def show(request: Request) -> Response:
         from pbl_pipeline.gait import IMPORTANT_CHANGE
 
@@ -83,7 +81,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
 
 
 def charts_of(found: comparison.Comparison, names: Sequence[str], language: str = "en") -> list[Chart]:
-    """Every angle of which any result has curves, in the order of the report."""
+    """Return the charts of all angles with curves, in the order of the report."""
     out = []
     for angle, (title, positive) in (ANGLES | FOOT_ANGLES | PELVIS_ANGLES).items():
         sides, far = {}, {}
@@ -120,7 +118,7 @@ def _norm(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
 
 
 def _interval(one: comparison.Side, name: str) -> tuple[float, float] | None:
-    """The interval of a measure if it is that of the spread of its cycles alone; None where it has none."""
+    """The interval of a measure if it is that of the spread of its cycles alone; None if it has none."""
     value, _ = one.about.all_measures.get(name, (None, ""))
     return None if value is None or value.error_sd is not None else value.interval
 
@@ -145,7 +143,7 @@ def without(found: comparison.Comparison) -> dict[tuple[str, ...], list[str]]:
 
 
 def _name(one: comparison.Side) -> str:
-    """What tells a result from the others, without the person's code."""
+    """Return a distinct name of a result, without the person's code."""
     label = one.about.row.label
     if len(one.about.results) < 2 or one.about.result is None:
         return label

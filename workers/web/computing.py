@@ -28,7 +28,7 @@ Target = Callable[[int, bool], None]
 
 
 def compute_visit(session_id: int, again: bool) -> None:
-    """Compute what is missing of a visit, as `pbl populate --visit` does; a signal puts the running job back."""
+    """Compute the missing results of a visit, as `pbl populate --visit` does; a signal puts the running job back."""
 
     def end(*_: object) -> None:
         raise SystemExit(0)
@@ -61,22 +61,22 @@ def _broken(session_id: int, found: str) -> PblError:
         "WORKER_CRASH",
         found=f"the computation of the visit broke off: {found}",
         expected="a process that computes it to its end",
-        next_step="compute it again, which frees what it held; the terminal of `pbl web` says more",
+        next_step="compute it again, which frees what it held; the terminal of `pbl web` has details",
         key=f"session_id={session_id}",
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class Told:
-    """How far a visit is."""
+    """Progress of a visit."""
 
     progress: Progress
-    state: str  # "running" or "waiting" here, or "" where it was not asked for
+    state: str  # "running" or "waiting" here, or "" if it was not asked for
     error: PblError | None  # what ended its last process before it was done
 
     @property
     def busy(self) -> bool:
-        """True where it changes by itself: the page asks again."""
+        """True if it changes by itself: the page asks again."""
         return bool(self.state or self.progress.running)
 
 
@@ -89,8 +89,6 @@ def told(request: Request, progress: Progress) -> Told:
 
 
 def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Address]:
-    """The addresses of this part."""
-
     async def compute(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)

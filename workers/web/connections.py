@@ -26,12 +26,7 @@ LINGER_S = 1.0
 
 def customer(address: str) -> str:
     """Return the IPv4 address, also of one written as IPv6; of IPv6 the /64 network, all of which one customer has.
-
-    Raises
-    ------
-    ValueError
-        The text is not an address.
-    """
+    Raises ValueError if the text is not an address."""
     at = ip_address(address)
     if isinstance(at, IPv6Address):
         return str(at.ipv4_mapped or IPv6Address(int(at) >> 64 << 64))
@@ -124,17 +119,17 @@ class Connection(H11Protocol):
             self._time_request()
 
     def pause_writing(self) -> None:
-        """The client takes nothing at the moment."""
+        """Start a timer: the client takes nothing at the moment."""
         super().pause_writing()  # type: ignore[misc]
         self._abort_after("answer", TAKE_S)
 
     def resume_writing(self) -> None:
-        """It took something."""
+        """Stop the timer: the client took something."""
         super().resume_writing()  # type: ignore[misc]
         self._end("answer")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Nothing is waited for any more."""
+        """Stop all timers."""
         self._end("request")
         self._end("answer")
         super().connection_lost(exc)
@@ -143,14 +138,13 @@ class Connection(H11Protocol):
         """Close a connection of the address that has the most: rather one that waits for its client than one that is
         being answered, and of these the oldest."""
         ((most, _),) = Counter(c._customer for c in others).most_common(1)
-        closed = min((c for c in others if c._customer == most), key=lambda c: (not c._waits, c._made_at))
+        closed = min(
+            (c for c in others if c._customer == most),
+            # Whether the next step is the client's: to send a request, or to take an answer.
+            key=lambda c: (not (c._timers or c.cycle is None or c.cycle.response_complete), c._made_at),
+        )
         self.connections.discard(closed)  # it stops counting now, not when it is closed
         closed.transport.abort()
-
-    @property
-    def _waits(self) -> bool:
-        """Whether the next step is the client's: to send a request, or to take an answer."""
-        return bool(self._timers) or self.cycle is None or self.cycle.response_complete
 
     def _time_request(self) -> None:
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):

@@ -1,4 +1,4 @@
-"""Judge a recording: whether it is usable, and its events by hand. Each decision is a row (`schemas.decisions`)."""
+"""Marks of recordings as not usable, and corrected events. Each decision is a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
@@ -23,26 +23,24 @@ _EVENTS = {"d": "foot_down", "u": "foot_up"}
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """What was decided of a recording, and the state in which the page shows it. views: videos of its trial, which are
-    marked together; events: those that count, None where none were searched."""
+    """Decisions about a recording, and the state in which the page shows it. views: videos of its trial, which are
+    marked together; events: those that count, None if none were searched."""
 
     mark: not_usable.Unusable | None
     usable_state: str
     views: int
-    events: event_corrections.Shown | None
+    events: event_corrections.ShownEvents | None
     reasons: tuple[str, ...] = tuple(UNUSABLE)
 
 
 def judged(video_id: int) -> Judged:
-    """Of a registered recording. Reads tables."""
+    """Return the decisions about a registered recording. Reads tables."""
     views = fit.videos_of(fit.trial_of(video_id))
     mark = not_usable.unusable([video_id]).get(video_id)
-    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown(video_id))
+    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown_events(video_id))
 
 
 def routes(tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def usable_or_not(request: Request) -> Response:
         fields = await form_of(request)
         number, seen = number_of(request), fields.get("seen", "")

@@ -1,4 +1,4 @@
-"""Decide: who of a recording is measured, which warnings are accepted; each a row (`schemas.decisions`)."""
+"""Choice of the measured person, and accepted warnings; each decision is a row (`schemas.decisions`)."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def person(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)
@@ -75,7 +73,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
 
     async def people(request: Request) -> Response:
-        """The picture of the numbered people. It is of the original: none where heads are to be hidden."""
+        """The picture of the numbered people. It is of the original: none if heads are to be hidden."""
         number, which = number_of(request), _number(request.query_params.get("method", "0"))
 
         def picture() -> bytes:
@@ -105,10 +103,10 @@ def _number(text: str) -> int:
 
 
 def boxes_json(tracked: Tracking) -> bytes:
-    """Boxes of everybody as JSON.
+    """Return the boxes of all people as JSON.
 
     `size`: width, height of the upright video (px); `time`: (T) s; `people`: number of a person and `boxes`: for each
-    frame x0, y0, x1, y1 (px) and whether somebody was detected there (1) or the box is carried over a gap (0); null in
+    frame x0, y0, x1, y1 (px) and whether a person was detected there (1) or the box is carried over a gap (0); null in
     frames without the person.
     """
     people: list[dict[str, Any]] = []

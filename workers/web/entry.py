@@ -15,13 +15,11 @@ from .address import Address, number_of
 from .pages import Pages, in_field, reader_language
 from .tables import Tables
 
-#: What the names of the fields begin with: an instrument may be called as another field of the form.
+#: Prefix of the names of the fields: an instrument may have the name of another field of the form.
 _FIELD = "value:"
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     def page(
         request: Request, entry: visit_forms.Form, values: Mapping[str, str], errors: Mapping[str, PblError]
     ) -> Response:
@@ -29,7 +27,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         scores = {name: in_field(language, entry.values[name]) for name in entry.instruments}
         return pages.show(
             request,
-            "enter.html",
+            "scores.html",
             entry=entry,
             values={**entry.values, **scores, **values},
             errors=errors,
@@ -39,16 +37,18 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         )
 
     async def form(request: Request) -> Response:
-        return page(request, await tables.ask(visit_forms.entry, number_of(request)), {}, {})
+        return page(request, await tables.ask(visit_forms.scores_form, number_of(request)), {}, {})
 
     async def send(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)
         values = {name.removeprefix(_FIELD): text for name, text in fields.items() if name.startswith(_FIELD)}
         reason = fields.get("reason", "").strip()
-        _, errors = await tables.ask(visit_forms.enter, number, values, sender(request), fields.get("seen", ""), reason)
+        _, errors = await tables.ask(
+            visit_forms.enter_scores, number, values, sender(request), fields.get("seen", ""), reason
+        )
         if errors:
-            return page(request, await tables.ask(visit_forms.entry, number), values, errors)
+            return page(request, await tables.ask(visit_forms.scores_form, number), values, errors)
         return RedirectResponse(f"/visits/{number}#entered", 303)
 
     async def instruments(request: Request) -> Response:

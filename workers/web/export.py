@@ -22,8 +22,6 @@ FORMATS = ("csv", "trc", "mot")
 
 
 def routes(asks: Asks, source: Source) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def export(request: Request) -> Response:
         number, result = number_of(request), shown_of(request)
 
@@ -42,7 +40,7 @@ async def archive_of(visit: Visit, name: str) -> Response:
     def write() -> Path:
         from pbl_pipeline.export import ExportOptions, write_export
 
-        # As a reviewer sees it: what failed a check says so in its files.
+        # As a reviewer sees it: the files state failed checks.
         options = ExportOptions(number_trials=True, allow_failed=True)
         out, archive = folder.path / "files", folder.path / "visit.zip"
         paths = write_export(visit, FORMATS, out, options)

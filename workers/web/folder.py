@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import functools
 from collections.abc import Hashable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from pbl_pipeline.words import MEASURES
 from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
 from schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
 from schemas.reading.visit_progress import Progress
+from schemas.subject_codes import day_of
 
 from .access import REPORT_POLICY
 from .address import Address, interval, number_of, page
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 _MOST, _DEEP = 1000, 3
 #: Visits that are kept in memory at a time.
 _KEPT = 4
-#: Endings of a recording that is looked for beside its results.
+#: Endings of recordings that are searched beside their results.
 _VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """Where a visit lies: its name, its folder, and the numbers that its recordings have here."""
+    """Name and folder of a visit, and the numbers of its recordings here."""
 
     name: str
     path: Path
@@ -50,15 +50,10 @@ class _Place:
 class ResultsFolder:
     """Visits below a folder, each a folder with a `session.json` or, of a run that was ended, with fits alone.
 
-    Raises `PblError` FILE_MISSING where no results are in it.
+    Raises `PblError` FILE_MISSING if no results are in it.
 
-    Parameters
-    ----------
-    path
-        Of `pbl run --out`, or a folder of such folders.
-    videos
-        Where the recordings are looked for, by their names: the results hold none. None: beside the results and in the
-        folder above.
+    `path`: of `pbl run --out`, or a folder of such folders. `videos`: folder of the recordings, which are found by
+    their names (None: beside the results and in the folder above).
     """
 
     def __init__(self, path: Path, videos: Path | None = None) -> None:
@@ -118,13 +113,13 @@ class ResultsFolder:
         )
 
     def state(self, number: int) -> Hashable:
-        """Return what tells apart what was fitted to a recording."""
+        """Return a value that changes with the fit of a recording."""
         of, name = self._of_recording(number)
         path = self._places[of].path / f"{name}.{FIT}"
         return str(path), path.stat().st_mtime_ns
 
     def video(self, number: int) -> Path:
-        """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING where it is not found.
+        """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING if it is not found.
 
         Also where only pictures with hidden heads may be shown (PBL_DEIDENTIFY).
         """
@@ -156,7 +151,7 @@ class ResultsFolder:
         return path
 
     def report(self, number: int) -> Path:
-        """Return the report. Raises `PblError` DB_NOT_FOUND where there is none."""
+        """Return the report. Raises `PblError` DB_NOT_FOUND if there is none."""
         path = self._place(number).path / REPORT
         if not path.is_file():
             raise _unknown("report of visit", number)
@@ -216,7 +211,7 @@ class ResultsFolder:
             session_id=number,
             subject="" if visit is None else _subject(visit),
             label=place.name,
-            day=None if visit is None else _day(visit),
+            day=None if visit is None else day_of(visit.date),
             role="",
             videos=len(place.recordings) if visit is None else len(visit.recordings),
             state=state,
@@ -296,14 +291,6 @@ def _tasks(visit: Visit) -> dict[str, dict[str, tuple[Measure | None, str]]]:
 
 def _subject(visit: Visit) -> str:
     return "" if visit.subject == "-" else visit.subject
-
-
-def _day(visit: Visit) -> datetime.date | None:
-    """Return the day of a visit; None where the files have none, or text that is not a day."""
-    try:
-        return datetime.date.fromisoformat(visit.date)
-    except ValueError:
-        return None
 
 
 def _facts_of_fit(recording: Recording) -> dict[str, Any]:

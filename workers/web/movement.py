@@ -22,7 +22,7 @@ POINT_STEPS, _FAR = 2, 2.0
 
 @dataclasses.dataclass(frozen=True)
 class Movement:
-    """What a recording's page asks for: `movement_json`, the numbers of `body_json`, `points_bytes`."""
+    """Data of a recording's page: `movement_json`, the numbers of `body_json`, `points_bytes`."""
 
     movement: bytes
     body: bytes
@@ -30,7 +30,7 @@ class Movement:
 
     @classmethod
     def of(cls, found: Recording) -> Movement:
-        """All three. Raises as they do."""
+        """Return all three. Raises as they do."""
         body, numbers = body_json(found)
         return cls(movement_json(found, body), numbers, points_bytes(found))
 
@@ -93,7 +93,7 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
         parent's frame), `capsules` (body, start x y z, end x y z, radius; m, in the body's frame), `floor` and `start`
         (m: height of the floor, where the root is in the first known frame), `known`: runs of frames (first, last) with
         a pose, and `steps`. `camera`: `lens` (fx, fy, cx, cy px), `distortion` (k1, k2, p1, p2, k3), `turning` (squared
-        radius up to which that is a lens), `near` and `position` (m), `known`; null where there is no camera.
+        radius up to which that is a lens), `near` and `position` (m), `known`; null if there is no camera.
     bytes
         Channels (C, T): root x, y, z relative to `start`, four of each body's quaternion (w, x, y, z), four of the
         camera's, in steps. Of each channel second differences, first the low bytes of all, then the high bytes: that
@@ -145,7 +145,7 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
 
 def points_bytes(found: Recording) -> bytes:
     """The detected points: channels (2 J, T) x, y in half pixels, packed as those of `body_json`, then their confidence
-    (J, T) in 255ths as bytes, 0 where a point is not known. Empty where the fit is of markers."""
+    (J, T) in 255ths as bytes, 0 if a point is not known. Empty if the fit is of markers."""
     points = found.keypoints
     if points is None or len(points.time_s) != len(_fit(found).time_s):
         return b""

@@ -30,10 +30,8 @@ def is_multipart(request: Request) -> bool:
 
 
 async def parts(request: Request) -> AsyncIterator[Part | bytes]:
-    """Yield each part of a form, and then its bytes in pieces as they arrive.
-
-    Raises `Refused` "form" for a body that is broken off or not such a form.
-    """
+    """Yield each part of a form, and then its bytes in pieces as they arrive. Raises `Refused` "form" for a body that
+    is broken off or not such a form."""
     found = _BOUNDARY.match(request.headers.get("content-type", ""))
     if found is None:
         raise Refused("form")

@@ -16,7 +16,7 @@ from pbl_pipeline.names import whole_number
 from schemas import fit
 from schemas.decisions import review_decisions
 from schemas.operations.server_status import database_status
-from schemas.reading.status import ErrorRow, Running, Status, pipeline_status, running, span
+from schemas.reading.status import ErrorRow, pipeline_status, running, span
 from schemas.transactions import in_transaction
 
 from ..requeue import retry
@@ -40,10 +40,10 @@ class Group:
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """The addresses of this part."""
-
     async def show(request: Request) -> Response:
-        state, jobs, server, free = await tables.ask(_state)
+        state, jobs, server, free = await tables.ask(
+            lambda: (pipeline_status(most=MOST), running(MOST), database_status(), disks())
+        )
         return pages.show(
             request,
             "operate.html",
@@ -82,10 +82,6 @@ def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:
     return sorted(made, key=lambda g: -len(g.errors))
 
 
-def _state() -> tuple[Status, list[Running], dict[str, Any], list[tuple[str, float, float]]]:
-    return pipeline_status(most=MOST), running(MOST), database_status(), disks()
-
-
 def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:
     """Put errors of a table and code back, all or that of one key, with a row of Decision; how many."""
 
@@ -100,14 +96,14 @@ def _retry(table: str, code: str, key: dict[str, Any] | None, by: str) -> int:
 
 
 def _whose(key: dict[str, Any]) -> dict[str, int]:
-    """The recording or visit that a job is of, so that the row goes with its person."""
+    """Return the recording or visit of a job, so that the row is deleted with its person."""
     if "video_id" in key:
         return {"video_id": int(key["video_id"])}
     return {"session_id": fit.session_of_set({"fit_set": key["fit_set"]})} if "fit_set" in key else {}
 
 
 def _key(text: str) -> dict[str, Any] | None:
-    """The key of a job as a form names it; None for none. Raises `Refused` for what is no key."""
+    """The key of a job as a form names it; None for none. Raises `Refused` for an invalid key."""
     if not text:
         return None
     try:

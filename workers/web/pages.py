@@ -34,7 +34,10 @@ _unforeseen = functools.partial(
     "INTERNAL",
     found="an unforeseen error of the page",
     expected="an answer",
-    next_step="report what the terminal of `pbl web` says",
+    next_step="report the text in the terminal of `pbl web`",
+)
+_refusal = functools.partial(
+    PblError, "WEB_REFUSED", expected="a request of a person who is signed in and has the right"
 )
 _not_there = functools.partial(
     PblError,
@@ -129,7 +132,7 @@ class Pages:
         headers: Mapping[str, str] | None = None,
         **values: Any,
     ) -> Response:
-        """Return a page, or what it shows as JSON where the address ends so. `values`: what its template names."""
+        """Return a page, or its values as JSON if the address ends so. `values`: variables of its template."""
         if as_json(request):
             shown = {name: plain(value) for name, value in values.items() if not callable(value)}
             return JSONResponse(shown, status, dict(headers or {}))
@@ -150,37 +153,33 @@ class Pages:
         return HTMLResponse(page, status, dict(headers or {}))
 
     def refused(self, request: Request, reason: str) -> Response:
-        """The answer to a request that may not pass."""
+        """Return the answer to a request that may not pass."""
         if reason == "address":
             return self.missing(request, 404)
         name = "enter.title" if reason == "session" else f"enter.{reason}_title"
         text = "enter.text" if reason == "session" else f"enter.{reason}"
         if as_json(request):
-            return self.error(request, _refusal(texts.text("en", name), texts.text("en", text)), _REFUSED[reason])
+            error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
+            return self.error(request, error, _REFUSED[reason])
         if reason == "session" and self._sign_in:
             return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
-        """The answer that a coded error makes: what is known and what to do."""
+        """Return the answer to a coded error."""
         return self.show(request, "error.html", status, error=error)
 
     def missing(self, request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:
-        """The answer for an address that there is not."""
+        """Return the answer to an unknown address."""
         if as_json(request):
             return self.error(request, _not_there(), status)
         return self.show(request, "missing.html", status, headers)
 
     def unforeseen(self, request: Request) -> Response:
-        """The answer where the program itself failed; the traceback is in the terminal."""
+        """Return the answer to a failure of the program; the traceback is in the terminal."""
         if as_json(request):
             return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
         return self.show(request, "unforeseen.html", 500, HEADERS)
-
-
-def _refusal(found: str, next_step: str) -> PblError:
-    expected = "a request of somebody who is signed in and has the right"
-    return PblError("WEB_REFUSED", found=found, expected=expected, next_step=next_step)
 
 
 def in_field(language: str, number: str) -> str:

@@ -28,6 +28,7 @@ from schemas.intake.protocols import Step, steps_of
 from schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
+from ..incoming import check_room
 from ..process_queue import ProcessQueue
 from . import certificates
 from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
@@ -44,12 +45,13 @@ _MAY = {
 }
 #: Hours for which a link can be made on the page.
 HOURS = ("2", "8")
-#: Visits of which is kept what one more pass would bring.
+#: Visits for which the gain of one more pass is kept.
 _KEPT = 20
 _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
-#: Group of the catalogue with the texts that the script says.
+#: Group of the catalogue with the texts of the script.
 _SAID = "capture."
-_on_disk = functools.partial(on_disk, "tell who runs the server; the recording stays on the phone")
+_NEXT_STEP = "tell who runs the server; the recording stays on the phone until there is room"
+_on_disk = functools.partial(on_disk, _NEXT_STEP)
 
 
 class Phones:
@@ -67,7 +69,6 @@ class Phones:
 
 
 def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue, target: Target) -> list[Address]:
-    """Return the addresses of this part."""
     finishing = asyncio.Lock()
 
     async def make(request: Request) -> Response:
@@ -128,7 +129,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
             }
         )
 
-    #: What one more pass would bring, of the visits asked for last, by what their results are told apart by.
+    #: Gain of one more pass for the last visits, with the identity of their results.
     worth: dict[int, tuple[tuple[str, ...], Next | None]] = {}
 
     def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None, list[Step]]:
@@ -197,11 +198,12 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
     async def told(request: Request, sent: Sent) -> Response:
         missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
         if len(missing) == sent.n_parts:
-            await _on_disk(phone_uploads.check_room, sent)
+            # Twice: the parts stay until the whole is registered.
+            await _on_disk(check_room, 2 * (sent.video_bytes + sent.log_bytes), _NEXT_STEP)
         return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
 
     async def worker(request: Request) -> Response:
-        """A script with a thread of its own; below the page's address, so that it is there without network as well."""
+        """Serve a script of a separate thread below the page's address, so that it is also available offline."""
         path = Path(__file__).parent / "static" / f"capture_{request.url.path.rpartition('/')[2]}"
         return FileResponse(path, media_type="text/javascript", headers={"service-worker-allowed": "/phone"})
 
@@ -242,7 +244,7 @@ def verdict(language: str, judged: Usable | None) -> str:
 
 
 def next_words(language: str, more: Next | None) -> str:
-    """Return what one more pass would bring, in two sentences; empty where that is not known."""
+    """Return what one more pass would bring, in two sentences; empty if that is not known."""
     if more is None:
         return ""
     now = texts.text(language, "capture.index", now=f"{more.now:.0f}")

@@ -21,13 +21,11 @@ from .tables import Asks
 
 #: Recordings whose movement is kept in memory at a time: some hundred kB each.
 _KEPT = 8
-#: How browsers call a file by its ending; others are offered as MP4, and a browser that cannot play one says so.
+#: Media types by ending; other files are offered as MP4, and a browser reports one that it cannot play.
 _KINDS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".mov": "video/mp4", ".mp4": "video/mp4"}
 
 
 def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def recording(request: Request) -> Response:
         about = await asks.ask(source.recording, number_of(request))
         problem: PblError | None = None
@@ -50,7 +48,7 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
     kept: collections.OrderedDict[Hashable, asyncio.Future[Movement]] = collections.OrderedDict()
 
     async def prepared(request: Request) -> Movement:
-        """What a recording's page asks for, made once for the requests of several."""
+        """Return the data of a recording's page, made once for concurrent requests."""
         number = number_of(request)
         key = await asks.ask(source.state, number)
         if key not in kept:
@@ -61,7 +59,7 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         try:
             return await asyncio.shield(kept[key])
         except Exception:
-            kept.pop(key, None)  # what was wrong may be put right
+            kept.pop(key, None)  # it may be mended meanwhile
             raise
 
     async def prepare(number: int) -> Movement:

@@ -17,7 +17,7 @@ from schemas.studies import visit_forms
 
 from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
-from ..incoming import VIDEO_ENDINGS, Copy
+from ..incoming import VIDEO_ENDINGS, Copy, check_room
 from ..refresh import queue_visit
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
@@ -28,7 +28,8 @@ from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
-_on_disk = functools.partial(on_disk, "tell who runs the server")
+_NEXT_STEP = "tell who runs the server"
+_on_disk = functools.partial(on_disk, _NEXT_STEP)
 _busy = functools.partial(
     PblError,
     "DB_REFUSED",
@@ -42,8 +43,6 @@ _no_file = functools.partial(
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """Return the addresses of this part."""
-
     async def new(request: Request) -> Response:
         today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
         return await new_page(request, {"visit": today}, {})
@@ -76,7 +75,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
-        stored, language = await tables.ask(visit_forms.facts, number_of(request)), reader_language(request)
+        stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
         numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
         return pages.show(
             request,
@@ -92,7 +91,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def correct(request: Request) -> Response:
         fields = dict(await form_of(request))
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_forms.correct, number, fields, sender(request), seen, reason)
+        changed, errors = await tables.ask(visit_forms.correct_facts, number, fields, sender(request), seen, reason)
         if errors:
             return await facts_page(request, fields, errors)
         if changed:
@@ -122,7 +121,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             raise Refused("form")
         to = await tables.ask(browser_uploads.place, number_of(request))
         request.scope.get(MORE_TIME, lambda: None)()
-        await _on_disk(browser_uploads.check_room, int(request.headers.get("content-length", "0")))
+        await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
         arriving: list[Arriving] = []
         try:
             fields, outcomes, whole = await _receive(request, to, arriving)
@@ -171,7 +170,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 async def _receive(
     request: Request, to: Place, arriving: list[Arriving]
 ) -> tuple[dict[str, str], list[Outcome], list[tuple[Arriving, Copy]]]:
-    """Return the fields of a form, the files that are refused at once, and those that are on disk.
+    """Return the fields of a form, the files that are refused immediately, and those that are on disk.
 
     `arriving` gets every file that was begun. Nothing is written before the form's token was read.
 

@@ -30,8 +30,6 @@ SECONDS, N_BYTES = 3600.0, 8 * 2**30
 
 
 def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
-    """The addresses of this part."""
-
     async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: Any) -> Work:
         """The work that a request is about, begun where it was not. Raises what stopped it, once."""
         wanted = await tables.ask(key, *args)
@@ -82,16 +80,14 @@ def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
 
 
 def state(work: Work | None) -> Response:
-    """How far a work is: what the script of a page that waits for it asks."""
+    """Return the progress of a work for the script of a page that waits for it."""
     return JSONResponse({"ended": work is None or work.ended, "share": 0.0 if work is None else round(work.share, 3)})
 
 
 # ------------------------------------------------------------------------------------ asked in the thread of the tables
 def overlay_key(video_id: int) -> tuple[Any, ...]:
-    """What the overlay of a recording depends on: another one where something was computed anew or heads are hidden.
-
-    Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit.
-    """
+    """Return the dependencies of the overlay of a recording, which change with new results and with hidden heads.
+    Raises `PblError` DB_NOT_FOUND for a recording without pictures or a fit."""
     about = reading.shown_recording(video_id)
     if not about.recording.fitted or about.recording.path is None:
         raise PblError(
@@ -112,7 +108,7 @@ def load_overlay(video_id: int) -> Task:
 
 
 def report_key(session_id: int, shown: int, language: str) -> tuple[Any, ...]:
-    """Return what the report of a result of a visit in a language depends on."""
+    """Return the dependencies of the report of a result of a visit in a language."""
     about = reading.computed_visit(session_id, shown)
     copies = [_copy_of(r.number) for r in about.recordings if r.number is not None]
     return ("report", session_id, language, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
@@ -147,7 +143,7 @@ def _copy_of(video_id: int) -> str:
     return "".join(str(h) for h in (privacy.Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))
 
 
-# -------------------------------------------------------------------------------------------- in processes of their own
+# -------------------------------------------------------------------------------------------- in separate processes
 def _draw(out: Path, recording: Recording) -> None:
     from pbl_pipeline.pipeline import draw_overlay
 

@@ -34,10 +34,10 @@ _CONNECTIONS, _OF_ONE, _IDLE_S = 200, 100, 10
 
 @dataclasses.dataclass(frozen=True)
 class Where:
-    """Where the page is served.
+    """Address and names of the page.
 
     tls_cert, tls_key: files (PEM) of the server's certificate and key. behind_proxy: address, or network, of a proxy of
-    one's own that ends TLS before the page; what it says of who asks is believed, and nobody else is answered.
+    one's own that ends TLS before the page; its statement of the client is trusted, and no one else is answered.
     hostnames: the names under which browsers reach the page. Port 0: a free one.
     """
 
@@ -50,7 +50,7 @@ class Where:
 
     @property
     def by_accounts(self) -> bool:
-        """Whether people sign in: wherever more than this machine may come."""
+        """True if people sign in: unless the page serves this machine alone."""
         return self.host not in LOOPBACK or bool(self.behind_proxy) or self.tls_cert is not None
 
     @property
@@ -60,7 +60,7 @@ class Where:
         return frozenset({*self.hostnames, *own})
 
     def tls(self) -> ssl.SSLContext | None:
-        """Return how TLS is spoken; None where it is not. Raises OSError."""
+        """Return the TLS context; None without TLS. Raises OSError."""
         if self.tls_cert is None:
             return None
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
@@ -125,7 +125,7 @@ def serve(
     sign in with accounts (`pbl web account`).
 
     Raises what `Where.check` raises; USAGE for a name that cannot be printed, and for a folder that more
-    than this machine may see; WEB_ACCOUNT where people sign in and there are no accounts; WEB_PORT where the port is
+    than this machine may see; WEB_ACCOUNT if people sign in and there are no accounts; WEB_PORT if the port is
     taken.
 
     Parameters
@@ -139,7 +139,7 @@ def serve(
     accounts
         None: those of this machine.
     folder
-        Results of `pbl run` that are shown in place of the tables, on this machine alone.
+        Results of `pbl run` that are shown instead of the tables, on this machine alone.
     """
     where.check()
     check_label("--name", name, 64)
@@ -148,7 +148,7 @@ def serve(
             "USAGE",
             found="--folder with PBL_AUDIT_LOOKS",
             expected="tables, in which each look at a recording leaves a row",
-            next_step="`pbl ingest` the recordings; or unset PBL_AUDIT_LOOKS where nobody asks for it",
+            next_step="`pbl ingest` the recordings; or unset PBL_AUDIT_LOOKS if it is not required",
         )
     if folder is not None and where.by_accounts:
         raise PblError(
@@ -163,7 +163,7 @@ def serve(
             raise PblError(
                 "WEB_ACCOUNT",
                 found="no accounts",
-                expected="at least one, with which somebody can sign in",
+                expected="at least one, with which a person can sign in",
                 next_step="pbl web account add NAME --role reviewer",
             )
     listening = _listen(where.host, where.port)
@@ -188,7 +188,7 @@ def serve(
 
 
 def config(app: object, where: Where) -> uvicorn.Config:
-    """How uvicorn serves the page."""
+    """Return the configuration of uvicorn."""
     proxy = ipaddress.ip_network(where.behind_proxy, strict=False) if where.behind_proxy else None
     limits = {"per_address": None if proxy else _OF_ONE, "only_from": proxy, "tls": where.tls()}
     return uvicorn.Config(
@@ -203,7 +203,7 @@ def config(app: object, where: Where) -> uvicorn.Config:
         timeout_keep_alive=_IDLE_S,
         timeout_graceful_shutdown=5,
         h11_max_incomplete_event_size=16_384,
-        # Who asks, as the proxy has it; what anybody else writes into those headers is left out.
+        # The client according to the proxy; these headers of anyone else are ignored.
         proxy_headers=bool(where.behind_proxy),
         forwarded_allow_ips=where.behind_proxy or None,
     )
@@ -269,7 +269,7 @@ def _listen(host: str, port: int) -> socket.socket:
         raise PblError(
             "WEB_PORT",
             found=f"{host}:{port}: {error.strerror or error}",
-            expected="a port that nobody listens on",
+            expected="a free port",
             next_step="pass another --port, or 0 for a free one; another `pbl web` may be running",
         ) from error
     return listening

@@ -1,4 +1,4 @@
-"""Where visits, recordings and videos come from: the tables, or a folder of `pbl run` (`folder.ResultsFolder`)."""
+"""Sources of visits, recordings and videos: the tables, or a folder of `pbl run` (`folder.ResultsFolder`)."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _KEPT = 8
 
 
 class Videos:
-    """Which file is shown of a recording: the original, or the copy with hidden heads where PBL_DEIDENTIFY asks for it.
+    """Files that are shown of recordings: the original, or the copy with hidden heads if PBL_DEIDENTIFY asks for it.
 
-    A copy in a remote store is fetched once and kept until others took its place or the page ends.
+    A copy in a remote store is fetched once and kept until others replace it or the page ends.
     """
 
     def __init__(self) -> None:
@@ -35,11 +35,8 @@ class Videos:
         self._lock = threading.Lock()
 
     def path(self, video_id: int) -> Path:
-        """The file to show. Reads tables.
-
-        Raises `PblError` DB_NOT_FOUND for an unknown video or one without the copy that is asked for, HEAD_NOT_FOUND,
-        VIDEO_MISSING.
-        """
+        """Return the file to show. Reads tables. Raises `PblError` DB_NOT_FOUND for an unknown video or one without the
+        copy that is asked for, HEAD_NOT_FOUND, VIDEO_MISSING."""
         with self._lock:
             if video_id in self._open:
                 self._open.move_to_end(video_id)
@@ -68,14 +65,14 @@ class Source(Protocol):
     DB_NOT_FOUND.
     """
 
-    def visit(self, number: int, result: int) -> shown.ShownVisit: ...
+    def visit(self, number: int, result: int, /) -> shown.ShownVisit: ...
 
-    def recording(self, number: int) -> shown.ShownRecording:
-        """Return a recording; its arrays are loaded when they are asked for."""
+    def recording(self, number: int, /) -> shown.ShownRecording:
+        """Return a recording; its arrays are loaded on first access."""
         ...
 
-    def state(self, number: int) -> Hashable:
-        """Return what tells apart what was fitted to a recording. Raises `PblError` DB_NOT_FOUND without a fit."""
+    def state(self, number: int, /) -> Hashable:
+        """Return a value that changes with the fit of a recording. Raises `PblError` DB_NOT_FOUND without a fit."""
         ...
 
     def video(self, number: int) -> Path:
@@ -83,23 +80,23 @@ class Source(Protocol):
         ...
 
     def to_export(self, number: int, result: int) -> Visit:
-        """Return a computed visit. Raises `PblError` DB_NOT_FOUND where it has no result."""
+        """Return a computed visit. Raises `PblError` DB_NOT_FOUND if it has no result."""
         ...
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
-        """Return who can be chosen, by tracking method, and the state in which that is shown."""
+        """Return the candidates for the measured person by tracking method, and the state that is shown."""
         ...
 
-    def judged(self, number: int) -> Judged:
-        """Return what people decided about a recording."""
+    def judged(self, number: int, /) -> Judged:
+        """Return the decisions about a recording."""
         ...
 
-    def progress(self, session_id: int) -> Progress:
-        """Return what is still to be computed of a visit."""
+    def progress(self, session_id: int, /) -> Progress:
+        """Return the pending computations of a visit."""
         ...
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
-        """Return what the page of a visit shows around it: decisions, accepted checks, entered scores."""
+        """Return the surroundings of a visit on its page: decisions, accepted checks, entered scores."""
         ...
 
 
@@ -109,14 +106,11 @@ class TablesSource:
     def __init__(self, videos: Videos) -> None:
         self._videos = videos
 
-    def visit(self, number: int, result: int) -> shown.ShownVisit:
-        return shown.shown_visit(number, result)
-
-    def recording(self, number: int) -> shown.ShownRecording:
-        return shown.shown_recording(number)
-
-    def state(self, number: int) -> Hashable:
-        return shown.computations(number)
+    visit = staticmethod(shown.shown_visit)
+    recording = staticmethod(shown.shown_recording)
+    state = staticmethod(shown.computations)
+    judged = staticmethod(judged)
+    progress = staticmethod(visit_progress)
 
     def video(self, number: int) -> Path:
         return self._videos.path(number)
@@ -127,7 +121,7 @@ class TablesSource:
         return about.visit
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
-        """None before people are searched."""
+        """Return as `Source.people`; nothing before people are searched."""
         try:
             found = candidates.candidates(about.number)
         except PblError as error:
@@ -136,25 +130,16 @@ class TablesSource:
             return [], []
         return found, [review_decisions.person_state(about.number, c.key["tracking_method"]) for c in found]
 
-    def judged(self, number: int) -> Judged:
-        return judged(number)
-
-    def progress(self, session_id: int) -> Progress:
-        return visit_progress(session_id)
-
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
-        from schemas.studies.visit_forms import entry
+        from schemas.studies.visit_forms import scores_form
 
         number = about.row.session_id
+        film = phone_recordings.filming(number)
+        sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in film["sent"]]
+        film |= {"sent": sent, "steps": protocols.steps_of(number), "protocols": protocols.protocols()}
         return {
             "decisions": review_decisions.decisions(number),
             "accepted": review_decisions.accepted(about.key) if about.key else {},
-            "entry": entry(number),
-            "film": _filming(number),
+            "entry": scores_form(number),
+            "film": film,
         }
-
-
-def _filming(session_id: int) -> dict[str, Any]:
-    found = phone_recordings.filming(session_id)
-    sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in found["sent"]]
-    return {**found, "sent": sent, "steps": protocols.steps_of(session_id), "protocols": protocols.protocols()}

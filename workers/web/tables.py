@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Asks(Protocol):
-    """A way to what is asked, away from the loop that answers browsers."""
+    """Executor of questions, away from the loop that answers browsers."""
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
         """The answer of a function that reads or writes."""
@@ -31,10 +31,8 @@ class Files:
 
 
 async def on_disk(next_step: str, work: Callable[..., T], *args: Any) -> T:
-    """Return what a function returns that reads or writes the archive.
-
-    Raises the error of the function; FILE_UNWRITABLE, with `next_step`, for its OSError.
-    """
+    """Return what a function returns that reads or writes the archive. Raises the error of the function;
+    FILE_UNWRITABLE, with `next_step`, for its OSError."""
     with os_errors_as("FILE_UNWRITABLE", "room and rights in the archive of the server", next_step):
         return await asyncio.to_thread(work, *args)
 
@@ -47,11 +45,8 @@ class Tables:
         self._declared = False
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
-        """The answer of a function that reads or writes tables.
-
-        Raises what the function raises; DB_NOT_RUNNING where the database is away, DB_REFUSED with the
-        server's words for its other errors, STORE_FULL.
-        """
+        """The answer of a function that reads or writes tables. Raises what the function raises; DB_NOT_RUNNING
+        if the database is away, DB_REFUSED with the server's words for its other errors, STORE_FULL."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, self._answer, question, args)
 
     def _answer(self, question: Callable[..., T], args: tuple[Any, ...]) -> T:
@@ -75,5 +70,5 @@ class Tables:
             raise
 
     def close(self) -> None:
-        """Wait for the question that is being asked, take no more."""
+        """Wait for the current question and accept no further ones."""
         self._thread.shutdown(cancel_futures=True)

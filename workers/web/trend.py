@@ -1,4 +1,4 @@
-"""All visits of a person in time, and the letter of one visit for the record."""
+"""Page of all visits of a person in time."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from .tables import Tables
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    """Return the address of this part."""
-
     async def trend(request: Request) -> Response:
         found = await tables.ask(trend_of, number_of(request), request.query_params.get("measure", INDEX))
         if as_json(request):
@@ -45,7 +43,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
 
 def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None:
-    """Return the values over the days of their visits; None where fewer than two days with a value are known."""
+    """Return the values over the days of their visits; None if fewer than two days with a value are known."""
     known = [(p.day, p.value, p) for p in points if p.day is not None and p.value is not None]
     if len(known) < 2:
         return None

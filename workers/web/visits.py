@@ -33,6 +33,7 @@ from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import ANGLES, KINETICS
 from schemas.reading import visit_list
 from schemas.reading.shown import ShownVisit
+from schemas.subject_codes import day_of
 
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of
@@ -48,7 +49,7 @@ SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
 
 @dataclasses.dataclass(frozen=True)
 class Curves:
-    """The angles of a visit. far: the leg that was behind the other, empty where both were seen alike. adults: ranges
+    """The angles of a visit. far: the leg that was behind the other, empty if both were seen alike. adults: ranges
     of adults beside the children's bands."""
 
     angles: tuple[CycleCurve, ...]
@@ -167,7 +168,8 @@ def list_routes(pages: Pages, tables: Tables) -> list[Address]:
 
 
 def _address(session: Session, fields: Mapping[str, str]) -> str:
-    """The list's address for a filled-in form. What was searched for is a number in it: a code is no part of one."""
+    """The list's address for a filled-in form. The search text is a number in it, so that no code is part of an
+    address."""
     search = fields.get("search", "").strip()[:100]
     asked: dict[str, Any] = {"q": session.search_number(search)} if search else {}
     asked |= {name: fields[name][:64] for name in _FIELDS if fields.get(name)}
@@ -175,7 +177,7 @@ def _address(session: Session, fields: Mapping[str, str]) -> str:
 
 
 def _filter(asked: Mapping[str, str], session: Session) -> tuple[visit_list.Filter, bool]:
-    """What is asked for, and whether a part of it was left out because it cannot be asked for."""
+    """Return the filter of a request, and whether an invalid part of it was left out."""
     bad = False
     values: dict[str, Any] = {}
     for name, allowed in (("quality", visit_list.OUTCOMES), ("state", visit_list.STATES)):
@@ -201,7 +203,4 @@ def _after(text: str) -> tuple[str, int] | None:
 
 
 def _day(text: str) -> datetime.date | None:
-    try:
-        return datetime.date.fromisoformat(text) if len(text) == len("2026-01-10") else None
-    except ValueError:
-        return None
+    return day_of(text) if len(text) == len("2026-01-10") else None

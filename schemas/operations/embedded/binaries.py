@@ -1,6 +1,4 @@
-"""Finding the MariaDB server on this machine, or getting it.
-
-Get the Debian packages of the server: installed by root, or unpacked into a folder by any user.
+"""Find the MariaDB server on this machine, or get its Debian packages.
 
 By hand, because apt installs for root only; for other users its packages are downloaded and unpacked into a folder.
 """
@@ -25,12 +23,9 @@ Say = Callable[[str], None]
 
 
 def install(say: Say) -> str | None:
-    """Install the packages on the system, as root or with a sudo that asks no password.
-
-    Returns None when they are installed, else why not.
-    """
-    prefix = _privilege()
-    if prefix is None:
+    """Install the packages on the system, as root or by sudo without a password; return why they are not, else None."""
+    prefix = [] if os.geteuid() == 0 else ["sudo", "-n"]
+    if prefix and _run([*prefix, "true"])[0] is not None:
         return "you are not root and sudo asks for a password"
     # A fresh machine may be installing its own updates: wait for the lock.
     command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", "-q", "-o", "DPkg::Lock::Timeout=120"]
@@ -44,16 +39,23 @@ def install(say: Say) -> str | None:
 
 
 def unpack(folder: Path, say: Say) -> str | None:
-    """Download the packages, with the libraries the system lacks, and unpack them into `folder`. Needs no root.
+    """Download the packages and the libraries that the system lacks, and unpack them without root.
 
-    `folder` becomes the root of the unpacked tree (`folder/usr/sbin/mariadbd`). Returns None when done, else why not.
+    `folder` becomes the root of the unpacked tree (`folder/usr/sbin/mariadbd`). Returns why it failed, else None.
     """
     work = folder.with_name(folder.name + ".tmp")
     try:
         shutil.rmtree(work, ignore_errors=True)
         (work / "lists" / "partial").mkdir(parents=True)
         (work / "archives" / "partial").mkdir(parents=True)
-        failure = _download_and_unpack(work, say)
+        failure = _download(work, say)
+        if failure is not None:
+            say("  fetching a separate package list")
+            lists = f"Dir::State::Lists={work / 'lists'}"
+            own = ("-o", lists, "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
+            failure = _run(["apt-get", *own, "-q", "update"])[0] or _download(work, say, own)
+        for package in sorted((work / "archives").glob("*.deb")):
+            failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
         if failure is None:
             shutil.rmtree(folder, ignore_errors=True)
             (work / "root").rename(folder)
@@ -64,20 +66,8 @@ def unpack(folder: Path, say: Say) -> str | None:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _download_and_unpack(work: Path, say: Say) -> str | None:
-    # The system's package lists are used as they are; where they are missing, own ones are fetched beside them.
-    own_lists = ("-o", f"Dir::State::Lists={work / 'lists'}", "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
-    failure = _download(work, say)
-    if failure is not None:
-        say("  fetching a package list of our own")
-        failure = _run(["apt-get", *own_lists, "-q", "update"])[0] or _download(work, say, own_lists)
-    for package in sorted((work / "archives").glob("*.deb")):
-        failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
-    return failure
-
-
 def _download(work: Path, say: Say, options: Sequence[str] = ()) -> str | None:
-    """Download what an installation would add: our packages and the libraries that the system lacks."""
+    """Download the packages that an installation would add: ours and the libraries that the system lacks."""
     failure, said = _run(["apt-get", *options, "-s", "-q", "install", "--no-install-recommends", *PACKAGES])
     if failure is not None:
         return failure
@@ -87,16 +77,8 @@ def _download(work: Path, say: Say, options: Sequence[str] = ()) -> str | None:
     return _run(["apt-get", *options, "-q", "download", *wanted], work / "archives")[0]
 
 
-def _privilege() -> list[str] | None:
-    if os.geteuid() == 0:
-        return []
-    if shutil.which("sudo") and _run(["sudo", "-n", "true"])[0] is None:
-        return ["sudo", "-n"]
-    return None
-
-
 def _run(command: Sequence[str], cwd: Path | None = None) -> tuple[str | None, str]:
-    """Run a program to its end; return why it failed, None where it did not, and its output."""
+    """Run a program to its end; return why it failed, None on success, and its output."""
     try:
         done = subprocess.run(
             command,
@@ -116,20 +98,20 @@ def _run(command: Sequence[str], cwd: Path | None = None) -> tuple[str | None, s
         return f"{command[0]} took more than {TIMEOUT_S:.0f} s", ""
     if done.returncode == 0:
         return None, done.stdout
-    # The line that says why: apt's first error (E: ...), else the last line.
+    # The reason: apt's first error (E: ...), else the last line.
     lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("E: ")]
     return next(iter([*errors, *lines[-1:]]), f"{command[0]} ended with code {done.returncode}"), done.stdout
 
 
-#: Where the server lies when it is not on PATH (Debian, Fedora, Homebrew).
+#: Further folders of the server (Debian, Fedora, Homebrew).
 PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
 
 _ABSENT = "there is no MariaDB server on this machine"
 
 
 def silent(_: str) -> None:
-    """The default of every `say`: prints nothing."""
+    """Print nothing: the default of every `say`."""
 
 
 @dataclass(frozen=True)
@@ -142,14 +124,14 @@ class Binaries:
     env: dict[str, str] = field(default_factory=dict)
 
     def environment(self) -> dict[str, str]:
-        """The whole environment of a child: small, for the caller's variables may hold passwords."""
+        """Return the environment of a child without the caller's variables, which may hold passwords."""
         kept = {name: os.environ[name] for name in ("LANG", "TZ") if name in os.environ}
-        # UMASK is MariaDB's own variable: the files it makes are for its account only.
+        # UMASK is a variable of MariaDB: its files are readable by its account only.
         return {"PATH": f"{os.defpath}:/usr/sbin:/sbin", "UMASK": "0600", "UMASK_DIR": "0700", **kept, **self.env}
 
 
 def find_server() -> Binaries | None:
-    """The MariaDB server of this machine, or the one unpacked into `settings.home_dir()/server`; None when absent."""
+    """Return the MariaDB server of this machine, or the one in `settings.home_dir()/server`; None without either."""
     ours = _unpack_folder()
     for place in (*os.environ.get("PATH", os.defpath).split(os.pathsep), *PLACES, ours / "usr" / "sbin"):
         server = Path(place) / "mariadbd"
@@ -165,10 +147,8 @@ def find_server() -> Binaries | None:
 
 
 def check_obtainable() -> None:
-    """Return where the server can be started or fetched; nothing is made or fetched.
-
-    Raises `PblError` DB_UNAVAILABLE with the reason and the other ways to a database.
-    """
+    """Check that the server can be started or fetched; nothing is made or fetched. Raises `PblError` DB_UNAVAILABLE
+    with the reason and alternatives."""
     if not hasattr(os, "geteuid"):
         raise _unavailable("the embedded database needs the accounts and file locks of Linux or macOS", install=False)
     if find_server() is not None:
@@ -180,10 +160,8 @@ def check_obtainable() -> None:
 
 
 def get_server(say: Say = silent) -> Binaries:
-    """The server of this machine, fetched with apt when it is absent.
-
-    Raises `PblError` DB_UNAVAILABLE with the reason and the remedy.
-    """
+    """Return the server of this machine, fetched with apt if it is absent. Raises `PblError` DB_UNAVAILABLE with the
+    reason and the remedy."""
     found = find_server()
     if found:
         return found

@@ -25,7 +25,7 @@ PORTS = range(13306, 30000)
 
 
 def port_free(port: int) -> bool:
-    """True when a server could listen on `port` now."""
+    """Return whether a server could listen on `port` now."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         # As the server does, so that connections of its last life that have not timed out do not count.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -37,10 +37,8 @@ def port_free(port: int) -> bool:
 
 
 def free_port() -> int:
-    """A random free port, so that several databases on one machine rarely collide.
-
-    Raises `PblError` DB_UNAVAILABLE when 200 tries find none.
-    """
+    """Return a random free port, so that several databases on one machine rarely collide. Raises `PblError`
+    DB_UNAVAILABLE when 200 tries find none."""
     for port in random.sample(PORTS, 200):
         if port_free(port):
             return port
@@ -61,7 +59,7 @@ _STATE = {
     "on_demand": bool | None,
 }
 
-#: Accounts root drops to, in this order. `nobody` exists on every Debian; `mysql` only where its packages made it.
+#: Accounts for a server that root starts, by preference: `mysql` exists only with its packages, `nobody` always.
 UNPRIVILEGED = ("mysql", "nobody")
 
 
@@ -74,7 +72,7 @@ class Account:
     gid: int
 
     def popen(self) -> dict[str, Any]:
-        """Arguments of `subprocess` that run a child as this account; nothing when it is the caller's own."""
+        """Return arguments of `subprocess` that run a child as this account; none for the caller's own."""
         if self.uid == os.geteuid():
             return {}
         return {"user": self.uid, "group": self.gid, "extra_groups": []}
@@ -86,16 +84,13 @@ class Account:
 
 
 def server_account(data: Path) -> Account:
-    """The account for the server process: never root.
+    """Return the account for the server process: never root.
 
     Raises `PblError` DB_UNAVAILABLE when the caller is root and the system has no unprivileged account to drop to.
 
-    Parameters
-    ----------
-    data
-        The data folder. When root meets one that exists, its owner goes on running it, whoever that is.
+    `data`: the data folder. For root, the owner of an existing one.
     """
-    import pwd  # here: Windows has none, and this module is imported there too
+    import pwd  # here, because Windows has none and also imports this module
 
     if os.geteuid() != 0:
         return Account(_name_of(os.geteuid()), os.geteuid(), os.getegid())
@@ -117,10 +112,8 @@ def server_account(data: Path) -> Account:
 
 
 def check_enterable(folder: Path, account: Account) -> None:
-    """Make sure `account` can enter `folder`, by trying as that account (permission bits alone do not decide).
-
-    Raises `PblError` DB_UNAVAILABLE naming the first folder on the way that is closed, and the remedy.
-    """
+    """Check as `account` that it can enter `folder`: permission bits alone do not decide. Raises `PblError`
+    DB_UNAVAILABLE, which names the first closed folder on the way, and the remedy."""
     if not account.popen():
         return
     if _can_enter(folder, account):
@@ -145,7 +138,7 @@ def _name_of(uid: int) -> str:
 
     try:
         return pwd.getpwuid(uid).pw_name
-    except KeyError:  # a container may run under a number that has no name
+    except KeyError:  # a container may run under a number without a name
         return str(uid)
 
 
@@ -156,18 +149,17 @@ ADMIN_USER = "pbl_admin"
 
 @dataclass(frozen=True)
 class Credentials:
-    """The two passwords of the server: the application's and the administrator's, who stops it and grants rights."""
+    """The passwords of the application, and of the administrator, who stops the server and grants rights."""
 
     app_password: str
     admin_password: str
 
     @staticmethod
     def new() -> Credentials:
-        """Random passwords of 192 bits, in characters that need no quoting."""
+        """Return random passwords of 192 bits, in characters that need no quoting."""
         return Credentials(secrets.token_hex(24), secrets.token_hex(24))
 
 
-@dataclass(frozen=True)
 class Folder:
     """`<home>/db`: `data/` and `run/` belong to the server's account, the rest to the user.
 
@@ -179,58 +171,29 @@ class Folder:
     lock               held while a command starts or stops the server
     """
 
-    path: Path
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.data, self.run, self.tmp = path / "data", path / "run", path / "tmp"
+        self.log = self.run / "server.log"
+        self.credentials_file, self.state_file = path / "credentials.json", path / "server.json"
 
     @staticmethod
     def default() -> Folder:
         return Folder(settings.home_dir() / "db")
 
-    @property
-    def data(self) -> Path:
-        return self.path / "data"
-
-    @property
-    def run(self) -> Path:
-        return self.path / "run"
-
-    @property
-    def tmp(self) -> Path:
-        return self.path / "tmp"
-
-    @property
-    def log(self) -> Path:
-        return self.run / "server.log"
-
-    @property
-    def credentials_file(self) -> Path:
-        return self.path / "credentials.json"
-
-    @property
-    def state_file(self) -> Path:
-        return self.path / "server.json"
-
-    @property
-    def lock_file(self) -> Path:
-        return self.path / "lock"
-
     def initialised(self) -> bool:
-        """True once the first start has completed its set-up (the credentials are written last)."""
+        """Return whether the set-up of the first start is complete (the credentials are written last)."""
         return self.credentials_file.exists()
 
     def create(self, account: Account) -> None:
-        """Make the folders, with the server's two given to its account.
-
-        Raises `PblError` DB_UNAVAILABLE when they cannot be made, or when `account` cannot enter them.
-        """
+        """Make the folders; `account` owns those of the server. Raises `PblError` DB_UNAVAILABLE when they cannot be
+        made, or when `account` cannot enter them."""
         try:
             missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
             self.path.mkdir(parents=True, exist_ok=True)
             for folder in missing:  # under any umask: the server's account enters, no one else writes
                 folder.chmod(0o755)
-        except OSError as error:
-            raise folder_error(self.path, error) from error
-        check_enterable(self.path, account)
-        try:
+            check_enterable(self.path, account)
             for folder, mode in ((self.data, 0o700), (self.run, 0o755), (self.tmp, 0o700)):
                 folder.mkdir(exist_ok=True)
                 account.own(folder)
@@ -240,13 +203,11 @@ class Folder:
 
     @contextmanager
     def locked(self, timeout_s: float = 120.0) -> Iterator[None]:
-        """Hold the folder's lock; another command that starts or stops the server waits.
-
-        Raises `PblError` DB_UNAVAILABLE when another command holds it for longer than `timeout_s`.
-        """
+        """Hold the folder's lock; another command that starts or stops the server waits. Raises `PblError`
+        DB_UNAVAILABLE when another command holds it for longer than `timeout_s`."""
         with ExitStack() as stack:
             try:
-                stack.enter_context(one_process(self.lock_file, timeout_s))
+                stack.enter_context(one_process(self.path / "lock", timeout_s))
             except TimeoutError as error:
                 raise PblError(
                     "DB_UNAVAILABLE",
@@ -260,11 +221,8 @@ class Folder:
             yield
 
     def credentials(self) -> Credentials:
-        """The stored passwords.
-
-        Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED when the file may not be read;
-        FILE_FORMAT for one that is damaged.
-        """
+        """Return the stored passwords. Raises `PblError` DB_NOT_RUNNING when the database was never set up; DB_REFUSED
+        when the file may not be read; FILE_FORMAT for one that is damaged."""
         try:
             with _undamaged(
                 self.credentials_file, "restore it from a copy of the folder: nothing else has the passwords"
@@ -294,8 +252,8 @@ class Folder:
         _write(self.credentials_file, asdict(credentials), 0o600)
 
     def state(self) -> dict[str, Any]:
-        """`port`, `pid`, `version` and the schema prefixes the application may use; empty before the first start.
-        Raises `PblError` FILE_FORMAT for a file that is damaged."""
+        """Return `port`, `pid`, `version` and the schema prefixes the application may use; empty before the first
+        start. Raises `PblError` FILE_FORMAT for a damaged file."""
         again = "end the server of this folder if it runs (its number is in run/pid), move the file away, pbl db start"
         try:
             with _undamaged(self.state_file, again):
@@ -315,7 +273,7 @@ class Folder:
         return state
 
     def log_tail(self, lines: int = 12) -> str:
-        """The last lines the server wrote."""
+        """Return the last lines of the server's log."""
         try:
             return "\n".join(self.log.read_text(errors="replace", encoding="utf-8").splitlines()[-lines:])
         except OSError as error:
@@ -324,7 +282,7 @@ class Folder:
 
 @contextmanager
 def _undamaged(path: Path, next_step: str) -> Iterator[None]:
-    """Turn what reading a damaged file raises into FILE_FORMAT. The content, which may be secret, is not repeated."""
+    """Raise FILE_FORMAT for a damaged file. The content, which may be secret, is not repeated."""
     try:
         yield
     except (ValueError, TypeError, RecursionError) as error:
@@ -333,7 +291,7 @@ def _undamaged(path: Path, next_step: str) -> Iterator[None]:
 
 
 def folder_error(path: Path, error: OSError) -> PblError:
-    """The coded error for a folder that cannot be written."""
+    """Return the coded error for a folder that cannot be written."""
     return PblError(
         "DB_UNAVAILABLE",
         key=path,
@@ -351,5 +309,5 @@ def _write(path: Path, content: dict[str, Any], mode: int) -> None:
 
 
 def indent(text: str) -> str:
-    """Return lines indented, to stand below the line of an error that introduces them."""
+    """Return the lines indented, for display below the line that introduces them."""
     return "\n".join(f"      {line}" for line in text.splitlines())

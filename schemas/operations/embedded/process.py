@@ -1,10 +1,8 @@
-"""The server's process: launch it, find it again, log in to it."""
+"""The server process: launch it, find it again, log in to it."""
 
 from __future__ import annotations
 
-import os
 import re
-import signal
 import subprocess
 import time
 from pathlib import Path
@@ -22,7 +20,7 @@ START_TIMEOUT_S = 60.0
 LOG_SIZE = "--innodb-log-file-size=256M"
 
 #: Options of the running server. Without a character set it would use latin1; with a case-insensitive collation the
-#: keys "a" and "A" would collide; packets of the default 16 MB cut arrays off at 8 MB; a worker may be silent for a
+#: keys "a" and "A" would collide; the default packets of 16 MB truncate arrays at 8 MB; a worker may be silent for a
 #: long time while it computes.
 OPTIONS = (
     f"--bind-address={HOST}",
@@ -36,21 +34,19 @@ OPTIONS = (
     "--wait-timeout=604800",
 )
 
-# Children of this process, kept so that an ended one is reaped and not taken for a running server.
+# Children of this process, kept so that an exited one is reaped and not mistaken for a running server.
 _children: dict[int, subprocess.Popen[str]] = {}
 
 
 def buffer_pool_mb() -> int:
-    """Memory (MB) in which the server keeps rows: an eighth of the machine's, for computations share it; between 256 MB
-    and 8 GB."""
+    """Return the memory (MB) in which the server keeps rows: an eighth of the machine's, between 256 MB and 8 GB,
+    because computations share it."""
     return min(max(memory_bytes() // 8 // 2**20, 256), 8192)
 
 
 def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
-    """Start the server as a separate process that outlives this one, and wait until it answers.
-
-    Raises `PblError` DB_UNAVAILABLE with the server's last lines and what to do.
-    """
+    """Start the server as a separate process that outlives this one, and wait until it answers. Raises `PblError`
+    DB_UNAVAILABLE with the server's last lines and the remedy."""
     port = folder.state().get("port")
     for attempt in range(5):
         if port is None or attempt > 0 or not port_free(port):
@@ -61,7 +57,7 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
             f"--basedir={binaries.basedir}",
             f"--datadir={folder.data}",
             f"--tmpdir={folder.tmp}",
-            # Relative to the data folder: a socket's path may have 107 bytes at most, the folder's may be longer.
+            # Relative to the data folder: a socket's path is limited to 107 bytes, and the folder's may be longer.
             "--socket=../run/s.sock",
             f"--pid-file={folder.run / 'pid'}",
             f"--log-error={folder.log}",
@@ -97,10 +93,8 @@ def launch(folder: Folder, binaries: Binaries, account: Account) -> None:
 
 
 def wait_until_answers(folder: Folder) -> None:
-    """Return once an administrator can log in.
-
-    Raises `PblError` DB_UNAVAILABLE when the process ends, or does not answer within a minute (it is left alone then).
-    """
+    """Wait until an administrator can log in. Raises `PblError` DB_UNAVAILABLE when the process ends, or does not
+    answer within a minute (it continues then)."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:
@@ -130,7 +124,7 @@ def wait_until_answers(folder: Folder) -> None:
 
 
 def admin(folder: Folder) -> pymysql.Connection[Any]:
-    """A connection as administrator, with short time limits."""
+    """Return a connection as administrator, with short time limits."""
     return pymysql.connect(
         host=HOST,
         port=int(folder.state().get("port") or 0),
@@ -143,13 +137,13 @@ def admin(folder: Folder) -> pymysql.Connection[Any]:
 
 
 def running_pid(folder: Folder) -> int | None:
-    """Number of the server process of this folder, or None when it does not run."""
+    """Return the number of the server process of this folder; None if it does not run."""
     pid = folder.state().get("pid")
     return pid if pid is not None and alive(pid, folder) else None
 
 
 def alive(pid: int, folder: Folder) -> bool:
-    """True when process `pid` is the server of this folder; by now the number may be another program's."""
+    """Return whether process `pid` is still the server of this folder: another program may have its number."""
     if pid in _children:
         return _children[pid].poll() is None
     marker = f"--datadir={folder.data}"
@@ -162,14 +156,6 @@ def alive(pid: int, folder: Folder) -> bool:
         return state not in ("Z", "X") and marker in (proc / "cmdline").read_text(encoding="utf-8").split("\0")
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def terminate(pid: int) -> None:
-    """Ask for an orderly end by signal."""
-    try:
-        os.kill(pid, signal.SIGTERM)
-    except ProcessLookupError:
-        return
 
 
 def _advice(folder: Folder) -> str:

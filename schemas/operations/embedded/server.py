@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
 import shutil
+import signal
 import subprocess
 import time
 from dataclasses import dataclass
@@ -15,14 +18,15 @@ from pbl_pipeline.errors import PblError
 
 from .binaries import Binaries, Say, check_obtainable, get_server, silent
 from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, free_port, indent, server_account
-from .process import LOG_SIZE, admin, alive, launch, running_pid, terminate, wait_until_answers
+from .process import LOG_SIZE, admin, alive, launch, running_pid, wait_until_answers
 
 SETUP_TIMEOUT_S = 300.0
 #: An empty database takes 290 MB, nearly all of it the log that is laid out in advance.
 NEEDED_MB = 500
 
 #: The installation leaves up to four root accounts without a password (localhost, the machine's name, 127.0.0.1, ::1).
-#: All go: the only administrator has a random password. mariadb.sys owns system views and is locked, PUBLIC is a role.
+#: All are dropped: the only administrator has a random password. mariadb.sys owns system views and is locked, PUBLIC
+#: is a role.
 DROP_EVERY_ACCOUNT = (
     "BEGIN NOT ATOMIC FOR a IN (SELECT User, Host FROM mysql.global_priv WHERE User NOT IN ('mariadb.sys', 'PUBLIC')) "
     "DO EXECUTE IMMEDIATE CONCAT('DROP USER ', QUOTE(a.User), '@', QUOTE(a.Host)); END FOR; END;"
@@ -30,10 +34,8 @@ DROP_EVERY_ACCOUNT = (
 
 
 def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
-    """Fill `folder.data` and write the credentials, which mark the set-up as complete.
-
-    Raises `PblError` DB_UNAVAILABLE when there is too little space, or with what the program that failed said.
-    """
+    """Fill `folder.data` and write the credentials, which mark the set-up as complete. Raises `PblError` DB_UNAVAILABLE
+    for too little space, or with the output of the program that failed."""
     free_mb = shutil.disk_usage(folder.path).free // 2**20
     if free_mb < NEEDED_MB:
         raise PblError(
@@ -47,8 +49,7 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     shutil.rmtree(folder.data, ignore_errors=True)
     folder.create(account)
     where = [f"--datadir={folder.data}", f"--basedir={binaries.basedir}", f"--tmpdir={folder.tmp}", LOG_SIZE]
-    # "--force": a machine whose own name does not resolve (a bare container) does not matter; the accounts that
-    # carry the name are dropped below.
+    # "--force": the name of this machine need not resolve (a bare container); the accounts with it are dropped below.
     install = [str(binaries.install_db), "--no-defaults", "--force", "--auth-root-authentication-method=normal"]
     _run([*install, "--skip-test-db", *where], "", folder, binaries, account)
     credentials = Credentials.new()
@@ -69,7 +70,7 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
 
 
 def grant(prefix: str) -> str:
-    r"""The statement that lets the application do everything in the schemas `<prefix>_...`, and nothing elsewhere.
+    r"""Return the statement that grants the application all rights on the schemas `<prefix>_...`, and none elsewhere.
 
     Raises `PblError` USAGE when `prefix` cannot begin the name of a schema.
     """
@@ -107,7 +108,7 @@ def _run(command: list[str], stdin: str, folder: Folder, binaries: Binaries, acc
     if code == 0 and "[ERROR]" not in said and not said.startswith("ERROR"):
         return
     shutil.rmtree(folder.data, ignore_errors=True)
-    # The installer ends with a page of general advice; the lines that say why stand before it.
+    # The installer ends with a page of general advice; the lines with the reason precede it.
     lines = [line for line in said.splitlines() if "ERROR" in line] or said.splitlines()
     raise PblError(
         "DB_UNAVAILABLE",
@@ -123,7 +124,7 @@ STOP_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Status:
-    """Status of the server; entries are None where it does not run.
+    """Status of the server; entries are None if it does not run.
 
     `running` means that it answers; a process that does not answer has a `pid` and `running` False.
     """
@@ -140,7 +141,7 @@ class Status:
 
 
 def start(say: Say = silent, folder: Folder | None = None) -> Status:
-    """Have the server running: get it, set it up and start it as far as needed. Safe to call again, and at once.
+    """Get the server, set it up and start it, as far as needed. Safe to repeat, also concurrently.
 
     Raises `PblError` DB_UNAVAILABLE: no server could be obtained, the folder is unusable, or the server does not start
     (with its last log lines).
@@ -169,16 +170,11 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
 
 
 def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = False) -> bool:
-    """End the server and wait for it. Safe to call when none runs.
+    """Stop the server and wait for its end. Safe to call when none runs.
 
-    Raises `PblError` DB_REFUSED when it does not end within a minute.
+    Returns whether one was running. Raises `PblError` DB_REFUSED if it does not end within a minute.
 
-    Returns True when one was running.
-
-    Parameters
-    ----------
-    on_demand
-        The next connection starts it again (`starts_on_demand`), until it is stopped without this.
+    `on_demand`: let the next connection start it again (`starts_on_demand`), until it is stopped without this.
     """
     folder = folder or Folder.default()
     if not folder.initialised():
@@ -195,7 +191,8 @@ def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = Fals
                 cursor.execute("SHUTDOWN")
         except pymysql.err.Error:
             # It no longer answers, or not yet: the signal asks for the same orderly end.
-            terminate(pid)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
         deadline = time.monotonic() + STOP_TIMEOUT_S
         while alive(pid, folder):
             if time.monotonic() > deadline:
@@ -213,12 +210,12 @@ def stop(say: Say = silent, folder: Folder | None = None, on_demand: bool = Fals
 
 
 def starts_on_demand(folder: Folder) -> bool:
-    """Whether the server does not run and was stopped so that the next connection starts it."""
+    """Return whether the server is stopped in such a way that the next connection starts it."""
     return bool(folder.state().get("on_demand")) and running_pid(folder) is None
 
 
 def status(folder: Folder | None = None) -> Status:
-    """The server's status; changes nothing."""
+    """Return the server's status; change nothing."""
     folder = folder or Folder.default()
     if not folder.initialised():
         return Status(False, str(folder.path), False)
@@ -241,10 +238,8 @@ def status(folder: Folder | None = None) -> Status:
 
 
 def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
-    """Let the application use the schemas `<prefix>_...`; grants access and records it in `server.json`.
-
-    Raises `PblError` USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer.
-    """
+    """Grant the application access to the schemas `<prefix>_...`, and record it in `server.json`. Raises `PblError`
+    USAGE when the prefix cannot begin a name; DB_NOT_RUNNING when the server does not answer."""
     folder = folder or Folder.default()
     if prefix in folder.state().get("prefixes", []):
         return
@@ -259,7 +254,7 @@ def allow_prefix(prefix: str, folder: Folder | None = None) -> None:
 
 
 def not_running(folder: Folder, found: str) -> PblError:
-    """The coded error for an embedded server that does not answer."""
+    """Return the coded error for an embedded server that does not answer."""
     return PblError(
         "DB_NOT_RUNNING",
         key=f"embedded database in {folder.path}",

@@ -169,7 +169,7 @@ async function start() {
     canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
     stage.style.aspectRatio = `${width} / ${height}`;
     stage.style.width = `min(100%, calc(70vh * ${width / height}))`;
-  } else stage.hidden = true;  // markers of a laboratory: there is no picture
+  } else stage.hidden = true;  // markers of a laboratory: they have no picture
   const controls = /** @type {HTMLElement} */ (look.querySelector(".controls"));
   controls.hidden = false;
   const position = $("position"), now = $("now"), play = $("play");
@@ -222,7 +222,7 @@ async function start() {
   $("show-body").addEventListener("change", () => show(clock.frame));
   for (const button of document.querySelectorAll("button[data-time]")) button.addEventListener("click", () => seek(+(/** @type {HTMLElement} */ (button).dataset.time ?? 0)));
   look.addEventListener("seek", (e) => seek(/** @type {CustomEvent<number>} */ (e).detail));
-  // Where the body is fitted later only, the page begins there: before, nobody may be in view.
+  // Where the body is fitted later only, the page begins there: before, the view may be empty.
   const begin = m.body.known[0]?.[0] ?? 0;
   if (begin > 0 && (!video || (video.paused && video.currentTime === 0))) clock.go(begin);
   look.dispatchEvent(new CustomEvent("movement", { detail: m }));

@@ -41,7 +41,7 @@ export function rootAt(poses, frame) {
   return [0, 1, 2].map((k) => start[k] + n[k * t + frame] / steps.metre);
 }
 
-/** Direction of walking around a frame, as an angle in the floor from x to y; null where somebody stands or nothing is known.
+/** Direction of walking around a frame, as an angle in the floor from x to y; null if the person stands or nothing is known.
  * @param {Poses} poses @param {number[]} times @param {number} frame */
 export function heading(poses, times, frame) {
   const within = poses.body.known.find(([first, last]) => first <= frame && frame <= last);
@@ -298,7 +298,7 @@ if (section) {
   player.then((shown) => {
     if (!shown) return;
     section.hidden = false;
-    // 140 kB of scripts, when somebody comes to see it.
+    // 140 kB of scripts, on first use.
     const coming = new IntersectionObserver(([entry]) => { if (entry.isIntersecting) { coming.disconnect(); start(shown, section); } }, { rootMargin: "300px" });
     coming.observe(section);
   });

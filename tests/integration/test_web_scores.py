@@ -10,7 +10,7 @@ from schemas import lab, session, study
 from schemas.cli.study import instrument
 from schemas.review import Decision
 from schemas.rows import utc_now
-from schemas.studies.visit_forms import enter, entry
+from schemas.studies.visit_forms import enter_scores, scores_form
 from tests.integration import web
 from tests.rows import everything
 
@@ -101,7 +101,7 @@ def test_a_role_that_does_not_fit_the_days_is_refused(two_visits: None):
 
 def test_the_second_of_two_sees_what_the_first_entered(two_visits: None):
     first, second = web.client(name="A. First"), web.client(name="B. Second")
-    seen = entry(1).seen
+    seen = scores_form(1).seen
     assert send(first, 1, seen, mJOA="14").status_code == 303
     late = send(second, 1, seen, mJOA="15")
     assert late.status_code == 409
@@ -120,8 +120,8 @@ def test_forged_forms_change_nothing(two_visits: None):
     assert "Your role can look but not enter values" in reader.get("/visits/1/enter").text
     assert send(reviewer, 1, seen="forged", mJOA="14").status_code == 409
     assert send(reviewer, 1, **{"none'--": "3"}).status_code == 400
-    assert send(reviewer, 999, seen=entry(1).seen, mJOA="3").status_code == 404
-    token = {"value:mJOA": "3", "seen": entry(1).seen}
+    assert send(reviewer, 999, seen=scores_form(1).seen, mJOA="3").status_code == 404
+    token = {"value:mJOA": "3", "seen": scores_form(1).seen}
     assert reviewer.post("/visits/1/enter", data=token, follow_redirects=False).status_code == 403
     assert reviewer.get("/visits/999/enter").status_code == 404
     assert everything() == before
@@ -130,7 +130,7 @@ def test_forged_forms_change_nothing(two_visits: None):
 def test_a_value_that_an_import_wrote_out_of_range_does_not_block_the_others(two_visits: None):
     table = study.ClinicalScore.full_table_name
     study.ClinicalScore.connection.query(f"UPDATE {table} SET score_value = 99")
-    assert enter(1, {"mJOA": "99", "BBS": "12"}, "A", entry(1).seen)[0] == ("BBS",)
+    assert enter_scores(1, {"mJOA": "99", "BBS": "12"}, "A", scores_form(1).seen)[0] == ("BBS",)
 
 
 OWN = {"instrument": "FAC", "instrument_name": "Functional Ambulation Categories", "instrument_unit": "points",
