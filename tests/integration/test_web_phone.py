@@ -343,6 +343,7 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
     reviewer = web.client(target=nothing)
     assert "<option>clinic</option>" in reviewer.get(f"/visits/{visit}").text
     browser = phone(visit, protocol="clinic")
+    assert "<li>Timed Up and Go, from any side" in reviewer.get(f"/visits/{visit}").text
     for n, step in enumerate((1, 2, 2)):
         done = [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]]
         assert done == [min(n, 1), max(0, n - 1)]
