@@ -27,7 +27,7 @@ from schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import without_posix
 from tests.database import new_home, remove_home
 from tests.german import REPORT_NAMES, english_of, english_words
-from tests.html_page import Page
+from tests.html_page import Page, commands_in
 
 pytestmark = pytest.mark.slow
 
@@ -159,6 +159,8 @@ def test_the_report_is_one_file_with_curves_and_pictures(out):
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.problems == []
+    assert "state the measured body height, or compare" in text
+    assert not commands_in(text)
     # Pictures are inside, anchors lead within the page: nothing is loaded from elsewhere.
     links = [v or "" for _, a in page.tags for k, v in a.items() if k in ("src", "href")]
     assert [link[:40] for link in links if not link.startswith(("data:", "#"))] == []

@@ -12,6 +12,7 @@ from pbl_pipeline.video import sha256_of
 from schemas import fit, privacy
 from schemas.origin import Origin
 from tests.german import REPORT_NAMES, english_of, english_words
+from tests.html_page import commands_in
 from tests.integration import web
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -87,6 +88,7 @@ def test_a_report_is_in_the_language_of_its_reader(visit: Path, browser: Any, mo
         until(browser, "/visits/1/report/state?result=0")
         report = browser.get("/visits/1/report?result=0").text
         assert f'<html lang="{language}">' in report
+        assert not commands_in(report)
         assert ("Wie dieser Bericht zu lesen ist" in report) == (language == "de")
         assert bool(english_of(report, english_words(), names)) == (language == "en")
 

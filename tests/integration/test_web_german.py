@@ -21,12 +21,12 @@ from schemas import session, study
 from schemas.intake.records import set_condition
 from tests import not_none
 from tests.german import english_of, english_words
+from tests.html_page import commands_in
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
-from workers.web import reports
 
 
 @pytest.fixture(scope="module")
@@ -108,24 +108,6 @@ def test_no_page_names_a_command_or_its_option(clinic: None, path: str):
     browser = web.client(role="reviewer,operator")
     for language in texts.LANGUAGES:
         assert not commands_in(browser.get(path, headers={"accept-language": language}).text)
-
-
-@pytest.mark.parametrize("language", texts.LANGUAGES)
-@pytest.mark.parametrize("number", [1, 3])
-def test_no_report_opened_from_a_page_names_a_command_or_its_option(
-    clinic: None, number: int, language: str, tmp_path: Path
-):
-    made = reports.load_report(number, 0, language)
-    with made.open_files:
-        made.function(tmp_path / made.file, *made.args)
-    page = (tmp_path / made.file).read_text("utf-8")
-    assert texts.library_words(language, "Quality checks") in page
-    assert not commands_in(page)
-
-
-def commands_in(page: str) -> list[str]:
-    shown = re.sub(r"(?s)<(script|style)\b.*?</\1>|<!--.*?-->|<[^>]+>", " ", page)
-    return re.findall(r"\bpbl [a-z]+[^<]{0,40}|(?<![\w-])--[a-z][\w-]+", shown)
 
 
 def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english: set[str]):
