@@ -98,7 +98,9 @@ def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
     visit: Path, browser: Any, monkeypatch: pytest.MonkeyPatch
 ):
     """The copy here is black; what is drawn over it must not show the grey of the original."""
-    assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # made before
+    browser.get("/recordings/1/overlay")
+    until(browser, "/recordings/1/overlay/state")
+    assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # of the original
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
     for address in ("/recordings/1/overlay", "/visits/1/report"):
         answer = browser.get(address)
