@@ -308,7 +308,7 @@ def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tm
     assert re.fullmatch(r"Usable.*[1-9]\d* gait cycles left, \d+ right\.", walked["verdict"]), walked["verdict"]
     assert walked["verdict"] in reviewer.get(f"/visits/{visit}").text
     german = browser.get("/phone/state.json", headers={"accept-language": "de"}).json()["recordings"]
-    assert any("Gangzyklen links" in r["verdict"] for r in german)
+    assert any("Doppelschritte links" in r["verdict"] for r in german)
     assert empty["state"] == "received"
 
 
@@ -386,9 +386,9 @@ def test_the_command_prints_a_link_that_opens(visit: int):
 
 
 @pytest.mark.parametrize(("now", "then", "side", "words"), [
-    (9.0, 6.0, "right", "Index so far: +-9 (90 %). One more pass filmed from the right side makes it +-6."),
-    (9.0, 6.2, "", "Index so far: +-9 (90 %). One more pass filmed from the front or back makes it +-6."),
-    (5.2, 5.0, "left", "Index so far: +-5 (90 %)."),
+    (9.0, 6.0, "right", "Index so far: ±9 (90 %). One more pass filmed from the right side makes it ±6."),
+    (9.0, 6.2, "", "Index so far: ±9 (90 %). One more pass filmed from the front or back makes it ±6."),
+    (5.2, 5.0, "left", "Index so far: ±5 (90 %)."),
 ])  # fmt: skip
 def test_what_to_film_next(now: float, then: float, side: str, words: str):
     assert next_words("en", Next(side, now, then)) == words
