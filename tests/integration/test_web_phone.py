@@ -25,7 +25,7 @@ from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from schemas.intake.protocols import add_protocol, read_protocol
 from schemas.intake.records import session_ids
 from schemas.jobs import jobs_of
-from schemas.reading.usable import Next
+from schemas.reading.usable import Next, Usable
 from schemas.rows import check_row
 from schemas.transactions import in_transaction
 from tests.integration import web
@@ -36,7 +36,7 @@ from tests.rows import register
 from workers import incoming, phone_uploads, queue
 from workers.populate import populate
 from workers.web import Options, Where, create_app
-from workers.web.phone import next_words
+from workers.web.phone import next_words, verdict
 
 
 @pytest.fixture
@@ -393,6 +393,8 @@ def test_the_command_prints_a_link_that_opens(visit: int):
 def test_what_to_film_next(now: float, then: float, side: str, words: str):
     assert next_words("en", Next(side, now, then)) == words
     assert next_words("de", Next(side, now, then)).startswith("Index bisher")
+    nobody = Usable("unusable", ("No person was found in the video.",))
+    assert verdict("de", nobody) == "Neu filmen: Im Video wurde keine Person gefunden."
 
 
 # ------------------------------------------------------------------------------------------------------------ attacks

@@ -149,6 +149,8 @@ def test_a_page_in_english_has_no_codes_either():
     assert texts.page_in("en", "<p>Camera intrinsics measured: " + camera.format("guess: a lens") + ".</p>").endswith(
         "; have the camera calibrated once.</p>"
     )
+    empty = "choice of the person ran well and found nothing to go on with: No person was found in the video."
+    assert texts.on_page("en", empty) == "No person was found in the video."
     assert {n for n in load_body().joint_names if texts.library_words("en", n) == n} == {*SLIDES}
 
 

@@ -243,7 +243,7 @@ def verdict(language: str, judged: Usable | None) -> str:
     if judged.cycles is not None and any(judged.cycles):
         left, right = judged.cycles
         said = f"{said}. {texts.text(language, 'capture.cycles', left=left, right=right)}"
-    return said + "."
+    return said.removesuffix(".") + "."
 
 
 def next_words(language: str, more: Next | None) -> str:
