@@ -60,9 +60,10 @@ def _library_words(language: str, english: str) -> str | None:
     if own is not None:
         return own
     for at in (m.start() for m in re.finditer(r" \(", english) if english.endswith(")")):
-        # A check and in brackets the recording that it is of.
+        # A check and in brackets the recording that it is of, or a reason, which is more than a word.
         if (own := catalogue().get(f"library.{english[:at]}", {}).get(language)) is not None:
-            return own + english[at:]
+            inner = english[at + 2 : -1]
+            return f"{own} ({library_words(language, inner) if ' ' in inner else inner})"
     for joint in (": ", "; "):
         for at in (m.start() for m in re.finditer(joint, english)):
             first, rest = english[:at], _library_words(language, english[at + len(joint) :])

@@ -133,6 +133,12 @@ def test_a_check_of_one_of_several_recordings_has_its_name_in_german():
         assert texts.library("de", words.check_words(check)) == expected
 
 
+def test_a_reason_in_brackets_is_german_too():
+    reason = "its 90 % interval is wider than the range of healthy people"
+    told = texts.library_words("de", f"Not known ({reason}): Vertical force, peak of loading; Work of the hip in stance")
+    assert told.startswith("Nicht bekannt (das 90-%-Intervall ist breiter als")
+
+
 def test_a_page_in_english_has_no_codes_either():
     reason = "no trial of walking at the pace 'self_selected' (there are: sit_to_stand; walking, fast)"
     said = "no recording of walking at the pace self-selected (there are: sit to stand; walking, fast)"
