@@ -135,7 +135,7 @@ def test_a_check_of_one_of_several_recordings_has_its_name_in_german():
 
 def test_a_reason_in_brackets_is_german_too():
     reason = "its 90 % interval is wider than the range of healthy people"
-    told = texts.library_words("de", f"Not known ({reason}): Vertical force, peak of loading; Work of the hip in stance")
+    told = texts.library_words("de", f"Not known ({reason}): Work of the hip in stance")
     assert told.startswith("Nicht bekannt (das 90-%-Intervall ist breiter als")
 
 
@@ -168,9 +168,10 @@ def test_no_text_of_a_page_names_a_command():
     for template in WEB.glob("templates/*.html"):
         assert not re.search(r"\bpbl [a-z]", template.read_text("utf-8")), template.name
     say = "Use the buttons of this page, or ask the person who runs this server."
-    assert (
-        texts.on_page("en", "TrackedPersons failed (X); next: look at it, then pbl retry")
-        == f"TrackedPersons failed (X); next: look at it. {say}"
+    failed = "TrackedPersons failed (X); next: look at it, then "
+    assert texts.on_page("en", f"{failed}pbl retry") == f"{failed}try again"
+    assert texts.on_page("en", "TrackedPersons broke; look at it, then pbl retry") == (
+        f"TrackedPersons broke; look at it. {say}"
     )
     assert texts.on_page("en", "give the height (--height-m), or <none>") == "give the height, or &lt;none&gt;"
     german = texts.on_page("de", "a. `pbl why` says more")
