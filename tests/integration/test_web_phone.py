@@ -393,8 +393,8 @@ def test_the_command_prints_a_link_that_opens(visit: int):
 def test_what_to_film_next(now: float, then: float, side: str, words: str):
     assert next_words("en", Next(side, now, then)) == words
     assert next_words("de", Next(side, now, then)).startswith("Index bisher")
-    nobody = Usable("unusable", ("No person was found in the video.",))
-    assert verdict("de", nobody) == "Neu filmen: Im Video wurde keine Person gefunden."
+    empty = Usable("unusable", ("No person was found in the video.",))
+    assert verdict("de", empty) == "Neu filmen: Im Video wurde keine Person gefunden."
 
 
 # ------------------------------------------------------------------------------------------------------------ attacks
