@@ -12,6 +12,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from pbl_pipeline.errors import CODES
+from pbl_pipeline.words import capital
 
 #: The first is the default.
 LANGUAGES = ("en", "de")
@@ -34,8 +35,9 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z0-9])")
 
 @functools.cache
 def catalogue() -> dict[str, dict[str, str]]:
-    """Every text by "group.name": language to text."""
+    """Every text by "group.name": language to text. The English of the library is its own words where none is given."""
     groups = tomllib.loads((Path(__file__).parent / "texts.toml").read_text("utf-8"))
+    groups["library"] = {name: {"en": name, **said} for name, said in groups["library"].items()}
     return {f"{group}.{name}": text for group, names in groups.items() for name, text in names.items()}
 
 
@@ -58,18 +60,17 @@ def _library_words(language: str, english: str) -> str | None:
     if own is not None:
         return own
     for at in (m.start() for m in re.finditer(r" \(", english) if english.endswith(")")):
-        # A check, followed by its recording in brackets.
+        # A check, followed in brackets by its recording or by a reason, which has several words.
         if (own := catalogue().get(f"library.{english[:at]}", {}).get(language)) is not None:
-            return own + english[at:]
-    if language == "en":
-        found = ((pattern.fullmatch(english), said) for pattern, said in _patterns(language))
-        return next((_filled(language, match, said) for match, said in found if match), english)
+            inner = english[at + 2 : -1]
+            return f"{own} ({library_words(language, inner) if ' ' in inner else inner})"
     for joint in (": ", "; "):
         for at in (m.start() for m in re.finditer(joint, english)):
             first, rest = english[:at], _library_words(language, english[at + len(joint) :])
-            # Before a colon a single word may be the name of a recording.
+            # Before a colon a single word may be the name of a recording, and one that stands for others surely is.
             name = first if joint == ": " and " " not in first else None
-            parts = _library_words(language, first) or name, rest
+            stands = name and catalogue().get(f"library.{name}", {}).get("en", name) != name
+            parts = name if stands else _library_words(language, first) or name, rest
             if parts[0] is not None and parts[1] is not None:
                 return joint.join(p for p in parts if p is not None)
     best = None
@@ -121,9 +122,7 @@ def in_chart(language: str, chart: Markup) -> Markup:
 
 
 def page_in(language: str, page: str) -> str:
-    """Return a page that was written in English with its texts and labels in a language; unknown ones stay English."""
-    if language == LANGUAGES[0]:
-        return page
+    """Return a page that the library wrote, its texts and labels in a language; unknown ones stay as they are."""
     parts = _TAGS.split(page)
     parts[::2] = [_said(language, text) for text in parts[::2]]
     parts[1::2] = [_LABELS.sub(lambda m: _said(language, m[0]), tag) for tag in parts[1::2]]
@@ -154,14 +153,14 @@ def _sentence(language: str, text: str) -> str | None:
     if (own := _library_words(language, bare)) is not None:
         return own + text[len(bare) :]
     own = _library_words(language, bare[0].lower() + bare[1:])
-    return None if own is None else own[0].upper() + own[1:] + text[len(bare) :]
+    return None if own is None else capital(own) + text[len(bare) :]
 
 
 def library(language: str, english: str) -> str:
     """Return an English text of the library in the language of a page: HTML, marked as English if it stays so."""
     own = _library_words(language, english)
-    if own is not None:
-        return escape(own)
+    if own is not None or language == "en":
+        return escape(own or english)
     return Markup('<span lang="en">{}</span>').format(english)
 
 

@@ -152,7 +152,12 @@ def check_words(name: str) -> str:
     words = [_SPELLED.get(w, w) for w in (words[:-1] if unit else words)]
     text = " ".join(words) + (f" ({unit})" if unit else "")
     named = f" {recording}" if recording.startswith("(") else f" ({recording})"
-    return text[:1].upper() + text[1:] + (named if recording else "")
+    return capital(text) + (named if recording else "")
+
+
+def capital(text: str) -> str:
+    """The text with a capital at its start."""
+    return text[:1].upper() + text[1:]
 
 
 def number(value: float | None, decimals: int) -> str:

@@ -44,3 +44,8 @@ class Page(HTMLParser):
 
     def all(self, tag: str) -> list[dict[str, str | None]]:
         return [a for t, a in self.tags if t == tag]
+
+
+def commands_in(page: str) -> list[str]:
+    """The commands and options of commands that a page names."""
+    return re.findall(r"\bpbl [a-z]+.{0,40}|(?<![\w-])--[a-z][\w-]+", Page(page).text)

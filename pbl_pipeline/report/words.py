@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
-from pbl_pipeline.words import check_words
+from pbl_pipeline.words import capital, check_words
 
 #: The measures of the tiles, before the GDI.
 HEADLINES = ("cadence_steps_per_min", "stride_time_s", "stance_percent", "double_support_percent")
@@ -32,7 +32,7 @@ def check_name(check: Check) -> str:
 def sentence(text: str) -> str:
     """Capitalise a text and end it with a full stop."""
     text = text.strip()
-    return text and text[0].upper() + text[1:] + ("" if text[-1] in ".!?" else ".")
+    return text and capital(text) + ("" if text[-1] in ".!?" else ".")
 
 
 def plural(n: int, one: str) -> str:

@@ -27,7 +27,7 @@ from schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import without_posix
 from tests.database import new_home, remove_home
 from tests.german import REPORT_NAMES, english_of, english_words
-from tests.html_page import Page
+from tests.html_page import Page, commands_in
 
 pytestmark = pytest.mark.slow
 
@@ -159,6 +159,8 @@ def test_the_report_is_one_file_with_curves_and_pictures(out):
     text = (out / "report.html").read_text()
     page = Page(text)
     assert page.problems == []
+    assert "state the measured body height, or compare" in text
+    assert not commands_in(text)
     # Pictures are inside, anchors lead within the page: nothing is loaded from elsewhere.
     links = [v or "" for _, a in page.tags for k, v in a.items() if k in ("src", "href")]
     assert [link[:40] for link in links if not link.startswith(("data:", "#"))] == []
@@ -194,8 +196,10 @@ def test_reports_and_exports_come_from_a_named_server_without_posix(home, out, t
     assert ".trc" in {path.suffix for path in map(Path, done.out.splitlines()) if path.stat().st_size}
     done = without_posix.pbl("report", "--subject", "NOBODY", "--out", tmp_path / "r", variables=server)
     assert done.error_code == "DB_NOT_FOUND", done.err
-    assert pbl(home, "report", "--subject", "DEMO", "--language", "de", "--out", tmp_path / "r").returncode == 0
-    german = (tmp_path / "r/report.html").read_text("utf-8")
-    assert "Wie dieser Bericht zu lesen ist" in german
-    assert not english_of(german, english_words(), REPORT_NAMES)
+    for command in (("report", "--subject", "DEMO"), ("demo",)):
+        done_again = pbl(home, *command, "--language", "de", "--out", tmp_path / command[0])
+        assert done_again.returncode == 0, done_again.stderr
+        german = (tmp_path / command[0] / "report.html").read_text("utf-8")
+        assert "Wie dieser Bericht zu lesen ist" in german
+        assert not english_of(german, english_words(), REPORT_NAMES)
     assert pbl(home, "db", "stop").returncode == 0

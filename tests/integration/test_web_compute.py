@@ -145,7 +145,7 @@ def test_a_failure_is_shown_with_its_next_step_and_tried_again(visits: None, bro
     for path in ("/visits/1", f"/recordings/{number}", "/visits/1/progress"):
         page = browser.get(path).text
         assert "VIDEO_MISSING" in page
-        assert "bring the file or its disk back" in page
+        assert "Bring the file or its disk back" in page
     assert "Try failed computations again" in browser.get("/visits/1").text
     gone.write_bytes(kept)
     assert populate(visit=1).did_something is False  # what failed is tried again where that is asked for

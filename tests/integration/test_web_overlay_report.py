@@ -12,6 +12,7 @@ from pbl_pipeline.video import sha256_of
 from schemas import fit, privacy
 from schemas.origin import Origin
 from tests.german import REPORT_NAMES, english_of, english_words
+from tests.html_page import commands_in
 from tests.integration import web
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -87,6 +88,7 @@ def test_a_report_is_in_the_language_of_its_reader(visit: Path, browser: Any, mo
         until(browser, "/visits/1/report/state?result=0")
         report = browser.get("/visits/1/report?result=0").text
         assert f'<html lang="{language}">' in report
+        assert not commands_in(report)
         assert ("Wie dieser Bericht zu lesen ist" in report) == (language == "de")
         assert bool(english_of(report, english_words(), names)) == (language == "en")
 
@@ -96,7 +98,9 @@ def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
     visit: Path, browser: Any, monkeypatch: pytest.MonkeyPatch
 ):
     """The copy here is black; what is drawn over it must not show the grey of the original."""
-    assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # made before
+    browser.get("/recordings/1/overlay")
+    until(browser, "/recordings/1/overlay/state")
+    assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # of the original
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
     for address in ("/recordings/1/overlay", "/visits/1/report"):
         answer = browser.get(address)

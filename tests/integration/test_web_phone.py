@@ -25,7 +25,7 @@ from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from schemas.intake.protocols import add_protocol, read_protocol
 from schemas.intake.records import session_ids
 from schemas.jobs import jobs_of
-from schemas.reading.usable import Next
+from schemas.reading.usable import Next, Usable
 from schemas.rows import check_row
 from schemas.transactions import in_transaction
 from tests.integration import web
@@ -36,7 +36,7 @@ from tests.rows import register
 from workers import incoming, phone_uploads, queue
 from workers.populate import populate
 from workers.web import Options, Where, create_app
-from workers.web.phone import next_words
+from workers.web.phone import next_words, verdict
 
 
 @pytest.fixture
@@ -308,7 +308,7 @@ def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tm
     assert re.fullmatch(r"Usable.*[1-9]\d* gait cycles left, \d+ right\.", walked["verdict"]), walked["verdict"]
     assert walked["verdict"] in reviewer.get(f"/visits/{visit}").text
     german = browser.get("/phone/state.json", headers={"accept-language": "de"}).json()["recordings"]
-    assert any("Gangzyklen links" in r["verdict"] for r in german)
+    assert any("Doppelschritte links" in r["verdict"] for r in german)
     assert empty["state"] == "received"
 
 
@@ -343,6 +343,7 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
     reviewer = web.client(target=nothing)
     assert "<option>clinic</option>" in reviewer.get(f"/visits/{visit}").text
     browser = phone(visit, protocol="clinic")
+    assert "<li>Timed Up and Go, from any side" in reviewer.get(f"/visits/{visit}").text
     for n, step in enumerate((1, 2, 2)):
         done = [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]]
         assert done == [min(n, 1), max(0, n - 1)]
@@ -385,13 +386,15 @@ def test_the_command_prints_a_link_that_opens(visit: int):
 
 
 @pytest.mark.parametrize(("now", "then", "side", "words"), [
-    (9.0, 6.0, "right", "Index so far: +-9 (90 %). One more pass filmed from the right side makes it +-6."),
-    (9.0, 6.2, "", "Index so far: +-9 (90 %). One more pass filmed from the front or back makes it +-6."),
-    (5.2, 5.0, "left", "Index so far: +-5 (90 %)."),
+    (9.0, 6.0, "right", "Index so far: ±9 (90 %). One more pass filmed from the right side makes it ±6."),
+    (9.0, 6.2, "", "Index so far: ±9 (90 %). One more pass filmed from the front or back makes it ±6."),
+    (5.2, 5.0, "left", "Index so far: ±5 (90 %)."),
 ])  # fmt: skip
 def test_what_to_film_next(now: float, then: float, side: str, words: str):
     assert next_words("en", Next(side, now, then)) == words
     assert next_words("de", Next(side, now, then)).startswith("Index bisher")
+    empty = Usable("unusable", ("No person was found in the video.",))
+    assert verdict("de", empty) == "Neu filmen: Im Video wurde keine Person gefunden."
 
 
 # ------------------------------------------------------------------------------------------------------------ attacks

@@ -102,7 +102,7 @@ def test_times_of_a_task_are_compared_and_have_a_trend(visits: None):
     assert side.changes[name] == change
     browser = web.client()
     page = " ".join(browser.get("/compare?v=5&v=6").text.split())
-    assert "sit to stand: Time of five rises" in page
+    assert "Sit to stand: Time of five rises" in page
     assert '<span class="value">10.50</span>' in page
     assert page.count("interval: spread of the repetitions only") == 1
     page = browser.get(f"/visits/6/trend?measure={name}").text

@@ -15,12 +15,13 @@ from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.report.words import check_name, plural, sentence, size
+from pbl_pipeline.texts import LANGUAGES, catalogue, library_words
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
 from pbl_pipeline.visit import Recording, Solution, Visit
 from pbl_pipeline.words import number, significant
 from tests import not_none
-from tests.html_page import Page
+from tests.html_page import Page, commands_in
 from tests.inputs import video_info
 from tests.walking_fit import walking_fit
 
@@ -226,6 +227,20 @@ def test_verdict_is_the_worst_check(visit: Visit, tmp_path: Path) -> None:
     page = _page(visit.with_measures(not_none(visit.measures).with_checks([*visit.checks, seen])), tmp_path)
     assert _verdict(page) == FAIL
     assert "Residual 2D (px): look at the overlay." in page.text
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_what_names_an_option_on_the_command_line_is_said_otherwise(visit: Visit, tmp_path: Path, language) -> None:
+    advised = [n.removeprefix("library.").format(source="a guess") for n in catalogue() if re.search(r" \(?--[a-z]", n)]
+    assert len(advised) == 3
+    named = ("camera_orientation_known", "lengths_scale", "camera_intrinsics_measured")
+    checks = [Check(name, WARN, None, None, advice) for name, advice in zip(named, advised, strict=True)]
+    asking = visit.with_measures(not_none(visit.measures).with_checks([*visit.checks, *checks]))
+    page = write_report(tmp_path / "report.html", asking, PICTURES, "Visit 1", None, language).read_text("utf-8")
+    assert not commands_in(page)
+    for advice in advised:
+        told = library_words(language, advice)[1:].replace("'", "&#39;")
+        assert page.count(told) == 2  # in the verdict and beside the check
 
 
 def test_session_without_gait_says_so_and_draws_the_angles(stand: TrialFit, tmp_path: Path) -> None:

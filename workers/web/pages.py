@@ -20,7 +20,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
-from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
 from schemas.intake.sheets import with_point
 from schemas.reading.shown import ShownVisit
 
@@ -123,6 +123,7 @@ class Pages:
             measure_words=MEASURES | TASKS,
             angle_words=[title for title, _ in ANGLES.values()],
         )
+        self._environment.filters["capital"] = capital
 
     def show(
         self,

@@ -21,6 +21,7 @@ from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Re
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
+from pbl_pipeline.words import capital
 from schemas.capture import UPLOADING
 from schemas.intake import phone_recordings
 from schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
@@ -107,10 +108,14 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         return response
 
     async def page(request: Request) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        every = texts.catalogue()
         said = {
-            name.removeprefix(_SAID): by_language for name, by_language in texts.catalogue().items()
-            if name.startswith(_SAID)
-        }  # fmt: skip
+            **{f"is_{name}": {k: capital(v) for k, v in every[f"library.{name}"].items()} for name in ACTIVITIES},
+            **{f"is_{name}": every[f"library.{name}"] for name in PACES},
+            **{name.removeprefix(_SAID): own for name, own in every.items() if name.startswith(_SAID)},
+        }
         return pages.show(
             request, "capture.html", 200, _MAY, phone=request.state.phone, words=json.dumps(said), part_bytes=PART_BYTES
         )
@@ -240,7 +245,7 @@ def verdict(language: str, judged: Usable | None) -> str:
     if judged.cycles is not None and any(judged.cycles):
         left, right = judged.cycles
         said = f"{said}. {texts.text(language, 'capture.cycles', left=left, right=right)}"
-    return said + "."
+    return said.removesuffix(".") + "."
 
 
 def next_words(language: str, more: Next | None) -> str:

@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from pbl_pipeline import charts, texts
-from pbl_pipeline.words import MEASURES, TASKS
+from pbl_pipeline.words import MEASURES, TASKS, capital
 from schemas.reading.trend import INDEX, Point, trend_of
 
 from .address import Address, number_of, page
@@ -25,7 +25,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         language = reader_language(request)
         activity, _, name = found.measure.rpartition(".")
         words, unit, decimals = ("", "", 1) if found.measure == INDEX else (MEASURES | TASKS)[name]
-        title = ": ".join(texts.library_words(language, w) for w in (activity, words) if w)
+        title = ": ".join(capital(texts.library_words(language, w)) for w in (activity, words) if w)
         title = title or texts.text(language, "visit.gdi")
         label = texts.text(language, "trend.chart", name=title, n=len(found.points))
         picture = _chart(label, found.points, found.measure == INDEX)

@@ -234,7 +234,7 @@ async function show() {
   list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
-  $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toFixed(1) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
+  $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toLocaleString(language, { maximumFractionDigits: 1 }) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
 }
 
 /** A screen reader reads it again only where it is another. @param {string} at @param {string} text */
