@@ -67,7 +67,7 @@ def orientation_of(frame: av.VideoFrame) -> Orientation:
     """
     # `frame.side_data` would keep a reference back to the frame: only the collector of cycles frees such a frame, and
     # until then FFmpeg keeps the memory of all pictures of the video.
-    data = SideDataContainer(frame).get("DISPLAYMATRIX")
+    data = SideDataContainer(frame).get("DISPLAYMATRIX")  # pyright: ignore[reportCallIssue] - missing in its stub
     if data is None:
         return Orientation()
     a, b, _, c, d = (np.frombuffer(bytes(data), np.int32)[:5] / 65536.0).tolist()

@@ -81,7 +81,7 @@ def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: P
     [
         (("--resource", "fit"), ["16"]),
         (("--no-phones", "--processes", "5"), ["3"] * 5),
-        (("--processes", "auto"), [*["2"] * 8, "16"]),  # the last one is for phones
+        (("--processes", "auto"), [*["1"] * 16, "16"]),  # the last one is for phones
     ],
 )
 def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, monkeypatch, asked: tuple, shares: list):

@@ -11,9 +11,8 @@ from workers.registry import DETECTOR, FIT, GROUPS
 if TYPE_CHECKING:
     from workers.process import Options
 
-#: Share of a process of `--processes auto`: more cores bring one recording little, fewer suffice where a GPU computes
-#: the networks, and the memory is what a long recording takes (bytes).
-CORES_EACH, CORES_WITH_GPU, MEMORY_EACH = 2, 1, 4 * 2**30
+#: Memory of each process of `--processes auto` (bytes): that of a long recording.
+MEMORY_EACH = 4 * 2**30
 
 
 class Processes(click.ParamType):
@@ -36,9 +35,8 @@ class Processes(click.ParamType):
 )
 @click.option(
     "--processes", type=Processes(),
-    help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (2 cores and "
-    "4 GB each; 1 core with a GPU; of the fit alone one for each GPU). Default: one for each GPU where the fit is "
-    "served, else 1.",
+    help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (1 core and "
+    "4 GB each; of the fit alone one for each GPU). Default: one for each GPU where the fit is served, else 1.",
 )  # fmt: skip
 @click.option(
     "--batch",
@@ -116,7 +114,7 @@ def options_of(resource: str, processes: int | str | None, batch: int | None = N
 
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
-        room = min(cores() // (CORES_WITH_GPU if gpus else CORES_EACH), memory_bytes() // MEMORY_EACH)
+        room = min(cores(), memory_bytes() // MEMORY_EACH)
         processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
     return Options(
         resource=resource,
