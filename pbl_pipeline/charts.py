@@ -282,7 +282,7 @@ def contact_chart(
     spans: Mapping[str, Sequence[tuple[float, float]]],
     events: Sequence[tuple[float, str, str]],
 ) -> Markup:
-    """Foot contacts over the recording: stance bars, a triangle down for foot down and up for foot up.
+    """Foot contacts over the recording: stance bars, a triangle down for initial contact and up for toe-off.
 
     known: stretches (start, stop) in s in which the person is fitted; events: (time_s, side, event).
     """

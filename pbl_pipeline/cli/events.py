@@ -43,7 +43,7 @@ def events(file: Path, out: Path, method: str) -> None:
         return
     count = {k: sum(e.event == k for e in found.events) for k in ("foot_down", "foot_up")}
     bouts = ", ".join(f"{a:.2f}-{b:.2f} s" for a, b in found.walking_s)
-    click.echo(f"{out}: {count['foot_down']} foot downs, {count['foot_up']} foot ups; walking {bouts}")
+    click.echo(f"{out}: {count['foot_down']} initial contacts, {count['foot_up']} toe-offs; walking {bouts}")
     for check in found.qc:
         if check.advice:
             click.echo(f"  {check.outcome} {check.check}: {check.advice}")

@@ -1,4 +1,4 @@
-"""Gait cycles between foot downs of one side, their joint-angle curves, and the exclusion of unlike cycles."""
+"""Gait cycles between initial contacts of one side, their joint-angle curves, and the exclusion of unlike cycles."""
 
 from __future__ import annotations
 
@@ -154,11 +154,11 @@ def find_cycles(
     """All cycles whose inner events are complete and in order, with curves and lengths if a fit is given.
 
     First and last step of each bout are left out of the measures (Cotton et al.: "first and last step of a trial are
-    discarded"). A step is the time from one foot down to the next foot down of the other foot. So of a bout with
-    n foot downs, which has n - 1 steps and n - 2 cycles, the cycle that starts with the first foot down and the cycle
-    that ends with the last one are not used: n - 4 cycles remain, made of exactly the n - 3 inner steps. Eight steps
-    (nine foot downs) in view leave 5 cycles. Cycles that are not used stay in the result with `used` False, so that
-    both counts can be shown.
+    discarded"). A step is the time from one initial contact to the next initial contact of the other foot. So of a bout
+    with n initial contacts, which has n - 1 steps and n - 2 cycles, the cycle that starts with the first initial
+    contact and the cycle that ends with the last one are not used: n - 4 cycles remain, made of exactly the n - 3 inner
+    steps. Eight steps (nine initial contacts) in view leave 5 cycles. Cycles that are not used stay in the result with
+    `used` False, so that both counts can be shown.
 
     With `keep_ends` they are used: for a recording that begins and ends while the person walks, such as a laboratory's,
     where the first step in view is not the first step of the walk.

@@ -172,11 +172,11 @@ class Spatiotemporal:
 def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     """Measures over the used cycles of one or several trials (formulas and sources in docs/measures.md).
 
-    For a cycle with foot down D, opposite foot up U', opposite foot down D', foot up U, next foot down E:
-    stride time E - D; stance U - D and swing E - U, also in percent of the stride; single support
-    100 (D' - U') / (E - D); double support time (U' - D) + (U - D'), also in percent; cadence 120 / (E - D). Step time
-    is between successive foot downs and belongs to the side that lands: D' - D is a step of the other side, E - D' one
-    of this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
+    For a cycle with initial contact D, opposite toe-off U', opposite initial contact D', toe-off U, next initial
+    contact E: stride time E - D; stance U - D and swing E - U, also in percent of the stride; single support 100 (D' -
+    U') / (E - D); double support time (U' - D) + (U - D'), also in percent; cadence 120 / (E - D). Step time is between
+    successive initial contacts and belongs to the side that lands: D' - D is a step of the other side, E - D' one of
+    this side; a step that is part of two cycles counts once. Lengths are those of `cycle_lengths`, speed is stride
     length by stride time.
 
     With a cycle of odd length that may be a true stride (`Exclusion.length_unproven`) no measure has sd, variability or

@@ -15,7 +15,7 @@ from .types import GaitCycle, Lengths
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
 
-#: The part of a stride after its foot down in which the foot lies flat (fraction of the stride).
+#: The part of a stride after its initial contact in which the foot lies flat (fraction of the stride).
 FLAT_FROM, FLAT_TO = 0.08, 0.32
 #: If the standing feet of a trial move over the floor at more than this fraction of their speed against the pelvis
 #: (median), they do not stand: a treadmill's belt carries them, or the camera moves (1 and more for both; 0.2 at most

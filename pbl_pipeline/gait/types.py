@@ -190,9 +190,9 @@ class Lengths:
 
 @dataclasses.dataclass(frozen=True)
 class GaitCycle:
-    """One stride: foot down to the next foot down of the same side.
+    """One stride: initial contact to the next initial contact of the same side.
 
-    Times in seconds of the trial. In order: `start_s` (foot down), `opposite_foot_up_s`, `opposite_foot_down_s`,
+    Times in seconds of the trial. In order: `start_s` (initial contact), `opposite_foot_up_s`, `opposite_foot_down_s`,
     `foot_up_s`, `end_s`. `number` counts the cycles of a trial in order of time, both sides together, from 0.
     `used` is False for the cycles that touch the first or last step of their walking bout, for those that are far
     longer or shorter than the others and not one stride (`odd_length`) or whose curves are far from the others'
@@ -250,5 +250,5 @@ class GaitCycle:
 
     @property
     def stride_time_s(self) -> float:
-        """Foot down to the next foot down of the same side."""
+        """Initial contact to the next initial contact of the same side."""
         return self.end_s - self.start_s

@@ -104,8 +104,8 @@ class _Sole:
 def contact_of(time_s: np.ndarray, events: Sequence[GaitEvent]) -> Float[np.ndarray, "N 2"]:
     """Return 1 where [left, right] is on the floor, 0 where it is in the air, NaN where the events do not tell.
 
-    A foot's state is known between two events of a bout that follow each other (foot down, foot up); before its first
-    event it is the other one, from the first event of the bout on, and after its last likewise.
+    A foot's state is known between two events of a bout that follow each other (initial contact, toe-off); before its
+    first event it is the other one, from the first event of the bout on, and after its last likewise.
     """
     contact = np.full((len(time_s), 2), np.nan)
     for bout in sorted({e.bout for e in events}):

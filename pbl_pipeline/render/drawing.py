@@ -236,7 +236,7 @@ class Event(Protocol):
 
 
 def stance_spans(events: Iterable[Event], side: str) -> list[tuple[float, float]]:
-    """Times (foot down, foot up) in which the foot of `side` is known to be on the ground.
+    """Times (initial contact, toe-off) in which the foot of `side` is known to be on the ground.
 
     Only a foot-down that is followed by a foot-up makes a span: before the first and after the last event, and between
     two events of one kind, nothing is claimed.

@@ -68,10 +68,8 @@ def contact_chart(fit: TrialFit, events: GaitEvents) -> Markup | None:
     """Draw the foot contacts over the recording; None without events."""
     if not events.events:
         return None
-    counts = ", ".join(
-        f"{side} foot down {len(events.times(side, 'foot_down'))} and up {len(events.times(side, 'foot_up'))} times"
-        for side in SIDES
-    )
+    n = {side: [len(events.times(side, kind)) for kind in ("foot_down", "foot_up")] for side in SIDES}
+    counts = ", ".join(f"{side} {down} initial contacts and {up} toe-offs" for side, (down, up) in n.items())
     return charts.contact_chart(
         f"Foot contacts over the recording: {counts}.",
         float(fit.time_s[-1]),
@@ -121,8 +119,8 @@ def legend(*items: str) -> list[tuple[Markup, str]]:
         "norm": (_rect("#dfe3e8"), "Norm, mean and one sd each way"),
         "foot off": (_line("#5b636c", 1.0, "2 3"), "Foot off"),
         "stance": (_rect(right, 0.45), "Foot on the ground"),
-        "foot down": (Markup('<polygon points="10,1 20,1 15,10" fill="#5b636c"/>'), "Foot down"),
-        "foot up": (Markup('<polygon points="10,11 20,11 15,2" fill="#5b636c"/>'), "Foot up"),
+        "initial contact": (Markup('<polygon points="10,1 20,1 15,10" fill="#5b636c"/>'), "Initial contact"),
+        "toe-off": (Markup('<polygon points="10,11 20,11 15,2" fill="#5b636c"/>'), "Toe-off"),
         "in view": (_rect("#eceff2"), "Person in view and fitted"),
     }
     return [

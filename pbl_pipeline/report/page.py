@@ -67,7 +67,7 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         "trials": [_trial(r, pictures.get(r.name, ())) for r in recordings],
         "open_time_charts": empty,
         "key_cycles": _figures.legend("left", "right", "cycles", "norm", "foot off"),
-        "key_contacts": _figures.legend("stance", "foot down", "foot up", "in view"),
+        "key_contacts": _figures.legend("stance", "initial contact", "toe-off", "in view"),
         "key_time": _figures.legend("left", "right", "stance"),
         "event_methods": [] if metrics is None else list(dict.fromkeys(t.events.method for t in metrics.trials)),
         "scale_assumed": any(

@@ -39,7 +39,7 @@ def _frames() -> dict[str, tuple[Column, ...]]:
         column = Column(row["name"], row["kind"], row["unit"], row["meaning"], row["optional"] == "yes")
         found.setdefault(row["frame"], []).append(column)
     found["curves"] += [
-        Column(p, "number", "unit", f"mean at {p[1:]} % of the gait cycle, from foot down") for p in CURVE_POINTS
+        Column(p, "number", "unit", f"mean at {p[1:]} % of the gait cycle, from initial contact") for p in CURVE_POINTS
     ]
     return {frame: tuple(columns) for frame, columns in found.items()}
 

@@ -191,7 +191,7 @@ class Plan:
     #: (N,) 1 where the pelvis follows `xy_m`, 0 where it goes where the standing feet and the posture put it.
     on_path: Float[np.ndarray, " N"]
     speed_m_per_s: Float[np.ndarray, " N"]  # (N,) along the way, which sets how much of a walk the legs and arms do
-    steps: tuple[Step, ...]  # all stances, in order of foot down
+    steps: tuple[Step, ...]  # all stances, in order of initial contact
     #: angle -> (N,) of both sides while the person does not walk: hip_flexion, knee_flexion, ankle_angle, tilt,
     #: lumbar_extension, arm_flex, elbow_flex; missing ones are those of standing.
     posture_deg: dict[str, np.ndarray]

@@ -45,7 +45,7 @@ SWAY_M = 0.020
 
 
 def side_phases(plan: Plan, foot_off: float) -> dict[str, Float[np.ndarray, " N"]]:
-    """Phase of the gait cycle (rad) of each side: 2 pi k at its foot downs, 2 pi (k + foot_off) at its foot ups."""
+    """Phase of the gait cycle (rad) of each side: 2 pi k at initial contacts, 2 pi (k + foot_off) at toe-offs."""
     out = {}
     for side in "rl":
         knots, phase = [], []
@@ -79,7 +79,7 @@ def swing_bump(plan: Plan, side: str) -> Float[np.ndarray, " N"]:
 
 
 def swing_window(plan: Plan, side: str, early_s: float = 0.08) -> Float[np.ndarray, " N"]:
-    """1 in each swing of a side, smoothly 0 outside; it begins a little before foot up."""
+    """1 in each swing of a side, smoothly 0 outside; it begins a little before toe-off."""
     out = np.zeros(len(plan.grid_s))
     own = [s for s in plan.steps if s.side == side]
     for before, after in itertools.pairwise(own):

@@ -23,7 +23,7 @@ STEP_TIME_SD, ALONG_SD_M, ACROSS_SD_M = 0.018, 0.008, 0.008
 WIDTH_M, TOE_OUT_DEG = (0.11, 0.015), (6.0, 2.0)
 #: Standing: distance between the heels.
 STANCE_WIDTH_M = 0.20
-#: The pelvis is over the foot at this fraction of the stride after foot down.
+#: The pelvis is over the foot at this fraction of the stride after initial contact.
 OVER_FOOT = 0.29
 #: How the speed differs between people, dimensionless (Schwartz et al. 2008, "free").
 SPEED_SD = 0.026

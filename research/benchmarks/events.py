@@ -253,7 +253,7 @@ def double_support_error(speed: float, seed: int, method: str) -> tuple[float, T
 
 
 def foot_speed(feet: FootTrajectories, events: Sequence[GaitEvent], belt_m_per_s: np.ndarray) -> dict[str, float]:
-    """Speed (m/s) against the floor of the heel at foot down and of the toe at foot up, median over the events."""
+    """Speed (m/s) against the floor of the heel at initial contact and of the toe at toe-off: median over events."""
     out = {}
     for event, points in (("foot_down", feet.heel_m), ("foot_up", feet.toe_m)):
         found = []

@@ -17,8 +17,8 @@ from ._rhythm import Rhythm
 _PERSON_DEG = (5.0, 2.0, 1.4, 0.8, 0.4, 0.25)
 _SIDE_SHARE = 0.4
 
-#: Running, deg over the stride from foot down, foot off at 38 %. The project's own numbers, drawn to follow the course
-#: of textbook curves (Novacheck 1998, Gait & Posture 7:77): a style for training, not a norm.
+#: Running, deg over the stride from initial contact, foot off at 38 %. The project's own numbers, drawn to follow the
+#: course of textbook curves (Novacheck 1998, Gait & Posture 7:77): a style for training, not a norm.
 _RUN_PERCENT = (0, 8, 16, 24, 32, 38, 46, 55, 65, 75, 85, 93, 100)
 #: Foot off in them.
 _RUN_FOOT_OFF = 0.38

@@ -104,9 +104,9 @@ def _in_turn(table: np.ndarray, least_s: float) -> np.ndarray:
 
 
 def leg_phase(down_s: np.ndarray, up_s: np.ndarray, curve_foot_off: float, time_s: np.ndarray) -> np.ndarray:
-    """Phase (T,) in turns of the curves of one leg: whole at each foot down, `curve_foot_off` later at each foot up."""
+    """Phase (T,) in turns of the curves of one leg: whole at initial contact, `curve_foot_off` later at toe-off."""
     knots = np.concatenate([down_s, up_s])
-    first_up = int(np.searchsorted(down_s, up_s[0]))  # the foot down after which the first foot up comes
+    first_up = int(np.searchsorted(down_s, up_s[0]))  # the initial contact after which the first toe-off comes
     turns = np.concatenate([np.arange(len(down_s)), np.arange(len(up_s)) + first_up - 1 + curve_foot_off])
     order = np.argsort(knots)
     phase = PchipInterpolator(knots[order], turns[order])(np.clip(time_s, knots.min(), knots.max()))

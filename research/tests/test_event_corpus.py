@@ -43,7 +43,7 @@ def test_a_scene_is_its_seeds_and_has_feet_below_the_hips():
 
 
 def test_feet_are_ahead_where_they_come_down():
-    """The events of a scene fit its movement: at a foot down the foot is ahead of the other one."""
+    """The events of a scene fit its movement: at an initial contact the foot is ahead of the other one."""
     judged = 0
     for seed in range(30):
         s = scene(seed)

@@ -172,7 +172,7 @@ def test_monocular_walks_agree_with_the_markers(shared_data, method):
     for system in ("mocap", "mono", "wham"):
         time, xyz = read_bodies(shared_data / "real" / "video_mocap" / "walk" / f"sample_{system}.json.gz")
         events = detect_events(feet_from_markers(time, MARKERS, "plug_in_gait", xyz), method).events
-        # The model also finds the foot down in the second frame, where there is little before it to see it by.
+        # The model also finds the initial contact in the second frame, where there is little before it to see it by.
         walks[system] = [e for e in events if e.time_s > 0.05]
         assert [(e.side, e.event) for e in walks[system]] == kinds
     for system in ("mono", "wham"):

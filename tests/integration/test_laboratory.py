@@ -187,7 +187,7 @@ def test_without_labels_the_method_finds_the_events(walk, tmp_path):
         json.loads((tmp_path / f"{m}.json").read_text())["session"]["double_support_percent"]["mean"]
         for m in ("phase-transformer", "zeni-2008")
     )
-    assert late > early + 5  # Zeni's foot down is 39 ms early
+    assert late > early + 5  # Zeni's initial contact is 39 ms early
     points, names = normal_walk()
     with pytest.raises(PblError, match="GAIT_INPUT") as error:
         read_lab_feet(write_c3d(tmp_path / "bare.c3d", points, names))

@@ -10,7 +10,7 @@ from pbl_pipeline.gait.motion import heading_agreement, heading_from_hips
 UP = np.array([0.0, 0.0, 1.0])
 LEG_M = 0.9
 STRIDE_S = 1.12
-#: Share of the stride from foot down to foot up of one side.
+#: Share of the stride from initial contact to toe-off of one side.
 STANCE = 0.62
 
 
@@ -18,9 +18,9 @@ STANCE = 0.62
 class Walker:
     """Foot positions relative to the pelvis as functions of time, and when they are extreme.
 
-    A foot moves back in stance and forward in swing, each along half a cosine: foremost exactly at foot down, rearmost
-    exactly at foot up. Stance is longer than swing, so the curve is sharper on one side of each extremum, as in real
-    walking: a low-pass filter moves the extremum a little (7 ms at 6 Hz) towards the flatter side.
+    A foot moves back in stance and forward in swing, each along half a cosine: foremost exactly at initial contact,
+    rearmost exactly at toe-off. Stance is longer than swing, so the curve is sharper on one side of each extremum, as
+    in real walking: a low-pass filter moves the extremum a little (7 ms at 6 Hz) towards the flatter side.
     """
 
     start_s: float = 0.3
@@ -37,7 +37,7 @@ class Walker:
         return sorted(e for e in out if 0 <= e[0] <= duration_s)
 
     def forward(self, time_s: np.ndarray, side: str) -> np.ndarray:
-        """Smooth curve whose maximum is at foot down and minimum at foot up: two half cosines."""
+        """Smooth curve whose maximum is at initial contact and minimum at toe-off: two half cosines."""
         delay = 0.0 if side == "left" else self.right_delay
         phase = ((time_s - self.start_s) / self.stride_s - delay) % 1.0
         back = np.cos(np.pi * phase / STANCE)

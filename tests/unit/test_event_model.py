@@ -391,5 +391,5 @@ def test_the_command(tmp_path):
         out = tmp_path / f"{method}.csv"
         done = CliRunner().invoke(events_command, [str(tmp_path / "m.npz"), "--out", str(out), "--method", method])
         assert done.exit_code == 0, done.output
-        assert "foot downs" in done.output
+        assert "initial contacts" in done.output
         assert len(out.read_text().splitlines()) > n

@@ -32,7 +32,7 @@ from tests.walking_fit import walking_fit
 
 
 def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bout: int = 0) -> list[GaitEvent]:
-    """Foot downs as given; the other foot leaves the ground `double_support_s[side that landed]` later."""
+    """Initial contacts as given; the other foot leaves the ground `double_support_s[side that landed]` later."""
     out = []
     for time, side in downs:
         other = "right" if side == "left" else "left"
@@ -43,8 +43,8 @@ def walk(downs: list[tuple[float, str]], double_support_s: dict[str, float], bou
     return out
 
 
-# Left steps (landing left) last 0.6 s, right steps 0.5 s; stride 1.1 s. After a left foot down the right foot leaves
-# 0.12 s later, after a right one the left 0.10 s later.
+# Left steps (landing left) last 0.6 s, right steps 0.5 s; stride 1.1 s. After a left initial contact the right foot
+# leaves 0.12 s later, after a right one the left 0.10 s later.
 DOWNS = [
     (1.0, "left"),
     (1.5, "right"),
@@ -96,9 +96,9 @@ def test_measures_by_hand():
     )
     assert of(result, "cadence_steps_per_min").mean == pytest.approx(120 / 1.1)
     assert of(result, "cadence_steps_per_min").left is None
-    # Left stance: down at 0, left foot up 0.10 s after right foot down at 0.5 -> 0.60 s of 1.1 s.
+    # Left stance: down at 0, left toe-off 0.10 s after right initial contact at 0.5 -> 0.60 s of 1.1 s.
     assert of(result, "stance_percent").left == pytest.approx(100 * 0.60 / 1.1)
-    # Right stance: down at 0, right foot up 0.12 s after left foot down at 0.6 -> 0.72 s.
+    # Right stance: down at 0, right toe-off 0.12 s after left initial contact at 0.6 -> 0.72 s.
     assert of(result, "stance_percent").right == pytest.approx(100 * 0.72 / 1.1)
     assert of(result, "swing_percent").left == pytest.approx(100 * 0.50 / 1.1)
     # The left foot stands alone while the right one swings: from 0.12 to 0.50 s; the right one from 0.10 to 0.60 s.
@@ -175,12 +175,12 @@ def test_a_cycle_without_its_inner_events_is_none():
     lost = [e for e in EVENTS if not (e.side == "right" and e.event == "foot_up" and 2.1 < e.time_s < 2.6)]
     starts = [c.start_s for c in find_cycles(lost)]
     assert 2.1 not in starts
-    assert 1.5 not in starts  # its own foot up is the one that is missing
+    assert 1.5 not in starts  # its own toe-off is the one that is missing
     assert 2.6 in starts
 
 
 def steps(times: list[float]) -> list[GaitEvent]:
-    """A walk with foot downs of alternate sides at these times."""
+    """A walk with initial contacts of alternate sides at these times."""
     return walk([(t, "left" if k % 2 == 0 else "right") for k, t in enumerate(times)], {"left": 0.11, "right": 0.11})
 
 

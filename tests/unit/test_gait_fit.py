@@ -50,7 +50,7 @@ def make_fit(time_s: np.ndarray, values: dict[str, np.ndarray | float], name: st
 
 
 def walking(time_s: np.ndarray, heading_deg: float = 0.0, start_s: float = 0.0, speed: float = 1.2) -> dict:
-    """Joint values that follow the normative mean curves, right foot down at `start_s`, left half a stride later."""
+    """Joint values along the normative mean curves, right initial contact at `start_s`, left half a stride later."""
     norm = load_norm()
     values: dict[str, np.ndarray | float] = {}
     for side, delay in (("r", 0.0), ("l", 0.5)):
@@ -170,9 +170,9 @@ def test_a_walking_body(heading_deg):
     assert stride.mean == pytest.approx(STRIDE_S, abs=0.004)
     assert cadence.mean == pytest.approx(120 / STRIDE_S, abs=0.5)
     assert stance.left == pytest.approx(stance.right, abs=1.0)
-    # The mean curves of normal walking: foot up at 60 % of the cycle; the method finds it a little late.
+    # The mean curves of normal walking: toe-off at 60 % of the cycle; the method finds it a little late.
     assert 58 < stance.mean < 70
-    # Right foot down at multiples of the stride, by construction of the curves.
+    # Right initial contact at multiples of the stride, by construction of the curves.
     down = np.array(metrics.trials[0].events.times("right", "foot_down"))
     assert np.abs((down + STRIDE_S / 2) % STRIDE_S - STRIDE_S / 2).max() < 0.06
     # Curves of the mean of the norm are closer to it than those of anybody.

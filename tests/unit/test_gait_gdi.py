@@ -339,7 +339,7 @@ def test_the_set_that_ships():
     assert (norm.n, norm.variables, norm.components.shape[1]) == (166, THREE_ANGLES, 150)
     assert set(norm.curves) == set(NINE_ANGLES)
     assert all(band["mean_deg"].shape == (51,) for band in norm.curves.values())
-    # Signs of normal walking: knee bends most in swing, hip extends before foot up, adducts in early stance.
+    # Signs of normal walking: knee bends most in swing, hip extends before toe-off, adducts in early stance.
     knee, hip, adduction = (norm.curves[n]["mean_deg"] for n in ("knee_flexion", "hip_flexion", "hip_adduction"))
     assert 55 < knee.max() < 65
     assert 68 <= 2 * knee.argmax() <= 78

@@ -72,7 +72,7 @@ def routes(tables: Tables) -> list[Address]:
 
 
 def _events(text: str) -> list[tuple[float, str, str]]:
-    """Events as the page sends them: `1.2345ld` is the left foot down at 1.2345 s."""
+    """Events as the page sends them: `1.2345ld` is the left initial contact at 1.2345 s."""
     out = []
     for word in text.split():
         found = _EVENT.fullmatch(word)

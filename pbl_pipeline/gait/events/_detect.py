@@ -1,4 +1,4 @@
-"""Detection of foot down and foot up by a named method."""
+"""Detection of initial contact and toe-off by a named method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .types import GaitEvents
 
 
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:
-    """Foot down and foot up of both sides in order of time, in bouts of walking.
+    """Initial contact and toe-off of both sides in order of time, in bouts of walking.
 
     Raises `PblError` GAIT_INPUT if no frame has the method's input, or the legs are upside down or mirrored;
     SOLVER_UNKNOWN for an unknown method; ASSET_MISSING if the event model's weights are missing.

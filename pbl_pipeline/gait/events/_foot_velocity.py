@@ -1,4 +1,4 @@
-"""Detection of foot down and foot up from the vertical speed of the middle of the foot."""
+"""Detection of initial contact and toe-off from the vertical speed of the middle of the foot."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FootVelocityParams(EventParams):
         Smallest extremum of the vertical speed that counts, in leg lengths per second. The foot sinks with only 0.15 to
         0.3 m/s where it meets the floor.
     max_heel_share
-        At foot down the heel is below this fraction of its range of heights.
+        At initial contact the heel is below this fraction of its range of heights.
     """
 
     cutoff_hz: float = 7.0
@@ -32,13 +32,13 @@ class FootVelocityParams(EventParams):
 
 
 def detect_by_foot_velocity(feet: FootTrajectories, method: Method[FootVelocityParams]) -> GaitEvents:
-    """Foot down and foot up from the vertical speed of the middle between heel and toe.
+    """Initial contact and toe-off from the vertical speed of the middle between heel and toe.
 
-    Method: O'Connor, Thorpe, O'Malley, Vaughan 2007, Gait & Posture 25:469-474. Foot up is where the speed is
-    greatest upwards; foot down where it is greatest downwards while the heel is in the lowest 35 % of its range. The
-    signals are low-passed at 7 Hz as there. Heights are against the pelvis, so that a camera that moves does not
-    matter; the pelvis' own movement of a few cm is part of them. Order and cadence are then checked as for
-    `zeni-2008`, and `probability` is as there.
+    Method: O'Connor, Thorpe, O'Malley, Vaughan 2007, Gait & Posture 25:469-474. Toe-off is where the speed is
+    greatest upwards; initial contact where it is greatest downwards while the heel is in the lowest 35 % of its range.
+    The signals are low-passed at 7 Hz as there. Heights are against the pelvis, so that a camera that moves does not
+    matter; the pelvis' own movement of a few cm is part of them. Order and cadence are then checked as for `zeni-2008`,
+    and `probability` is as there.
 
     Raises `PblError` GAIT_INPUT as there.
     """

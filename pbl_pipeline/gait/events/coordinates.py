@@ -1,4 +1,4 @@
-"""Coordinate-based detection of foot down and foot up."""
+"""Coordinate-based detection of initial contact and toe-off."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ _HEEL, _TOE = slice(0, 2), slice(2, 4)
 
 
 def detect_by_coordinates(feet: FootTrajectories, method: Method[EventParams]) -> GaitEvents:
-    """Foot down and foot up from the forward movement of the feet relative to the pelvis.
+    """Initial contact and toe-off from the forward movement of the feet relative to the pelvis.
 
-    Method: Zeni, Richards, Higginson 2008, Gait & Posture 27:710-714. Foot down is where the heel is foremost, foot
-    up where the toe is rearmost, relative to the pelvis along the heading. The signals are interpolated onto a
-    uniform grid, low-passed without lag at `cutoff_hz`, extrema refined by a parabola; each must be prominent
-    against the leg length and against the other steps of its side, and together they must follow the order left
-    down, right up, right down, left up within the limits of cadence.
+    Method: Zeni, Richards, Higginson 2008, Gait & Posture 27:710-714. Initial contact is where the heel is foremost,
+    toe-off where the toe is rearmost, relative to the pelvis along the heading. The signals are interpolated onto a
+    uniform grid, low-passed without lag at `cutoff_hz`, extrema refined by a parabola; each must be prominent against
+    the leg length and against the other steps of its side, and together they must follow the order left down, right up,
+    right down, left up within the limits of cadence.
 
     Known bias, which is not removed: against the labels of 11 laboratory walks of children (optical markers, force
-    plates) foot down is 39 +- 12 ms early and foot up 13 +- 10 ms late (mean +- sd), so stance comes out 50 ms and
-    double support 100 ms too long. On fitted video the bias is not measured yet. An extremum within about
-    0.15 s of the end of view is not found: it cannot be seen to be one.
+    plates) initial contact is 39 +- 12 ms early and toe-off 13 +- 10 ms late (mean +- sd), so stance comes out 50 ms
+    and double support 100 ms too long. On fitted video the bias is not measured yet. An extremum within about 0.15 s of
+    the end of view is not found: it cannot be seen to be one.
 
     `probability` of an event is `c / (1 + (threshold / prominence)^2)`: 0.5 for an extremum just at the detection
     threshold, near 1 for one far above it, times the confidence `c` of the points where the source states one. It

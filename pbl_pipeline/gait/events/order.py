@@ -35,7 +35,7 @@ def best_sequence(candidates: Sequence[Candidate], params: EventParams) -> list[
 
     A candidate may be left out (that costs its weight) and a run may end (that costs `break_cost`), so that one
     spurious extremum is dropped and one missing event splits a bout. Dynamic programming over candidates in order of
-    time. Runs are then split where two successive foot downs are outside the limits of cadence.
+    time. Runs are then split where two successive initial contacts are outside the limits of cadence.
     """
     found = sorted(candidates, key=lambda c: c.time_s)
     best: list[float] = []

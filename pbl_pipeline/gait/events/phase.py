@@ -36,7 +36,7 @@ class PhaseParams:
     min_leg_share
         Least fraction of a stretch in which a leg is seen below the hip.
     min_foot_downs
-        Fewest foot downs of a walking bout.
+        Fewest initial contacts of a walking bout.
     min_probability
         Events that are less likely real than this are left out, and end a bout.
     event_delay_s
@@ -149,7 +149,7 @@ def event_evidence(smooth: SmoothPhases, z: np.ndarray, walking: np.ndarray, k: 
 
 
 def _bouts(events: list[GaitEvent], p: PhaseParams) -> list[list[GaitEvent]]:
-    """Runs of events that are likely enough, with enough foot downs of both sides."""
+    """Runs of events that are likely enough, with enough initial contacts of both sides."""
     runs: list[list[GaitEvent]] = [[]]
     for e in events:
         if e.probability >= p.min_probability:
@@ -164,7 +164,7 @@ def _downs(run: list[GaitEvent]) -> list[GaitEvent]:
 
 
 def double_support_s(events: list[GaitEvent]) -> np.ndarray:
-    """Time (s) from each foot down to the nearest foot up of the other foot of the same bout; negative if that came
+    """Time (s) from each initial contact to the nearest toe-off of the other foot in its bout; negative if that came
     before, with the body in the air."""
     out = []
     for down in _downs(events):
@@ -178,7 +178,7 @@ def _why_not(grid: Any, phases: Any, stretches: int, half_seen: int, p: PhasePar
     if half_seen:
         return "the person walks, but one leg is hardly seen", "film from where both legs are in view"
     if stretches:
-        return f"walking, but not {p.min_foot_downs} foot downs", "film a longer stretch"
+        return f"walking, but not {p.min_foot_downs} initial contacts", "film a longer stretch"
     reach = reach_leg(swing_leg(grid))
     likely = float(phases.walking.max()) if len(phases.walking) else 0.0
     said = f"the feet pass each other by {reach:.2f} leg lengths, the event model's probability of walking is"

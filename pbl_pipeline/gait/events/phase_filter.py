@@ -1,8 +1,8 @@
 """Kalman filter and Rauch-Tung-Striebel smoother over phase, phase rate and three offsets (Cotton et al. 2022).
 
-State: the phase of left foot down (rad, unwrapped), its rate (rad/s), and the lead of the phases of right foot up,
-right foot down and left foot up over it (rad). Measured are the four phases, each modulo a turn: the innovation is
-wrapped, so that the filter stays linear.
+State: the phase of left initial contact (rad, unwrapped), its rate (rad/s), and the lead of the phases of right
+toe-off, right initial contact and left toe-off over it (rad). Measured are the four phases, each modulo a turn: the
+innovation is wrapped, so that the filter stays linear.
 """
 
 from __future__ import annotations

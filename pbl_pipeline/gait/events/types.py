@@ -46,7 +46,7 @@ class EventParams:
     break_cost
         Cost of a break of the event order in the search for the best sequence (one event weighs its probability).
     min_foot_downs
-        Fewest foot downs of a walking bout.
+        Fewest initial contacts of a walking bout.
     foot_down_offset_s, foot_up_offset_s
         Added to every event of that kind: the correction of a measured bias, 0 for none.
     """

@@ -83,7 +83,7 @@ _POINTS: dict[str, dict[str, tuple[str, str]]] = {
         "heel": ("left_heel", "right_heel"),
         "toe": ("left_foot_index", "right_foot_index"),
     },
-    # MeTRAbs' 17 joints end at the ankles: the ankle stands for heel and toe. What is lost: foot up is then the
+    # MeTRAbs' 17 joints end at the ankles: the ankle stands for heel and toe. What is lost: toe-off is then the
     # rearmost ankle, which comes before toe-off because the heel rises first.
     "mpi_inf_3dhp_17": {
         "hip": ("left_hip", "right_hip"),
