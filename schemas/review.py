@@ -1,4 +1,4 @@
-"""Decisions and looks of people on the review page. Rows are added, never changed; `schemas.decisions` writes them."""
+"""Decisions of people, and views of recordings. Rows are added, never changed; `schemas.decisions` writes them."""
 
 from __future__ import annotations
 

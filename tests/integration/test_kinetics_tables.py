@@ -204,7 +204,8 @@ def test_a_job_that_fails_leaves_the_rest_of_the_visit(upright: None, tmp_path: 
     assert [f.table for f in visit_progress(1).failed] == ["Kinetics"]
     assert "a broken motion" in why(1).verdict
     page = web.client().get("/visits/1").text
-    assert "Forces and joint moments" not in page
+    assert "Forces and joint moments: a broken motion" in page
+    assert "<h2>Forces and joint moments</h2>" not in page
     assert done(populate(retry_errors=True)) == {"Kinetics": 1}
     assert found().measures
 

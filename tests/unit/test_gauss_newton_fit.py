@@ -25,7 +25,6 @@ from pbl_pipeline.fit import (
     lanes,
     per_frame,
     problem,
-    session_fit,
 )
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
@@ -34,6 +33,7 @@ from pbl_pipeline.fit.solution import Solution
 from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.synthetic import CORRELATED_NOISE, Noise, Seen
 from research.walker.observe import observe
@@ -321,8 +321,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
     pixels = SessionInput([dataclasses.replace(trial, xyz_cam_m=np.full_like(trial.xyz_cam_m, np.nan))], ["pixels"])
     asked: list[list[str]] = []
 
-    def nothing(part, params) -> list[Solution]:
-        sessions = [p.session for p in part]
+    def nothing(sessions, params, starts) -> list[Solution]:
         asked.append([s.names[0] for s in sessions])
         f, j = len(sessions[0].problem.weight), len(sessions[0].markers)
         names = {"qpos": (f, 40), "R_nc": (f, 1, 3, 3), "s": (8,), "scale": (8,), "site_offset_m": (j, 3)}
@@ -333,7 +332,7 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         nan = Solution(**(values | {"seconds": 0.0, "compile_seconds": 0.0, "iterations": 1, "result": Result.BOUND}))
         return [nan] * len(sessions)
 
-    monkeypatch.setattr(session_fit, "_solve", nothing)
+    monkeypatch.setattr(Method, "function", property(lambda _: nothing))
     found = fit_sessions([pixels, *walkers], PARAMSET, batch=8)
     assert asked == [["pixels"], [w.names[0] for w in walkers]]
     assert [e.code for e in found if isinstance(e, PblError)] == ["FIT_DIVERGED"] * 4

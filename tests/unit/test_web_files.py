@@ -83,6 +83,7 @@ def test_what_the_library_says_is_in_every_language():
         "In the tracking {method} person {n} was chosen by hand, whom nobody here surely is. A person has to choose "
         "again.",
         "the hips are {n} leg lengths above the feet: nobody stands",
+        "walking, but not {n} foot downs",
         "the stated height is far from what is seen (value: their ratio): a mistyped height, another person, or a "
         "child, whom a phone's detector takes for an adult and on whom nobody has measured its index",
         "the keypoints do not state {fields}: a lens without distortion, a camera that nobody measured and the box "
