@@ -48,6 +48,4 @@ class Case:
 
 def fit_cases(method: str, trials: Sequence[int], batches: Sequence[int], n_people: int, repeat: int) -> list[Case]:
     """Return a case for each number of trials and each size of a batch."""
-    return [
-        Case(method, Data(n, batch if batch > 1 else n_people, 300), batch, repeat) for n in trials for batch in batches
-    ]
+    return [Case(method, Data(n, batch if batch > 1 else n_people), batch, repeat) for n in trials for batch in batches]

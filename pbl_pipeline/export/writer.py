@@ -100,8 +100,8 @@ FORMATS: Mapping[str, str] = {
 }
 #: Formats that need events, cycles and measures.
 GAIT_FORMATS = frozenset({"forces", "c3d", "csv", "parquet", "bids"})
-#: Formats with heights, which count from the floor; their readers require ASCII in names, some also in paths.
-_WITH_GROUND = ("trc", "mot", "forces", "osim", "c3d")
+#: Formats of programs of gait laboratories: heights count from the floor; names are ASCII, in some programs also paths.
+_OF_LABORATORIES = ("trc", "mot", "forces", "osim", "c3d")
 #: Characters that OpenSim refuses in the name of a component.
 _NOT_IN_OPENSIM = frozenset(" \t/\\*+")
 _LONGEST_NAME = 64
@@ -183,7 +183,7 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
         about[trial.name] = {**origin, **summary(trial)}
         folder = out / trial.name
         standing, headers = trial, origin
-        if set(_WITH_GROUND) & set(formats):
+        if set(_OF_LABORATORIES) & set(formats):
             standing, ground = on_floor(trial)
             headers = {**origin, "ground": one_line(ground)}
             grounds[trial.name] = {"ground": ground}
@@ -318,7 +318,7 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
         check_frames(trial)
     if GAIT_FORMATS & set(formats) and trial.measured is not None:
         _check_gait(trial.measured, formats)
-    if ascii_only := [f for f in formats if f in _WITH_GROUND]:
+    if ascii_only := [f for f in formats if f in _OF_LABORATORIES]:
         _check_names(trial, ascii_only)
     if "dlc" in formats and trial.keypoints is None:
         raise _input(

@@ -138,13 +138,14 @@ class Connection(H11Protocol):
         """Close a connection of the address that has the most: rather one that waits for its client than one that is
         being answered, and of these the oldest."""
         ((most, _),) = Counter(c._customer for c in others).most_common(1)
-        closed = min(
-            (c for c in others if c._customer == most),
-            # Whether the next step is the client's: to send a request, or to take an answer.
-            key=lambda c: (not (c._timers or c.cycle is None or c.cycle.response_complete), c._made_at),
-        )
+        closed = min((c for c in others if c._customer == most), key=lambda c: (not c._waits, c._made_at))
         self.connections.discard(closed)  # it stops counting now, not when it is closed
         closed.transport.abort()
+
+    @property
+    def _waits(self) -> bool:
+        """The next step is the client's: to send a request, or to take an answer."""
+        return bool(self._timers) or self.cycle is None or self.cycle.response_complete
 
     def _time_request(self) -> None:
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
