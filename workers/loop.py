@@ -234,7 +234,7 @@ class Worker:
         if job.table.__name__ == "VideoInfo":
             self._in_hand = int(job.key["video_id"])
         elif job.table.__name__ == "Keypoints":
-            self._forget_recording()
+            self._forget_recording(memory=False)
         self.done += good
         self.failed += outcome.what == run_job.FAILED
         self.heartbeat.count(job.table.__name__, int(good), int(outcome.what == run_job.FAILED), outcome.seconds)
@@ -246,9 +246,9 @@ class Worker:
             self.stop.wait(1.0)  # the cause is outside of the job: the next one would meet it too
         return outcome
 
-    def _forget_recording(self) -> None:
+    def _forget_recording(self, memory: bool = True) -> None:
         self._in_hand = None
-        release_frames()
+        release_frames(memory)
 
     def follow(self, outcomes: Sequence[Outcome]) -> None:
         """Queue what the jobs made computable."""

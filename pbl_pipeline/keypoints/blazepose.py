@@ -150,7 +150,7 @@ class BlazePoseLandmarks:
     ) -> PersonKeypoints:
         """Return the points that a network finds in the crop, or in its mirror image, in coordinates of the picture."""
         crop = cv2.cvtColor(crop, cv2.COLOR_BGR2RGB)
-        output = network(np.ascontiguousarray(crop[:, ::-1] if mirrored else crop))
+        output = network(cv2.flip(crop, 1) if mirrored else crop)
         found = output[N_ALL * 5].reshape(N_ALL, 5).astype(np.float64)
         points, circle, logits = found[:N_POINTS, :2], found[N_POINTS : N_POINTS + 2, :2], found[:N_POINTS, 3:]
         world = output[N_ALL * 3].reshape(N_ALL, 3)[:N_POINTS].astype(np.float64)

@@ -83,7 +83,7 @@ class SsdModel:
         small = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
         left, top = (size - w) // 2, (size - h) // 2
         canvas = np.zeros((size, size, 3), np.uint8)
-        canvas[top : top + h, left : left + w] = small[:, :, ::-1]
+        canvas[top : top + h, left : left + w] = cv2.cvtColor(small, cv2.COLOR_BGR2RGB)
         output = self._model(canvas)
         n = len(self._layout.anchor_centres)
         raw_boxes = output[n * self._layout.n_values].reshape(n, -1)

@@ -23,6 +23,8 @@ from .types import Detection, Scene
 #: up positive.
 _PATCHES = ((0.06, 0.46, 0.14), (-0.62, -0.10, 0.16))
 _PATCH_SIZE = (12, 24)
+#: Column and row of its pixels, and 1: (3, 288).
+_GRID = np.insert(np.indices(_PATCH_SIZE[::-1]).reshape(2, -1)[::-1], 2, 1, axis=0)
 #: Bins of lightness, and of each of the two colour axes (CIE Lab as 8 bit).
 _LIGHT_BINS, _COLOUR_BINS = 6, 8
 _SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)
@@ -66,8 +68,7 @@ def _patch(scene: Scene, to_picture: np.ndarray) -> np.ndarray:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         patch = cv2.warpAffine(scene, to_picture, _PATCH_SIZE, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         return patch.reshape(1, -1, 3)
-    row, column = np.indices(_PATCH_SIZE[::-1]).reshape(2, -1)
-    at = to_picture @ np.stack([column, row, np.ones(len(row))])
+    at = to_picture @ _GRID
     inside = ((at >= 0) & (at <= np.array(scene.size_px)[:, None] - 1)).all(axis=0)
     return scene.cut(to_picture, _PATCH_SIZE).reshape(1, -1, 3)[:, inside]
 

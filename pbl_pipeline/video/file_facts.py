@@ -96,6 +96,8 @@ _STEP_LEVELS, _OF_STEP, _STRAIGHT, _LONG = 10, 0.6, 0.9, 0.4
 #: Lines nearer to the picture's edge than this fraction are padding; least number of lines that show a screen, and the
 #: fraction of the movement that they enclose.
 _PADDING, _LEAST_LINES, _ENCLOSED = 0.015, 4, 0.9
+#: Rows that are examined together, for the memory.
+_ROWS_AT_ONCE = 64
 
 
 class BorderMeter:
@@ -146,7 +148,7 @@ class BorderMeter:
         """Return the number of a screen's lines around the movement; 0 if they are too few, or the movement is not
         between them."""
         greys = (self._sum / max(self._n, 1), self._first, self._last)
-        sides = [(greys, self._moved), ([np.ascontiguousarray(g.T) for g in greys], self._moved.T)] if self._n else []
+        sides = [(greys, self._moved), ([g.T for g in greys], self._moved.T)] if self._n else []
         found = [(_lines(pictures), moved.sum(axis=1)) for pictures, moved in sides]
         around = (
             moved[int(at[0] * len(moved)) : round(at[-1] * len(moved)) + 1].sum() >= _ENCLOSED * moved.sum() > 0
@@ -164,21 +166,25 @@ def _lines(greys: Sequence[np.ndarray]) -> np.ndarray:
     """
     height, width = greys[0].shape
     n, rows = max(1, int(_LONG * width)), []
-    for first in range(0, height - 5, 256):  # in parts, for the memory
-        parts = [grey[first : first + 261].astype(np.float32) for grey in greys]
+    # Few rows of a camera's picture have enough steps in the mean for the remaining conditions to matter.
+    step = np.abs(greys[0][3:-2] - greys[0][2:-3])
+    possible = np.flatnonzero(np.count_nonzero(step >= _STEP_LEVELS, axis=1) >= _STRAIGHT * n)
+    for some in np.split(possible, range(_ROWS_AT_ONCE, len(possible), _ROWS_AT_ONCE)):
+        around = some[:, None] + np.arange(6)
+        parts = [grey[around].astype(np.float32) for grey in greys]
         for sign in (1, -1):
             hits = np.logical_and.reduce([_steps(sign * part, k) for part, k in zip(parts, (1, 0.5, 0.5), strict=True)])
             count = np.pad(np.cumsum(hits, axis=1, dtype=np.int32), ((0, 0), (1, 0)))
-            straight = (count[:, n:] - count[:, :-n]).max(axis=1) >= _STRAIGHT * n
-            rows += (first + 3 + np.flatnonzero(straight)).tolist()
+            straight = (count[:, n:] - count[:, :-n]).max(axis=1, initial=0) >= _STRAIGHT * n
+            rows += (some[straight] + 3).tolist()
     found = np.unique(rows)
     at = found[np.diff(found, prepend=-9) > 3] / height
     return at[(at > _PADDING) & (at < 1 - _PADDING)]
 
 
 def _steps(grey: np.ndarray, part: float) -> np.ndarray:
-    """(H - 5, W) where (H, W) grey levels rise from one row to the next by `part` of the step of a screen's line."""
-    step, over = grey[3:-2] - grey[2:-3], grey[5:] - grey[:-5]
+    """(N, W) where six rows of grey levels (N, 6, W) rise in the middle by `part` of the step of a screen's line."""
+    step, over = grey[:, 3] - grey[:, 2], grey[:, 5] - grey[:, 0]
     return (step >= part * _STEP_LEVELS) & (step >= part * _OF_STEP * over)
 
 

@@ -21,7 +21,7 @@ from av.video.reformatter import VideoReformatter
 
 from .decode import Decoder, check_file
 from .kept import kept
-from .types import Frame, coarser, cut_samples, square
+from .types import Frame, cut_samples, square, to_blocks
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +117,7 @@ def cut_planes(
         samples = np.frombuffer(memoryview(plane), np.uint8 if bits == 8 else "<u2")
         samples = samples.reshape(plane.height, -1)[:, : plane.width]
         # A colour sample lies in the middle of the pixels that share it.
-        part = cut_samples(samples, coarser(x, y) @ square(stored), size_px, float(black << (bits - 8)))
+        part = cut_samples(samples, to_blocks(stored, x, y), size_px, float(black << (bits - 8)))
         parts.append(part if bits == 8 else cv2.convertScaleAbs(part, alpha=2.0 ** (8 - bits)))
     return cv2.transform(cv2.merge(parts), _to_bgr(int(frame.colorspace), full))
 

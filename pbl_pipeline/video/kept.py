@@ -2,17 +2,22 @@
 
 Decoding takes as long as all their other work outside the networks. Pictures are kept within `frames_kept` if those of
 the whole video fit into this process's share of the memory; longer videos are decoded each time.
+
+They are copied into memory that held those of the recording before: clearing new memory takes the system several times
+as long as the copy.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import weakref
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
 import av
+import numpy as np
 
 from pbl_pipeline.resources import share_of_memory
 
@@ -37,6 +42,12 @@ class _Shelf:
     def __init__(self) -> None:
         self.wanted = 0
         self.pictures: Pictures | None = None
+        self.blocks: list[np.ndarray] = []  # memory of released pictures, all of one size
+
+    def return_block(self, block: np.ndarray) -> None:
+        """Keep the memory of a picture that was freed, while pictures are to be kept."""
+        if self.wanted:
+            self.blocks.append(block)
 
 
 _shelf = _Shelf()
@@ -54,9 +65,11 @@ def frames_kept() -> Iterator[None]:
             release_frames()
 
 
-def release_frames() -> None:
-    """Release the memory of the kept pictures."""
+def release_frames(memory: bool = True) -> None:
+    """Release the kept pictures; without `memory`, theirs stays with this process for those of the next recording."""
     _shelf.pictures = None
+    if memory:
+        _shelf.blocks = []
 
 
 def kept(path: Path) -> Pictures | None:
@@ -67,19 +80,45 @@ def kept(path: Path) -> Pictures | None:
 
 def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield the pictures of a decoder, and keep them if that is wanted and the end is reached."""
-    release_frames()
+    release_frames(memory=False)
     room = share_of_memory() * _FRACTION if _shelf.wanted else 0.0
     file, stamped = _identity(decoder.path), []
     for pts, frame in decoder:
         # The memory of a reference picture counts in full, although the decoder also holds it.
         room -= sum(plane.buffer_size for plane in frame.planes)
         if room >= 0:
-            stamped.append((pts, frame))
+            # The first one states the orientation, which the copy does not.
+            stamped.append((pts, _in_used_memory(frame) if stamped else frame))
         else:
             stamped.clear()
         yield pts, frame
     if room >= 0:
         _shelf.pictures = Pictures(file, decoder.time_base, stamped)
+
+
+def _in_used_memory(frame: av.VideoFrame) -> av.VideoFrame:
+    """Return a copy of a picture in a block of released memory; the picture itself in a format that PyAV does not take
+    from arrays, or whose conversion uses facts that PyAV does not copy (10 bits: where the colour samples lie)."""
+    if len(frame.planes) != 3 or frame.interlaced_frame or frame.format.components[0].bits != 8:
+        return frame
+    ends = np.cumsum([plane.buffer_size for plane in frame.planes])
+    blocks = _shelf.blocks
+    if blocks and len(blocks[-1]) != ends[-1]:
+        blocks = _shelf.blocks = []
+    block = blocks.pop() if blocks else np.empty(ends[-1], np.uint8)
+    planes = []
+    for plane, part in zip(frame.planes, np.split(block, ends[:-1]), strict=True):
+        part[:] = np.frombuffer(memoryview(plane), np.uint8)
+        planes.append(part.reshape(plane.height, -1)[:, : plane.width])
+    try:
+        copy = av.VideoFrame.from_dlpack(planes, frame.format.name)
+    except (NotImplementedError, ValueError):  # odd sizes, and formats without a plane for each component
+        return frame
+    copy.colorspace, copy.color_range = frame.colorspace, frame.color_range
+    copy.color_trc, copy.color_primaries = frame.color_trc, frame.color_primaries
+    # The last array that the copy holds is freed with it.
+    weakref.finalize(planes[-1], _shelf.return_block, block).atexit = False
+    return copy
 
 
 def _identity(path: Path) -> tuple[object, ...]:

@@ -30,7 +30,7 @@ def cut_samples(samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int
             samples = cv2.copyMakeBorder(samples, 0, down, 0, right, cv2.BORDER_REPLICATE)
         size = samples.shape[1] // block, samples.shape[0] // block
         samples = cv2.resize(samples, size, interpolation=cv2.INTER_AREA)
-        matrix = coarser(block, block) @ square(matrix - [[0, 0, left], [0, 0, top]])
+        matrix = to_blocks(matrix - [[0, 0, left], [0, 0, top]], block, block)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(samples, matrix, size_px, flags=flags, borderValue=(border,) * 4)
 
@@ -39,17 +39,21 @@ def _needed(
     samples: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], block: int
 ) -> tuple[np.ndarray, int, int]:
     """The samples around the region, in whole blocks, and their first column and row."""
-    width, height = size_px
-    corners = matrix @ np.array([[0, width - 1, 0, width - 1], [0, 0, height - 1, height - 1], [1, 1, 1, 1]])
-    left, top = (max(math.floor(n / block - 1) * block, 0) for n in corners.min(axis=1).tolist())
-    right, bottom = (max(math.ceil(n / block + 2) * block, 0) for n in corners.max(axis=1).tolist())
-    return samples[top:bottom, left:right], left, top
+    (a, b, x), (c, d, y) = matrix.tolist()
+    right, down = size_px[0] - 1, size_px[1] - 1
+    ends = ((x, a * right, b * down), (y, c * right, d * down))
+    # An affine map has its extremes at the corners.
+    left, top = (max(math.floor((at + min(i, 0) + min(j, 0)) / block - 1) * block, 0) for at, i, j in ends)
+    last, lowest = (max(math.ceil((at + max(i, 0) + max(j, 0)) / block + 2) * block, 0) for at, i, j in ends)
+    return samples[top:lowest, left:last], left, top
 
 
-@functools.cache
-def coarser(x: int, y: int) -> np.ndarray:
-    """(2, 3) matrix from pixel centres to the centres of blocks of x by y of them; do not modify it."""
-    return np.array([[1 / x, 0.0, (1 / x - 1) / 2], [0.0, 1 / y, (1 / y - 1) / 2]])
+def to_blocks(matrix: np.ndarray, x: int, y: int) -> np.ndarray:
+    """A matrix (2, 3) to pixel centres, as one to the centres of blocks of x by y pixels."""
+    scale = np.array([1 / x, 1 / y])
+    out = matrix * scale[:, None]
+    out[:, 2] += (scale - 1) / 2
+    return out
 
 
 def square(matrix: np.ndarray) -> np.ndarray:

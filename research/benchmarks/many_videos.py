@@ -24,10 +24,16 @@ from pbl_pipeline.bench.detect_case import measure
 from pbl_pipeline.keypoints import METHODS, Keypoints
 from pbl_pipeline.resources import cores, shared_cores
 from pbl_pipeline.temporary import new_folder
+from pbl_pipeline.video import frames_kept
 from research.clip_keypoints import clip_keypoints
 
 #: Points that a detector is less sure of are not compared.
 SURE = 0.5
+
+
+def keep_frames() -> None:
+    """Keep pictures, and their memory from one video to the next, as a worker does until its process ends."""
+    frames_kept().__enter__()
 
 
 def frames_of(video: Path, method: str) -> int:
@@ -50,7 +56,7 @@ def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
 
 def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float]:
     """Return frames a second over all videos, and the seconds of the first round."""
-    with shared_cores(processes), ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+    with shared_cores(processes), ProcessPoolExecutor(processes, get_context("spawn"), keep_frames) as pool:
         begin = time.perf_counter()
         list(pool.map(frames_of, videos[:processes], [method] * processes))
         first = time.perf_counter() - begin

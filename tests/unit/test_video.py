@@ -765,6 +765,35 @@ def test_kept_pictures_are_those_of_the_file(monkeypatch: pytest.MonkeyPatch, vi
     assert decodes(monkeypatch, video)
 
 
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "copied"),
+    [("libx264", "yuv420p", 7), ("libx264", "yuv444p", 7), ("libx265", "yuv420p10le", 0)],
+)
+def test_pictures_in_memory_that_is_used_again_are_those_of_the_file(
+    tmp_path: Path, codec: str, pixel_format: str, copied: int
+) -> None:
+    # Pictures of a single colour would not show that samples are in another place.
+    noise = np.random.default_rng(0).integers(0, 256, (8, 122, 162, 3), np.uint8)
+    paths = [
+        write_video(tmp_path / f"{i}.mp4", noise[::step], constant_rate(8), codec, pixel_format=pixel_format)
+        for i, step in enumerate((1, -1))
+    ]
+    expected = [pictures(path) for path in paths]
+    with frames_kept():
+        probe(paths[0])
+        release_frames(memory=False)
+        blocks = list(kept._shelf.blocks)
+        assert len(blocks) == copied
+        for path, before in zip(paths, expected, strict=True):
+            probe(path)
+            assert not kept._shelf.blocks
+            for (_, _, image), (_, _, other) in zip(before, pictures(path), strict=True):
+                np.testing.assert_array_equal(image, other)
+        release_frames(memory=False)
+        assert {id(b) for b in kept._shelf.blocks} == {id(b) for b in blocks}
+    assert not kept._shelf.blocks
+
+
 def test_nothing_is_kept_unless_asked_for(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
     probe(video)
     assert decodes(monkeypatch, video)
