@@ -5,10 +5,10 @@ speed. So the force F (body weights) is a Gaussian process over the phase of dou
 
     F = m(speed, phase) + person(phase) + step(time),
 
-of which the motion shows y - 1 = gain S (F - 1) + noise: a fit smooths (S), and the noise is that of the camera's set of
-points. The result is the mean of the normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, eq. 2.25), and draws
-from it. Where the noise is small, y remains. A model's numbers are in `vertical_models`, made by
-`python -m research.vertical_force`.
+of which the motion shows y - 1 = gain S (F - 1) + noise: a fit smooths (S), and the noise is that of the camera's set
+of points. The result is the mean of the normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine
+Learning, eq. 2.25), and draws from it. Where the noise is small and nothing is smoothed, y remains. A model's numbers
+are in `vertical_models`, made by `python -m research.vertical_force`.
 """
 
 from __future__ import annotations
