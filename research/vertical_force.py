@@ -43,7 +43,8 @@ N_COMPONENTS = 20
 #: How long an error of a phone's force stays alike: its autocorrelation over the tuning clips of
 #: `research.benchmarks.kinetics_phone` falls to 0.6 in this time.
 ERROR_MEMORY_S = 0.02
-#: Chosen on tuning persons by the least error of the vertical force (docs/kinetics.md).
+#: Chosen by the least error of the vertical force of tuning persons, here and in `research.benchmarks.kinetics_phone`
+#: (docs/kinetics.md).
 CHOSEN = {
     "step_sd": 0.04,
     "step_memory_s": 0.06,
