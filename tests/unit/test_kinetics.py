@@ -496,6 +496,11 @@ def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed() -> Non
         np.testing.assert_array_equal(vertical(**changes), needed)
 
 
+@pytest.mark.parametrize("name", ["vertical-force-1", "vertical-force-2"])
+def test_the_models_of_stored_methods_stay(name: str) -> None:
+    assert load_vertical_model(name).name == name
+
+
 def test_a_force_unlike_that_of_healthy_people_survives() -> None:
     """A person whose force hardly changes, as few at that speed, keeps most of that."""
     found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, NOISE)
