@@ -50,7 +50,7 @@ class KineticsParams:
     varying_turns: float = 0.05  # fraction of the variance that varies over a walk, of joint angles
     varying_slides: float = 0.002  # the same of the position of the pelvis
     memory_s: float = 0.2  # correlation time of the error
-    vertical_model: str = "vertical-force-1"  # model of the vertical force of one camera (`load_vertical_model`)
+    vertical_model: str = "vertical-force-2"  # model of the vertical force of one camera (`load_vertical_model`)
 
 
 class Walk(Protocol):

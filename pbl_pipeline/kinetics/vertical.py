@@ -5,10 +5,10 @@ speed. So the force F (body weights) is a Gaussian process over the phase of dou
 
     F = m(speed, phase) + person(phase) + step(time),
 
-of which the motion shows y - 1 = gain (F - 1) + noise, with the noise of the camera's set of points. The result is the
-mean of the normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, eq. 2.25), and draws
-from it. Where the noise is small, y remains. A model's numbers are in `vertical_models`, made by
-`python -m research.vertical_force`.
+of which the motion shows y - 1 = gain S (F - 1) + noise: a fit smooths (S), and the noise is that of the camera's set
+of points. The result is the mean of the normal posterior (Rasmussen & Williams 2006, Gaussian Processes for Machine
+Learning, eq. 2.25), and draws from it. Where the noise is small and nothing is smoothed, y remains. A model's numbers
+are in `vertical_models`, made by `python -m research.vertical_force`.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ _PART = 1500
 
 
 class Noise(NamedTuple):
-    """Error of the force that a motion of one camera needs: its standard deviation (body weights) and gain, and by how
-    much more than the posterior's standard deviation known walks were off (`widening`)."""
+    """Error of the force that a motion of one camera needs: its standard deviation (body weights) and gain, by how
+    much more than the posterior's standard deviation known walks were off (`widening`), and the standard deviation of
+    the Gaussian over time with which the fit smooths."""
 
     sd: float
     gain: float
     widening: float
+    smoothing_s: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)  # a model is itself alone, so that results of one can be kept
@@ -99,20 +101,22 @@ class VerticalForce:
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """A stretch of known phase: its frames, in each the weights of the model's knots and the components of persons, the
-    covariance of the prior, and the factor of the observed frames' covariance."""
+    """A stretch of known phase: its frames, in each the weights of the model's knots and the components of persons;
+    what the motion shows of the force in the observed frames, its covariance with the force, and the factor of that of
+    the observed frames."""
 
     at: slice
     model: VerticalModel
     noise: Noise
     knots: np.ndarray
     person: np.ndarray
-    prior: np.ndarray
+    shows: np.ndarray
+    shared: np.ndarray
     factor: Any
 
     def update(self, observed: np.ndarray) -> np.ndarray:
         """Return the update of the force by observations (of departures from their expectation)."""
-        return self.noise.gain * self.prior[:, ::_EVERY] @ cho_solve(self.factor, observed)
+        return self.shared @ cho_solve(self.factor, observed)
 
     def departure(self, rng: np.random.Generator) -> np.ndarray:
         """Draw force and noise of the prior; what the update makes of them is as far off as the posterior is
@@ -121,7 +125,7 @@ class _Part:
         force = self.person @ rng.standard_normal(self.person.shape[1])
         force += m.step_sd * _alike(rng, n, m.step_memory_s)
         noise = self.noise.sd * _alike(rng, n, m.noise_memory_s)[::_EVERY]
-        return self.noise.widening * (force - self.update(self.noise.gain * force[::_EVERY] + noise))
+        return self.noise.widening * (force - self.update(self.shows @ force + noise))
 
 
 @functools.cache
@@ -179,7 +183,7 @@ def vertical_force(
     mean, parts = np.array(needed_bw, float), _parts(np.asarray(stands, bool).tobytes(), model, noise)
     for part in parts:
         expected = part.knots @ model.expected(speed)
-        mean[part.at] = expected + part.update((needed_bw[part.at] - 1.0 - noise.gain * (expected - 1.0))[::_EVERY])
+        mean[part.at] = expected + part.update(needed_bw[part.at][::_EVERY] - 1.0 - part.shows @ (expected - 1.0))
     return VerticalForce(mean, parts)
 
 
@@ -198,9 +202,12 @@ def _part(at: slice, phase: np.ndarray, model: VerticalModel, noise: Noise) -> _
     n, knots = len(phase), _rows(phase, model.phase)
     person = knots @ model.person
     prior = person @ person.T + model.step_sd**2 * _kernel(n, model.step_memory_s)
+    smooth = _kernel(n, noise.smoothing_s)
+    shows = noise.gain * (smooth / smooth.sum(axis=1, keepdims=True))[::_EVERY]
     own = noise.sd**2 * _kernel(n, model.noise_memory_s) + 1e-9 * np.eye(n)
-    factor = cho_factor((noise.gain**2 * prior + own)[::_EVERY, ::_EVERY])
-    return _Part(at, model, noise, knots, person, prior, factor)
+    shared = prior @ shows.T
+    factor = cho_factor(shows @ shared + own[::_EVERY, ::_EVERY])
+    return _Part(at, model, noise, knots, person, shows, shared, factor)
 
 
 def _rows(phase: np.ndarray, knots: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.interpolate import make_interp_spline
+from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import SCALE_NAMES, load_body, stature_m
 from pbl_pipeline.cli.gait import gait as gait_command
@@ -44,6 +45,8 @@ from pbl_pipeline.names import check_mass
 from pbl_pipeline.report import write_report
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Visit, load_kinetics, save_kinetics
+from research.benchmarks.kinetics_phone import vertical_rms
+from research.corpus.walks import Walk
 from tests import not_none
 from tests.walking_fit import walking_fit
 
@@ -453,7 +456,7 @@ def levels(sd: float) -> VerticalModel:
 
 
 def test_the_posterior_of_a_constant_is_the_closed_form() -> None:
-    sd, noise, m = 0.1, Noise(0.3, 0.8, 1.0), N // 3
+    sd, noise, m = 0.1, Noise(0.3, 0.8, 1.0, 1e-3), N // 3
     found = vertical_force(np.full(N, 1.2), steps(), SPEED, levels(sd), noise)
     kept = noise.gain**2 * sd**2 * m / (noise.gain**2 * sd**2 * m + noise.sd**2)
     np.testing.assert_allclose(found.mean, 1.0 + kept * 0.2 / noise.gain, atol=1e-6)
@@ -466,7 +469,7 @@ def test_the_posterior_of_a_constant_is_the_closed_form() -> None:
 def test_what_is_certain_stays() -> None:
     usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
     needed = usual + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
-    found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0))
+    found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0, 1e-3))
     np.testing.assert_allclose(found.mean[::3], needed[::3], atol=1e-3)
     assert np.sqrt(np.mean((found.mean - needed) ** 2)) < 0.02
     assert np.abs(found.draw(np.random.default_rng(0)) - found.mean)[::3].max() < 0.001
@@ -493,6 +496,11 @@ def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed() -> Non
         np.testing.assert_array_equal(vertical(**changes), needed)
 
 
+@pytest.mark.parametrize("name", ["vertical-force-1", "vertical-force-2"])
+def test_the_models_of_stored_methods_stay(name: str) -> None:
+    assert load_vertical_model(name).name == name
+
+
 def test_a_force_unlike_that_of_healthy_people_survives() -> None:
     """A person whose force hardly changes, as few at that speed, keeps most of that."""
     found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, NOISE)
@@ -500,11 +508,37 @@ def test_a_force_unlike_that_of_healthy_people_survives() -> None:
     assert np.std(found.mean) < 0.4 * np.std(usual)
 
 
+def test_a_push_off_unlike_that_of_the_persons_of_the_model_survives() -> None:
+    phase = support_phase(steps())
+    usual = np.interp(phase, SHIPPED.phase, SHIPPED.expected(SPEED))
+    lower = -0.2 * np.exp(-0.5 * ((phase - 1.85) / 0.12) ** 2)
+    smoothed = gaussian_filter1d(usual + lower - 1.0, 100 * NOISE.smoothing_s)
+    found = vertical_force(1.0 + NOISE.gain * smoothed, steps(), SPEED, SHIPPED, NOISE)
+    assert np.sum(lower * (found.mean - usual)) > 0.7 * np.sum(lower**2)
+
+
+def test_the_smoothing_of_a_fit_is_undone() -> None:
+    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
+    sharp = usual + 0.1 * np.sin(2 * np.pi * np.arange(N) / 20)  # 5 Hz
+    known = Noise(3e-3, 0.9, 1.0, 0.03)
+    needed = 1.0 + known.gain * gaussian_filter1d(sharp - 1.0, 100 * known.smoothing_s)
+    found = vertical_force(needed, steps(), SPEED, SHIPPED, known)
+    assert np.std(found.mean - sharp) < 0.2 * np.std(needed - sharp)
+
+
 def test_noise_is_weighed_against_people() -> None:
     usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
     off = np.repeat(np.random.default_rng(1).normal(0.0, NOISE.sd, N // 6), 6)
     found = vertical_force(1.0 + NOISE.gain * (usual - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
     assert np.std(found.mean - usual) < 0.7 * np.std(off)
+
+
+def test_the_benchmark_compares_only_times_that_the_phone_saw(walk: TrialFit) -> None:
+    exact = dataclasses.replace(walk, qpos_sd=np.full_like(walk.qpos, np.nan))
+    per_frame = {n: np.asarray(getattr(exact, n))[:160] for n in ("time_s", "qpos", "qpos_sd")}
+    events = gait_metrics([walk]).trials[0].events.events
+    known = Walk("a", "synthetic", "healthy", 0.0, walk.time_s, walk.qpos, walk.scale, events)
+    assert vertical_rms(known, dataclasses.replace(exact, **per_frame), exact) < 3.0
 
 
 def test_where_no_foot_stands_the_force_is_as_it_was() -> None:
