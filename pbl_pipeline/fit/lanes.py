@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
-from .problem import Problem, State, power_of_2
+from .problem import Problem, State
 from .solution import Outcome, outcome
 from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
@@ -31,8 +31,8 @@ from .weights import Weights
 LANES, FEW = 32, 8
 #: Most frames of all lanes together, which bounds the memory.
 MOST_FRAMES = 32768
-#: Most frames of all problems that are held on the device, those that wait for a lane among them.
-HELD_FRAMES = 131072
+#: Problems held on the device for each lane: one size, for few programs.
+HELD = 4
 #: Iterations between two looks at which have ended: a lane that has ended idles until the next one.
 ROUND = 2
 
@@ -104,12 +104,11 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
     """
     frames = given[0][0].weight.shape[0]
     n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // frames))
-    held = max(n, HELD_FRAMES // frames)
-    if len(given) > held:
-        parts = [given[i : i + held] for i in range(0, len(given), held)]
+    size = HELD * n
+    if len(given) > size:
+        parts = [given[i : i + size] for i in range(0, len(given), size)]
         return [found for part in parts for found in fit_many(body, part, w, limits, last)]
-    # Stacked on the host, so that each array goes to the device once; as many rows as a power of 2, for few programs.
-    size = max(n, power_of_2(len(given)))
+    # Stacked on the host, so that each array goes to the device once.
     rows = [*given, *[given[-1]] * (size - len(given))]
     held_there = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
     waiting = iter(range(len(given)))

@@ -185,8 +185,9 @@ def pad_markers(n: int) -> int:
 
 
 def pad_trials(n: int, coarse: bool = False) -> int:
-    """The size to which `n` trials are padded: a power of 2."""
-    return max(COARSE_TRIALS if coarse else 1, power_of_2(n))
+    """The size to which `n` trials are padded: a power of 2. One stays one: three more would double the unknowns that
+    its frames share where the paramset has a detector's errors for each."""
+    return max(COARSE_TRIALS if coarse and n > 1 else 1, power_of_2(n))
 
 
 def power_of_2(n: int) -> int:

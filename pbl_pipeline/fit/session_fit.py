@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -35,8 +36,8 @@ from .solution import Solution
 from .vertical import upright
 
 #: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
-#: packed meanwhile.
-BATCH = 128
+#: packed meanwhile. The first ones are fewer, so that the device begins early.
+BATCH, FIRST = 128, 32
 #: Batches that are solved at a time on a GPU: while the host works on one, the device iterates the other.
 SOLVERS = 2
 #: Threads that pack sessions and make their results: numpy's larger steps run in parallel.
@@ -164,8 +165,8 @@ def _batches(
             return error
         return _Packed(i, session, start_of(session), time.perf_counter() - begin)
 
-    for first in range(0, len(sessions), batch):
-        some = range(first, min(first + batch, len(sessions)))
+    given, full = iter(range(len(sessions))), min(batch, FIRST)
+    while some := list(itertools.islice(given, full)):
         for i, packed in zip(some, threads.map(pack, some), strict=True):
             if isinstance(packed, PblError):
                 out[i] = packed
@@ -174,8 +175,9 @@ def _batches(
             shapes = tuple(a.shape for a in jax.tree.leaves(problem))
             key = (shapes, pixels_alone(problem), type(packed.session.trials[0]))
             waiting.setdefault(key, []).append(packed)
-            if len(waiting[key]) == batch:
+            if len(waiting[key]) == full:
                 yield waiting.pop(key)
+        full = min(batch, 2 * full)
     yield from waiting.values()
 
 
