@@ -171,7 +171,7 @@ def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, ite
     return jax.vmap(more)(p, at)
 
 
-@functools.partial(jax.jit, static_argnames="body")
+@functools.partial(jax.jit, static_argnames="body", donate_argnames="lanes")
 def _exchange(
     body: Body, w: Weights, lanes: _Lanes, ended: _Lanes, held: tuple[Problem, State], slot: Any, row: Any
 ) -> tuple[_Lanes, _Lanes]:

@@ -115,12 +115,7 @@ def body_metres(
     for points, confidence in zip(x_cam, c, strict=True):
         weight = np.where(confidence[:, 0, trunk] > 0, 1.0, 0.0)
         enough = weight.sum(axis=1) >= 3
-        weight, alike = weight[enough], bool(weight.all())  # mostly all points are seen: one row for all frames
-        seen, own = (
-            _spread(points[enough, 0][:, trunk], weight),
-            _spread(template[None], weight[:1] if alike else weight),
-        )
-        own = np.broadcast_to(own, seen.shape)
+        seen, own = (_spread(x, weight[enough]) for x in (points[enough, 0][:, trunk], template[None]))
         ratios.append(own[seen > 0] / seen[seen > 0])
     found = np.concatenate(ratios)
     return float(np.median(found)) if len(found) else 1.0
