@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -97,8 +97,10 @@ def _wanted(finished: Callable[..., Any], p: Problem, end: Progress, last: bool)
     return (kept, None, *finished(p, end.latest, end.state.R_nc)) if last else (kept, end.latest.x)
 
 
-def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool) -> list[Found]:
-    """Fit problems of the same sizes from their starts, in their order: see `Found`.
+def fit_many(
+    body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool
+) -> Iterator[Found]:
+    """Fit problems of the same sizes from their starts: see `Found`, in their order, while the device fits the others.
 
     The result does not depend on which problems are given together beyond rounding.
     """
@@ -106,8 +108,9 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
     n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // frames))
     size = HELD * n
     if len(given) > size:
-        parts = [given[i : i + size] for i in range(0, len(given), size)]
-        return [found for part in parts for found in fit_many(body, part, w, limits, last)]
+        for i in range(0, len(given), size):
+            yield from fit_many(body, given[i : i + size], w, limits, last)
+        return
     # Stacked on the host, so that each array goes to the device once.
     rows = [*given, *[given[-1]] * (size - len(given))]
     held_there = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
@@ -115,23 +118,25 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
     holds = [next(waiting, None) for _ in range(n)]
     lanes, ended = (_begin(body, w, held_there, np.arange(n) % len(given)) for _ in range(2))
     slots = list[int]()  # which problem each slot of `ended` holds
-    found: dict[int, Found] = {}
+    found, due = dict[int, Found](), list(range(len(given)))[::-1]
     to_fetch: list[tuple[list[int], tuple[Any, ...]]] = []
 
     def take_ended() -> None:
         to_fetch.append((slots.copy(), _wanted(_finish_many, *ended, last)))
         slots.clear()
 
-    def fetch_ended() -> None:
+    def fetched() -> Iterator[Found]:
         for problems, wanted in to_fetch:
             here = jax.device_get(wanted)
             found.update({i: Found(*jax.tree.map(lambda a, k=k: a[k], here)) for k, i in enumerate(problems)})
         to_fetch.clear()
+        while due and due[-1] in found:
+            yield found.pop(due.pop())
 
     most = min(int(limits.iterations), MOST_ITERATIONS)
     while any(i is not None for i in holds):
         lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits, ROUND)
-        fetch_ended()  # while the device iterates
+        yield from fetched()  # while the device iterates
         result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
         over = [k for k, i in enumerate(holds) if i is not None and (result[k] != Result.BOUND or iteration[k] >= most)]
         if over:
@@ -149,8 +154,7 @@ def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, lim
             at = (busy * FEW)[:FEW]
             lanes, holds = _some(lanes, np.asarray(at)), [holds[i] for i in busy] + [None] * (FEW - len(busy))
     take_ended()
-    fetch_ended()
-    return [found[i] for i in range(len(given))]
+    yield from fetched()
 
 
 @functools.partial(jax.jit, static_argnames="body")

@@ -8,7 +8,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -107,6 +107,7 @@ def fit_sessions(
     solvers, most = (1, 1) if jax.default_backend() == "cpu" else (SOLVERS, BATCH)
     batch, taking = batch or most, threading.Lock()
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
+    results: list[Future[None]] = []
 
     def finish(packed: _Packed, solution: Solution | PblError) -> None:
         try:
@@ -123,7 +124,8 @@ def fit_sessions(
             if part is None:
                 return
             solutions = method.function([p.session for p in part], method.params, [p.start for p in part])
-            list(threads.map(finish, part, solutions))  # raises what was raised there
+            for each in zip(part, solutions, strict=True):
+                results.append(threads.submit(finish, *each))
 
     # While batches are solved, the results of earlier ones are made and the next one is packed.
     with (
@@ -131,7 +133,9 @@ def fit_sessions(
         contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
         ThreadPoolExecutor(solvers) as pool,
     ):
-        list(pool.map(solve, [parts] * solvers))
+        list(pool.map(solve, [parts] * solvers))  # raises what was raised there
+        for result in results:
+            result.result()
     return [r for r in out if r is not None]
 
 
