@@ -128,7 +128,9 @@ def fit_many(
     def fetched() -> Iterator[Found]:
         for problems, wanted in to_fetch:
             here = jax.device_get(wanted)
-            found.update({i: Found(*jax.tree.map(lambda a, k=k: a[k], here)) for k, i in enumerate(problems)})
+            for k, i in enumerate(problems):
+                parts: tuple[Any, ...] = jax.tree.map(lambda a, k=k: a[k], here)
+                found[i] = Found(*parts)
         to_fetch.clear()
         while due and due[-1] in found:
             yield found.pop(due.pop())
@@ -138,14 +140,15 @@ def fit_many(
         lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits, ROUND)
         yield from fetched()  # while the device iterates
         result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
-        over = [k for k, i in enumerate(holds) if i is not None and (result[k] != Result.BOUND or iteration[k] >= most)]
+        ends = (result != Result.BOUND) | (iteration >= most)
+        over = [(k, i) for k, i in enumerate(holds) if i is not None and ends[k]]
         if over:
             if len(slots) + len(over) > n:
                 take_ended()
             slot, row = np.full(len(holds), n), np.full(len(holds), size)  # beyond the end: a lane stays
-            for k in over:
+            for k, i in over:
                 slot[k] = len(slots)
-                slots.append(holds[k])
+                slots.append(i)
                 holds[k] = following = next(waiting, None)
                 row[k] = size if following is None else following
             lanes, ended = _exchange(body, w, lanes, ended, held_there, slot, row)

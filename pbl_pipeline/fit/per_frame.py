@@ -67,7 +67,7 @@ def solve_per_frame(
         if params.weight_pelvis > 0:
             states = [f.end.state for f in first]
             each = zip(sessions, problems, states, strict=True)
-            problems = [with_augmented_pelvis(s, p, x.qpos, scale_multipliers(x.s)) for s, p, x in each]
+            problems = [with_augmented_pelvis(s, p, x.qpos, np.asarray(scale_multipliers(x.s))) for s, p, x in each]
             told = [np.asarray(p.c_pelvis) for p in problems]
         found = solve(sessions, problems, starts, last=True)
     body = sessions[0].body
