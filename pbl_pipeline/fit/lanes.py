@@ -113,24 +113,23 @@ def fit_many(
         return
     # Stacked on the host, so that each array goes to the device once.
     rows = [*given, *[given[-1]] * (size - len(given))]
-    held_there = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
+    held = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
     waiting = iter(range(len(given)))
     holds = [next(waiting, None) for _ in range(n)]
-    lanes, ended = (_begin(body, w, held_there, np.arange(n) % len(given)) for _ in range(2))
+    lanes, ended = (_begin(body, w, held, np.arange(n) % len(given)) for _ in range(2))
     slots = list[int]()  # which problem each slot of `ended` holds
     found, due = dict[int, Found](), list(range(len(given)))[::-1]
     to_fetch: list[tuple[list[int], tuple[Any, ...]]] = []
 
     def take_ended() -> None:
-        to_fetch.append((slots.copy(), _wanted(_finish_many, *ended, last)))
+        to_fetch.append((slots.copy(), _wanted(_finish_many, ended[0], ended[1], last)))
         slots.clear()
 
     def fetched() -> Iterator[Found]:
         for problems, wanted in to_fetch:
             here = jax.device_get(wanted)
             for k, i in enumerate(problems):
-                parts: tuple[Any, ...] = jax.tree.map(lambda a, k=k: a[k], here)
-                found[i] = Found(*parts)
+                found[i] = Found(*jax.tree.map(lambda a, k=k: a[k], here))
         to_fetch.clear()
         while due and due[-1] in found:
             yield found.pop(due.pop())
@@ -151,7 +150,7 @@ def fit_many(
                 slots.append(i)
                 holds[k] = following = next(waiting, None)
                 row[k] = size if following is None else following
-            lanes, ended = _exchange(body, w, lanes, ended, held_there, slot, row)
+            lanes, ended = _exchange(body, w, lanes, ended, held, slot, row)
         busy = [lane for lane, i in enumerate(holds) if i is not None]
         if 0 < len(busy) <= FEW < len(holds):  # a lane is empty only where none waits
             at = (busy * FEW)[:FEW]
