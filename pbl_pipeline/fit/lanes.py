@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
-from .problem import Problem, State
+from .problem import Problem, State, power_of_2
 from .solution import Outcome, outcome
 from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
@@ -31,7 +31,7 @@ from .weights import Weights
 LANES, FEW = 32, 8
 #: Most frames of all lanes together, which bounds the memory.
 MOST_FRAMES = 32768
-#: Problems held on the device for each lane: one size, for few programs.
+#: Most problems held on the device for each lane; their number is padded to a power of 2, for few programs.
 HELD = 4
 #: Iterations between two looks at which have ended: a lane that has ended idles until the next one.
 ROUND = 2
@@ -106,11 +106,11 @@ def fit_many(
     """
     frames = given[0][0].weight.shape[0]
     n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // frames))
-    size = HELD * n
-    if len(given) > size:
-        for i in range(0, len(given), size):
-            yield from fit_many(body, given[i : i + size], w, limits, last)
+    if len(given) > HELD * n:
+        for i in range(0, len(given), HELD * n):
+            yield from fit_many(body, given[i : i + HELD * n], w, limits, last)
         return
+    size = min(HELD * n, max(n, power_of_2(len(given))))
     # Stacked on the host, so that each array goes to the device once.
     rows = [*given, *[given[-1]] * (size - len(given))]
     held = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
