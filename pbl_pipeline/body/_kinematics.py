@@ -122,8 +122,7 @@ def marker_jacobian(
 def scale_multipliers(s: Float[Array, "*n S"]) -> Float[Array, "*n S"]:
     """Multipliers of the scale groups from the paper's parameters, which add to 1: 1 + overall for the first group
     ("overall"), 1 + overall + own for the others."""
-    overall = s[..., :1]
-    return 1.0 + overall + jnp.concatenate([jnp.zeros_like(overall), s[..., 1:]], axis=-1)
+    return 1.0 + s[..., :1] + s * (np.arange(s.shape[-1]) > 0)  # of numpy's arrays on the host
 
 
 def scaled_body_pos(body: Body, scale: Float[Array, " S"]) -> Float[Array, "B 3"]:

@@ -66,6 +66,13 @@ def check_fit(
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
 
+def _median(values: np.ndarray) -> np.ndarray:
+    """Median of finite values along their first axis, in half of the time of numpy's, which looks for NaN as well."""
+    half = len(values) // 2
+    parted = np.partition(values, half, axis=0)
+    return parted[half] if len(values) % 2 else 0.5 * (parted[:half].max(axis=0) + parted[half])
+
+
 def _grade(value: float, warn: float, fail: float) -> str:
     return FAIL if not value < fail else WARN if value > warn else PASS
 
@@ -75,9 +82,9 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
     for arrays, trial in zip(session.arrays, trials, strict=True):
         seen = (arrays.c_2d > 0) & arrays.used[:, None, None]
         y = np.where(seen, arrays.xy_px[..., 1], np.nan)[seen.any(axis=-1)]
-        height = np.median(np.nanmax(y, axis=-1) - np.nanmin(y, axis=-1))
+        height = np.median(np.fmax.reduce(y, axis=-1) - np.fmin.reduce(y, axis=-1))
         residual = trial.residual_2d_px
-        shares.append(np.median(residual[np.isfinite(residual)]) / height)
+        shares.append(_median(residual[np.isfinite(residual)]) / height)
     value = float(np.max(shares))
     return Check(
         "residual_2d_share_of_body_height",
@@ -91,9 +98,8 @@ def _residual_2d(session: Session, trials: Sequence[TrialFit]) -> Check:
 def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> Check:
     """Check the 3D residual in centimetres of the fit, which are the same for small and tall people."""
     counts = np.asarray(session.markers.weight_3d) > 0
-    medians = [
-        100 * np.median(r[np.isfinite(r)]) / metre for t in trials if np.isfinite(r := t.residual_3d_m[:, counts]).any()
-    ]
+    each = [t.residual_3d_m if counts.all() else t.residual_3d_m[:, counts] for t in trials]
+    medians = [100 * _median(seen) / metre for r in each if (seen := r[np.isfinite(r)]).size]
     if not medians:
         # Pixels alone: nothing to compare with.
         return Check("residual_3d_cm", PASS, None, RESIDUAL_3D_WARN_CM, "")
@@ -248,7 +254,7 @@ def _observed(trials: Sequence[TrialFit]) -> Check:
     names = trials[0].joint_names
     turns = np.array([n not in SLIDES for n in names])
     known = [np.isfinite(t.qpos_sd).all(axis=1) for t in trials]
-    sd = np.rad2deg(np.max([np.median(t.qpos_sd[k], axis=0) for t, k in zip(trials, known, strict=True)], axis=0))
+    sd = np.rad2deg(np.max([_median(t.qpos_sd[k]) for t, k in zip(trials, known, strict=True)], axis=0))
     unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
     advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}"
     return warn_if(unseen, "joints_not_observed", float(len(unseen)), 0.0, advice)

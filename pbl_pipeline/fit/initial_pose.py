@@ -16,7 +16,7 @@ from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body, MarkerSet
 
 from .problem import TrialArrays
 from .session import Session
-from .standing import bodies_at, marker_places, standing_markers, trunk_of
+from .standing import SETS, bodies_at, marker_places, standing_markers, trunk_of
 
 #: Joint angles (deg) of the start beside the standing pose: bent a little, away from limits and from straight limbs.
 BENT_DEG = {"knee_angle": -10.0, "elbow_flex": 20.0, "pro_sup": 45.0, "hip_flexion": 5.0}
@@ -33,8 +33,6 @@ ARM_DEG = {
 #: A posture is accepted if the mean distance (m) of an arm's points from it is less than from hanging by the first at
 #: least, and below the second, which the walks of the tests do not reach on a body that faces the wrong way.
 NEARER_M, FURTHEST_M = 0.10, 0.15
-#: Number of marker sets whose places in the postures are cached.
-SETS = 8
 #: The body is placed, and its arms are compared, every so many frames, and interpolated.
 PLACED_EVERY, ARMS_EVERY = 3, 15
 
@@ -123,7 +121,7 @@ def world_points(arrays: TrialArrays) -> tuple[np.ndarray, np.ndarray]:
     """World positions (T, J, 3) in m and confidences (T, J) of the observed points, whatever the kind of trial."""
     if np.any(arrays.c_world > 0):
         return arrays.x_world, arrays.c_world
-    v = int(np.argmax(np.sum(arrays.c_3d, axis=(0, 2))))
+    v = int(np.argmax(np.sum(arrays.c_3d, axis=(0, 2)))) if arrays.c_3d.shape[1] > 1 else 0
     if np.any(arrays.c_3d[:, v] > 0):
         c = arrays.c_3d[:, v]
         root = root_positions(

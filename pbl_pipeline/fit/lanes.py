@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
-from .problem import Problem, State
+from .problem import Problem, State, power_of_2
 from .solution import Outcome, outcome
 from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
@@ -31,8 +31,10 @@ from .weights import Weights
 LANES, FEW = 32, 8
 #: Most frames of all lanes together, which bounds the memory.
 MOST_FRAMES = 32768
-#: Iterations between two looks at which have ended.
-ROUND = 4
+#: Most problems held on the device for each lane; their number is padded to a power of 2, for few programs.
+HELD = 4
+#: Iterations between two looks at which have ended: a lane that has ended idles until the next one.
+ROUND = 2
 
 #: Problems and where each stands.
 _Lanes = tuple[Problem, Progress]
@@ -84,83 +86,109 @@ _finish_one = jax.jit(finish)
 _finish_many = jax.jit(jax.vmap(finish))
 
 
-def fetch(p: Problem, end: Progress, last: bool, several: bool = False) -> Found:
-    """Fetch the end of an iteration to the host; with `several` lanes arrays have a further first axis."""
-    rest = (_finish_many if several else _finish_one)(p, end.latest, end.state.R_nc) if last else ()
+def fetch(p: Problem, end: Progress, last: bool) -> Found:
+    """Fetch the end of an iteration to the host."""
+    return Found(*jax.device_get(_wanted(_finish_one, p, end, last)))
+
+
+def _wanted(finished: Callable[..., Any], p: Problem, end: Progress, last: bool) -> tuple[Any, ...]:
+    """The fields of `Found`, still on the device."""
     kept = dataclasses.replace(end, latest=None, candidate=None, direction=None)
-    return Found(*jax.device_get((kept, None if last else end.latest.x, *rest)))
+    return (kept, None, *finished(p, end.latest, end.state.R_nc)) if last else (kept, end.latest.x)
 
 
-def fit_many(body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool) -> list[Found]:
-    """Fit problems of the same sizes from their starts, in their order: see `fetch`.
+def fit_many(
+    body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool
+) -> Iterator[Found]:
+    """Fit problems of the same sizes from their starts: see `Found`, in their order, while the device fits the others.
 
     The result does not depend on which problems are given together beyond rounding.
     """
-    n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // given[0][0].weight.shape[0]))
+    frames = given[0][0].weight.shape[0]
+    n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // frames))
+    if len(given) > HELD * n:
+        for i in range(0, len(given), HELD * n):
+            yield from fit_many(body, given[i : i + HELD * n], w, limits, last)
+        return
+    size = min(HELD * n, max(n, power_of_2(len(given))))
+    # Stacked on the host, so that each array goes to the device once.
+    rows = [*given, *[given[-1]] * (size - len(given))]
+    held = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
     waiting = iter(range(len(given)))
     holds = [next(waiting, None) for _ in range(n)]
-    # Stacked on the host, so that each array goes to the device once; the last one stands in for those missing.
-    p, start = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *[given[-1 if i is None else i] for i in holds]))
-    lanes = p, _begin(body, p, w, start)
-    ended, slots = jax.tree.map(jnp.zeros_like, lanes), list[int]()  # which problem each slot of `ended` holds
-    found: dict[int, Found] = {}
+    lanes, ended = (_begin(body, w, held, np.arange(n) % len(given)) for _ in range(2))
+    slots = list[int]()  # which problem each slot of `ended` holds
+    found, due = dict[int, Found](), list(range(len(given)))[::-1]
+    to_fetch: list[tuple[list[int], tuple[Any, ...]]] = []
 
     def take_ended() -> None:
-        several = fetch(*ended, last=last, several=True)
-        parts = several.end, several.x, several.variance, several.outcome
-        found.update({i: Found(*jax.tree.map(lambda a, k=k: a[k], parts)) for k, i in enumerate(slots)})
+        to_fetch.append((slots.copy(), _wanted(_finish_many, ended[0], ended[1], last)))
         slots.clear()
+
+    def fetched() -> Iterator[Found]:
+        for problems, wanted in to_fetch:
+            here = jax.device_get(wanted)
+            for k, i in enumerate(problems):
+                found[i] = Found(*jax.tree.map(lambda a, k=k: a[k], here))
+        to_fetch.clear()
+        while due and due[-1] in found:
+            yield found.pop(due.pop())
 
     most = min(int(limits.iterations), MOST_ITERATIONS)
     while any(i is not None for i in holds):
-        lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits)
+        lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits, ROUND)
+        yield from fetched()  # while the device iterates
         result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
-        for lane, i in enumerate(holds):
-            if i is None or (result[lane] == Result.BOUND and iteration[lane] < most):
-                continue
-            ended = _move(ended, lanes, len(slots), lane)
-            slots.append(i)
-            holds[lane] = following = next(waiting, None)
-            if following is not None:
-                lanes = _put(body, w, lanes, given[following], lane)
-            if len(slots) == n:
+        ends = (result != Result.BOUND) | (iteration >= most)
+        over = [(k, i) for k, i in enumerate(holds) if i is not None and ends[k]]
+        if over:
+            if len(slots) + len(over) > n:
                 take_ended()
+            slot, row = np.full(len(holds), n), np.full(len(holds), size)  # beyond the end: a lane stays
+            for k, i in over:
+                slot[k] = len(slots)
+                slots.append(i)
+                holds[k] = following = next(waiting, None)
+                row[k] = size if following is None else following
+            lanes, ended = _exchange(body, w, lanes, ended, held, slot, row)
         busy = [lane for lane, i in enumerate(holds) if i is not None]
         if 0 < len(busy) <= FEW < len(holds):  # a lane is empty only where none waits
             at = (busy * FEW)[:FEW]
             lanes, holds = _some(lanes, np.asarray(at)), [holds[i] for i in busy] + [None] * (FEW - len(busy))
-    if slots:
-        take_ended()
-    return [found[i] for i in range(len(given))]
+    take_ended()
+    yield from fetched()
 
 
 @functools.partial(jax.jit, static_argnames="body")
-def _begin(body: Body, p: Problem, w: Weights, start: State) -> Progress:
-    return jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
+def _begin(body: Body, w: Weights, held: tuple[Problem, State], rows: Any) -> _Lanes:
+    """Some rows of the problems and starts, before their first iteration."""
+    p, start = _some(held, rows)
+    return p, jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
 
 
-@functools.partial(jax.jit, static_argnames="body")
-def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits) -> Progress:
-    """`ROUND` iterations more of each lane that has not ended."""
+@functools.partial(jax.jit, static_argnames="body", donate_argnames="at")
+def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, iterations: Any) -> Progress:
+    """Some iterations more of each lane that has not ended."""
 
     def more(p: Problem, at: Progress) -> Progress:
-        most = jnp.minimum(limits.iterations, at.iteration + ROUND)
+        most = jnp.minimum(limits.iterations, at.iteration + iterations)
         return fit_problem(body, p, w, at, dataclasses.replace(limits, iterations=most))
 
     return jax.vmap(more)(p, at)
 
 
-@functools.partial(jax.jit, donate_argnames="into")
-def _move(into: _Lanes, lanes: _Lanes, slot: Any, lane: Any) -> _Lanes:
-    return jax.tree.map(lambda a, b: a.at[slot].set(b[lane]), into, lanes)
-
-
 @functools.partial(jax.jit, static_argnames="body", donate_argnames="lanes")
-def _put(body: Body, w: Weights, lanes: _Lanes, given: tuple[Problem, State], lane: Any) -> _Lanes:
-    p, start = given
-    return jax.tree.map(lambda a, b: a.at[lane].set(b), lanes, (p, begin_of(body, p, w, start)))
+def _exchange(
+    body: Body, w: Weights, lanes: _Lanes, ended: _Lanes, held: tuple[Problem, State], slot: Any, row: Any
+) -> tuple[_Lanes, _Lanes]:
+    """Move each lane to its slot of `ended` and the problem of its row into it; where these lie beyond the end, it
+    stays."""
+    ended = jax.tree.map(lambda a, b: a.at[slot].set(b, mode="drop"), ended, lanes)
+    stays = row >= held[0].weight.shape[0]
+    among = lambda a, b: jnp.where(stays.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
+    return jax.tree.map(among, lanes, _begin(body, w, held, row)), ended
 
 
 @jax.jit
-def _some(lanes: _Lanes, at: Any) -> _Lanes:
-    return jax.tree.map(lambda a: a[at], lanes)
+def _some(rows: Any, at: Any) -> Any:
+    return jax.tree.map(lambda a: a[at], rows)

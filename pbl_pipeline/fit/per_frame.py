@@ -7,7 +7,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -40,8 +40,11 @@ STANDING_FRACTION, STANDING_M_PER_S, STANDING_S = 0.25, 0.2, 0.03
 BACKWARDS_FRACTION = 0.2
 
 
-def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]) -> list[Solution]:
-    """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device.
+def solve_per_frame(
+    sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]
+) -> Iterator[Solution]:
+    """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device,
+    which fits the others while the first solutions are taken.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
@@ -55,31 +58,48 @@ def solve_per_frame(sessions: Sequence[Session], params: GaussNewtonParams, star
     several = len(sessions) > 1  # then in lanes, also for a part of them: each way compiles other programs
     solve = functools.partial(_solve, params=params, several=several)
     starts = [_with_detector(s, params) for s in starts]
-    found = solve(sessions, [s.problem for s in sessions], starts, last=not twice)
-    again = [i for i, f in enumerate(found) if suspicious(sessions[i], f.end.state.qpos)]
-    if again:
-        part = [sessions[i] for i in again]
-        turned_starts = [_with_detector(start_of(s, flip=True), params) for s in part]
-        turned = solve(part, [s.problem for s in part], turned_starts, last=not twice)
-        for i, other in zip(again, turned, strict=True):
-            found[i] = min(found[i], other, key=lambda f: float(f.end.cost))
-    traces, told = [f.trace for f in found], [None] * len(found)
+    found = _facing(sessions, starts, params, functools.partial(solve, last=not twice))
+    traces, told = [np.zeros((0, 2))] * len(sessions), [None] * len(sessions)
     if twice:
-        problems, starts = zip(*map(_on_floor, sessions, found), strict=True)
+        first = list(found)
+        traces = [f.trace for f in first]
+        problems, starts = zip(*map(_on_floor, sessions, first), strict=True)
         if params.weight_pelvis > 0:
-            scales = scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found])))
-            each = zip(sessions, problems, [f.end.state.qpos for f in found], np.asarray(scales), strict=True)
-            problems = [with_augmented_pelvis(*e) for e in each]
+            states = [f.end.state for f in first]
+            each = zip(sessions, problems, states, strict=True)
+            problems = [with_augmented_pelvis(s, p, x.qpos, np.asarray(scale_multipliers(x.s))) for s, p, x in each]
             told = [np.asarray(p.c_pelvis) for p in problems]
         found = solve(sessions, problems, starts, last=True)
-        # The cost of the second one has a term more.
-        traces = [np.concatenate([t, f.trace + np.array([len(t), 0.0])]) for t, f in zip(traces, found, strict=True)]
-    n = len(sessions)
-    scales = np.asarray(scale_multipliers(jnp.asarray(np.stack([f.end.state.s for f in found]))), np.float64)
-    spent = (time.perf_counter() - begin) / n, (compile_seconds() - compiled) / n
-    body, each = sessions[0].body, zip(sessions, found, scales, traces, told, strict=True)
+    body = sessions[0].body
     spread = by_joint(body.joint_names, params.sd_factor, 1.0), floors_of(body, params.sd_floor)
-    return [_solution(session, spread, f, scale, trace, asked, *spent) for session, f, scale, trace, asked in each]
+    for i, (session, f) in enumerate(zip(sessions, found, strict=True)):
+        # The cost of the second one has a term more.
+        trace = np.concatenate([traces[i], f.trace + np.array([len(traces[i]), 0.0])])
+        spent = (time.perf_counter() - begin) / (i + 1), (compile_seconds() - compiled) / len(sessions)
+        yield _solution(session, spread, f, trace, told[i], *spent)
+
+
+def _facing(
+    sessions: Sequence[Session],
+    starts: Sequence[State],
+    params: GaussNewtonParams,
+    solve: Callable[[Sequence[Session], Sequence[Problem], Sequence[State]], Iterator[Found]],
+) -> Iterator[Found]:
+    """The first solution of each session or, from the first suspicious one on, the better of two."""
+    waiting: list[Found] = []
+    for session, f in zip(sessions, solve(sessions, [s.problem for s in sessions], starts), strict=True):
+        if waiting or suspicious(session, f.end.state.qpos):
+            waiting.append(f)
+        else:
+            yield f
+    rest = sessions[len(sessions) - len(waiting) :]
+    again = [i for i, f in enumerate(waiting) if suspicious(rest[i], f.end.state.qpos)]
+    if again:
+        part = [rest[i] for i in again]
+        turned = [_with_detector(start_of(s, flip=True), params) for s in part]
+        for i, other in zip(again, solve(part, [s.problem for s in part], turned), strict=True):
+            waiting[i] = min(waiting[i], other, key=lambda f: float(f.end.cost))
+    yield from waiting
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -134,15 +154,16 @@ def _solve(
     params: GaussNewtonParams,
     several: bool,
     last: bool,
-) -> list[Found]:
+) -> Iterator[Found]:
     body = sessions[0].body
     w = Weights.of(body, params, size_unseen=pixels_alone(sessions[0].problem))
     limits = limits_of(params)
     with one_blas_thread():
         if several:
-            return fit_many(body, list(zip(problems, starts, strict=True)), w, limits, last)
+            yield from fit_many(body, list(zip(problems, starts, strict=True)), w, limits, last)
+            return
         p, start = jax.device_put((problems[0], starts[0]))
-        return [fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), last)]
+        yield fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), last)
 
 
 def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
@@ -172,7 +193,6 @@ def _solution(
     session: Session,
     spread: tuple[np.ndarray, np.ndarray],
     found: Found,
-    scale: np.ndarray,
     trace: np.ndarray,
     pelvis_told: np.ndarray | None,
     seconds: float,
@@ -186,7 +206,7 @@ def _solution(
         qpos=state.qpos,
         R_nc=state.R_nc,
         s=state.s,
-        scale=scale,
+        scale=np.asarray(scale_multipliers(found.end.state.s), np.float64),
         site_offset_m=state.site_offset_m[: len(session.markers)],
         clock_s=state.clock_s[: len(session.arrays)],
         loss_trace=trace,

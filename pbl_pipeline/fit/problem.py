@@ -185,8 +185,9 @@ def pad_markers(n: int) -> int:
 
 
 def pad_trials(n: int, coarse: bool = False) -> int:
-    """The size to which `n` trials are padded: a power of 2."""
-    return max(COARSE_TRIALS if coarse else 1, power_of_2(n))
+    """The size to which `n` trials are padded: a power of 2. One stays one: three more would double the unknowns that
+    its frames share where the paramset has a detector's errors for each."""
+    return max(COARSE_TRIALS if coarse and n > 1 else 1, power_of_2(n))
 
 
 def power_of_2(n: int) -> int:
@@ -244,10 +245,9 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         return c * (t.used / per_view).reshape(-1, *[1] * (c.ndim - 1))
 
     quats, starts = _phone_samples(trials, n, coarse)
-    number = np.concatenate([np.full(len(t.time_s), i) for i, t in enumerate(trials)])
     soles = sum(name in body.body_names for name, _ in SOLES)
     arrays: dict[str, Any] = {
-        "weight_3d": np.pad(markers.weight_3d, (0, size - n_markers)),
+        "weight_3d": _padded(markers.weight_3d, size),
         "time_s": rows(lambda t: t.time_s - t.time_s[0]),
         "weight": rows(lambda t: t.used),
         "x_cam": rows(lambda t: t.x_cam, 2),
@@ -265,15 +265,24 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "contact": np.zeros((frames, soles)),
         "pelvis": np.zeros((frames, 2)),
         "c_pelvis": np.zeros(frames),
-        "has_phone": np.pad([float(t.phone_time_s is not None) for t in trials], (0, n - len(trials))),
-        "clock_sd_s": np.pad([np.nan_to_num(t.phone_clock_sd_s) for t in trials], (0, n - len(trials))),
+        "has_phone": _padded([float(t.phone_time_s is not None) for t in trials], n),
+        "clock_sd_s": _padded([0.0 if math.isnan(t.phone_clock_sd_s) else t.phone_clock_sd_s for t in trials], n),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,
         "sample_step_s": np.asarray(SAMPLE_S),
     }
     arrays = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
-    arrays["trial"] = np.pad(number, (0, frames - len(number)), mode="edge").astype(np.int32)
+    lengths = [len(t.time_s) for t in trials]
+    lengths[-1] += frames - sum(lengths)  # padding belongs to the last trial
+    arrays["trial"] = np.repeat(np.arange(len(trials), dtype=np.int32), lengths)
     return Problem(points=point_table(body, markers, size), **arrays)
+
+
+def _padded(values: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
+    """(n,): the values, then zeros."""
+    out = np.zeros(n, np.float32)
+    out[: len(values)] = values
+    return out
 
 
 def _matrix_of_cost(trial: TrialArrays) -> np.ndarray:

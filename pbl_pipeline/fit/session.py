@@ -183,7 +183,7 @@ def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:
 
 
 def _check_finite(name: str, seen: np.ndarray, points: np.ndarray) -> None:
-    if np.any(seen & ~_finite(points)):
+    if not np.isfinite(points).all() and np.any(seen & ~_finite(points)):
         raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
 
 
@@ -250,7 +250,8 @@ def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     seen = c > 0
     known = seen & _finite(trial.xyz_cam_m)
     xy, x_cam = np.array(trial.xy_px), np.array(trial.xyz_cam_m)
-    xy[~seen], x_cam[~known] = 0.0, 0.0
+    for x, known_there in ((xy, seen), (x_cam, known)):
+        x.reshape(-1, x.shape[-1])[np.flatnonzero(~known_there)] = 0.0
     return undistort_px(xy, trial.camera), c, x_cam, np.where(known, c, 0.0)
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -35,8 +36,8 @@ from .solution import Solution
 from .vertical import upright
 
 #: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
-#: packed meanwhile.
-BATCH = 128
+#: packed meanwhile. The first ones are fewer, so that the device begins early.
+BATCH, FIRST = 128, 32
 #: Batches that are solved at a time on a GPU: while the host works on one, the device iterates the other.
 SOLVERS = 2
 #: Threads that pack sessions and make their results: numpy's larger steps run in parallel.
@@ -106,6 +107,7 @@ def fit_sessions(
     solvers, most = (1, 1) if jax.default_backend() == "cpu" else (SOLVERS, BATCH)
     batch, taking = batch or most, threading.Lock()
     out: list[SessionFit | PblError | None] = [None] * len(sessions)
+    results: list[Future[None]] = []
 
     def finish(packed: _Packed, solution: Solution | PblError) -> None:
         try:
@@ -122,7 +124,8 @@ def fit_sessions(
             if part is None:
                 return
             solutions = method.function([p.session for p in part], method.params, [p.start for p in part])
-            list(threads.map(finish, part, solutions))  # raises what was raised there
+            for each in zip(part, solutions, strict=True):
+                results.append(threads.submit(finish, *each))
 
     # While batches are solved, the results of earlier ones are made and the next one is packed.
     with (
@@ -130,7 +133,9 @@ def fit_sessions(
         contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
         ThreadPoolExecutor(solvers) as pool,
     ):
-        list(pool.map(solve, [parts] * solvers))
+        list(pool.map(solve, [parts] * solvers))  # raises what was raised there
+        for result in results:
+            result.result()
     return [r for r in out if r is not None]
 
 
@@ -164,8 +169,8 @@ def _batches(
             return error
         return _Packed(i, session, start_of(session), time.perf_counter() - begin)
 
-    for first in range(0, len(sessions), batch):
-        some = range(first, min(first + batch, len(sessions)))
+    given, full = iter(range(len(sessions))), min(batch, FIRST)
+    while some := list(itertools.islice(given, full)):
         for i, packed in zip(some, threads.map(pack, some), strict=True):
             if isinstance(packed, PblError):
                 out[i] = packed
@@ -174,8 +179,9 @@ def _batches(
             shapes = tuple(a.shape for a in jax.tree.leaves(problem))
             key = (shapes, pixels_alone(problem), type(packed.session.trials[0]))
             waiting.setdefault(key, []).append(packed)
-            if len(waiting[key]) == batch:
+            if len(waiting[key]) == full:
                 yield waiting.pop(key)
+        full = min(batch, 2 * full)
     yield from waiting.values()
 
 

@@ -11,14 +11,18 @@ from pbl_pipeline.body import Body, MarkerSet, body_frames
 
 #: Bodies whose markers turn with the trunk; limbs would pull the heading towards where they swing.
 TRUNK = ("pelvis", "torso", "head", "humerus_r", "humerus_l")
+#: Number of marker sets for which these are kept.
+SETS = 8
 
 
+@functools.lru_cache(SETS)
 def trunk_of(markers: MarkerSet) -> Bool[np.ndarray, " J"]:
     """Markers of the trunk; all of a set that has fewer than three there."""
     trunk = np.array([b in TRUNK for b in markers.body_names])
     return trunk if trunk.sum() >= 3 else np.ones_like(trunk)
 
 
+@functools.lru_cache(SETS)
 def standing_markers(body: Body, markers: MarkerSet) -> np.ndarray:
     """(J, 3) of the unscaled standing body with its pelvis at the origin and unturned."""
     return marker_places(*_standing(body), markers)[0]

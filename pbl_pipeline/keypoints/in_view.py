@@ -45,7 +45,13 @@ class Visibility:
     seen: np.ndarray  # (T,) bool most points of the person were found
     whole: np.ndarray  # (T,) bool the whole person is in view (`whole_person_in_view`)
     counts: np.ndarray  # (T,) bool used by a fit: whole, or in a bridged gap
-    gaps: tuple[Gap, ...]  # between the first and the last frame with the whole person
+
+    @property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Gaps between the first and the last frame with the whole person."""
+        time, counts = self.time_s, self.counts
+        around = _around_gaps(self.whole)
+        return tuple(Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all())) for a, b in around)
 
     @property
     def whole_share(self) -> float:
@@ -94,8 +100,7 @@ def visibility(
     whole = whole_person_in_view(keypoints, min_confidence)
     seen = np.mean(keypoints.confidence > 0, axis=1) >= SEEN_SHARE
     counts = bridge_gaps(whole, time, max_gap_s) & ~blind_runs(seen, time, max_blind_s)
-    gaps = [Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all())) for a, b in _around_gaps(whole)]
-    return Visibility(time, seen, whole, counts, tuple(gaps))
+    return Visibility(time, seen, whole, counts)
 
 
 def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:
@@ -143,10 +148,9 @@ def _around_gaps(flags: np.ndarray) -> np.ndarray:
 
 def bridge_gaps(in_view: np.ndarray, time_s: np.ndarray, max_gap_s: float) -> np.ndarray:
     """Frames to use: those in view and those inside a gap between two of them that is shorter than `max_gap_s`."""
-    used = in_view.copy()
-    for a, b in _around_gaps(in_view):
-        if time_s[b] - time_s[a] < max_gap_s:
-            used[a:b] = True
+    used, around = in_view.copy(), _around_gaps(in_view)
+    for a, b in around[time_s[around[:, 1]] - time_s[around[:, 0]] < max_gap_s].tolist():
+        used[a:b] = True
     return used
 
 

@@ -5,6 +5,7 @@ that one program serves each kind of session.
 """
 
 import dataclasses
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -25,6 +26,7 @@ from pbl_pipeline.fit import (
     lanes,
     per_frame,
     problem,
+    session_fit,
 )
 from pbl_pipeline.fit.initial_pose import placed_poses
 from pbl_pipeline.fit.per_frame import by_joint, floors_of
@@ -292,6 +294,7 @@ def test_more_sessions_than_lanes_are_each_as_alone(walkers, one_by_one, monkeyp
     """Two lanes for five sessions: who ended makes room, and the last one moves to a program of one."""
     monkeypatch.setattr(lanes, "LANES", 2)
     monkeypatch.setattr(lanes, "FEW", 1)
+    monkeypatch.setattr(lanes, "HELD", 2)  # four on the device at a time
     together = fit_sessions([*walkers, *walkers[:2]], PARAMSET, batch=5)
     for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
         assert isinstance(fit, SessionFit)
@@ -336,6 +339,30 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
     found = fit_sessions([pixels, *walkers], PARAMSET, batch=8)
     assert asked == [["pixels"], [w.names[0] for w in walkers]]
     assert [e.code for e in found if isinstance(e, PblError)] == ["FIT_DIVERGED"] * 4
+
+
+def test_results_are_made_while_others_are_solved_and_the_first_batch_is_small(walkers, monkeypatch):
+    made, sizes, error = (
+        threading.Event(),
+        list[int](),
+        PblError("FIT_DIVERGED", found="-", expected="-", next_step="-"),
+    )
+
+    def solve(sessions, params, starts) -> Iterator[None]:
+        sizes.append(len(sessions))
+        for _ in sessions:
+            yield None
+            assert made.wait(60)
+
+    def result(*_: object) -> PblError:
+        made.set()
+        return error
+
+    monkeypatch.setattr(Method, "function", property(lambda _: solve))
+    monkeypatch.setattr(session_fit, "_session_fit", result)
+    monkeypatch.setattr(session_fit, "FIRST", 1)
+    assert fit_sessions([walkers[0]] * 8, PARAMSET, batch=4) == [error] * 8
+    assert sizes == [1, 2, 4, 1]
 
 
 # --- robustness ---

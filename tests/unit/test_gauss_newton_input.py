@@ -116,7 +116,8 @@ def test_each_bad_session_has_its_own_error(trial):
 
 
 @pytest.mark.parametrize(
-    ("frames", "trials", "samples", "sizes"), [(100, 1, 300, (256, 4, 2048)), (700, 5, 3000, (768, 8, 4096))]
+    ("frames", "trials", "samples", "sizes"),
+    [(100, 1, 300, (256, 1, 2048)), (100, 2, 300, (256, 4, 2048)), (700, 5, 3000, (768, 8, 4096))],
 )
 def test_a_gpu_is_given_few_sizes(frames, trials, samples, sizes):
     pads = problem.pad_frames, problem.pad_trials, problem.pad_samples
