@@ -10,6 +10,7 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import shutil
 from collections.abc import Iterator
@@ -37,6 +38,18 @@ _LEFT_OUT = {
     "machine": "starts services, fetches a gigabyte or needs two idle cores",
     "long": "takes tens of seconds for what few changes touch",
 }
+
+
+#: Modules and tests stay as long as the process: while they are loaded nothing is found among them, and after that they
+#: are not looked through again each time (`pytest_collection_finish`).
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect what is left of loading the tests once; from here on as usual, for what the tests make."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
