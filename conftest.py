@@ -21,6 +21,7 @@ import pytest
 
 from tests import SHARED
 from tests.database import installation, leave_nothing_of_the_developer
+from tests.remembered import remembered
 
 #: How to have what the browser tests need, "" on a machine that has it.
 _CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -90,6 +91,16 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         leave_nothing_of_the_developer(patch)
         # Where no test asks for a database, a command that wants one finds none running.
         patch.setenv("PBL_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def phases_predicted_once() -> Iterator[None]:
+    """The event network looks at each walk once: tests have few, and every report and export is of one."""
+    from pbl_pipeline.gait.events import phase
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(phase, "predict", remembered(phase.predict))
         yield
 
 
