@@ -41,13 +41,13 @@ _LEFT_OUT = {
 }
 
 
-#: Modules and tests stay as long as the process: while they are loaded nothing is found among them, and after that they
-#: are not looked through again each time (`pytest_collection_finish`).
+# Modules and tests live as long as the process: while they are loaded there is nothing to collect, and later they are
+# not searched again each time (`pytest_collection_finish`).
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Collect what is left of loading the tests once; from here on as usual, for what the tests make."""
+    """Clear up once after loading the tests; from here on as usual, for what the tests make."""
     gc.collect()
     gc.freeze()
     gc.enable()

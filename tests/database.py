@@ -63,10 +63,11 @@ def _visible(heading: Any) -> dict[str, Any]:
     """What `Heading.attributes` is, put together once for each heading and not at each look."""
     if heading._attributes is None:
         heading._init_from_database()
+    own: dict[str, Any] = vars(heading)["_attributes"]
     of, found = getattr(heading, "_seen", (None, {}))
-    if of is not heading._attributes:
-        found = {name: a for name, a in heading._attributes.items() if not a.is_hidden}
-        heading._seen = heading._attributes, found
+    if of is not own:
+        found = {name: a for name, a in own.items() if not a.is_hidden}
+        heading._seen = own, found
     return found
 
 

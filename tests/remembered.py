@@ -5,11 +5,12 @@ import pickle
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-P, T = ParamSpec("P"), TypeVar("T")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def remembered(function: Callable[P, T]) -> Callable[P, T]:
-    """The function, called once in this process for arguments that are equal; each caller has an answer of its own."""
+    """The function, called once in this process for equal arguments; each caller has its own copy of the answer."""
     answers: dict[bytes, bytes] = {}
 
     @functools.wraps(function)

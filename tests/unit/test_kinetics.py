@@ -293,7 +293,7 @@ def kinetics_of(fit: TrialFit, **kwargs):
 
 @pytest.fixture(scope="module")
 def found(walk: TrialFit) -> Kinetics:
-    """What is computed of the walk of somebody of 70 kg."""
+    """The kinetics of the walk, of a person of 70 kg."""
     return kinetics_of(walk, mass_kg=70.0)
 
 
