@@ -10,6 +10,7 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import shutil
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ import pytest
 
 from tests import SHARED
 from tests.database import installation, leave_nothing_of_the_developer
+from tests.remembered import remembered
 
 #: How to have what the browser tests need, "" on a machine that has it.
 _CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -37,6 +39,18 @@ _LEFT_OUT = {
     "machine": "starts services, fetches a gigabyte or needs two idle cores",
     "long": "takes tens of seconds for what few changes touch",
 }
+
+
+# Modules and tests live as long as the process: while they are loaded there is nothing to collect, and later they are
+# not searched again each time (`pytest_collection_finish`).
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Clear up once after loading the tests; from here on as usual, for what the tests make."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -77,6 +91,16 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         leave_nothing_of_the_developer(patch)
         # Where no test asks for a database, a command that wants one finds none running.
         patch.setenv("PBL_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def phases_predicted_once() -> Iterator[None]:
+    """The event network looks at each walk once: tests have few, and every report and export is of one."""
+    from pbl_pipeline.gait.events import phase
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(phase, "predict", remembered(phase.predict))
         yield
 
 

@@ -62,6 +62,13 @@ def write_video(
     return Path(path)
 
 
+def write_as_they_are(path: Path, frames_bgr: Iterable[np.ndarray], fps: int = 30) -> Path:
+    """Write an .avi with every pixel as it is: a codec without loss takes longer than what is tested."""
+    frames = list(frames_bgr)
+    how = {"codec": "rawvideo", "pixel_format": "bgr24", "ticks_per_s": fps}
+    return write_video(path, frames, constant_rate(len(frames), fps), **how)
+
+
 def numbered_frames(n: int, height: int = 64, width: int = 96) -> Iterable[np.ndarray]:
     """`n` distinct BGR pictures: grey level = 8 * (index % 30), a blue top-left and a red bottom-right corner block."""
     for i in range(n):

@@ -152,12 +152,12 @@ def _step(problem: _Problem, q: np.ndarray, loose: float) -> np.ndarray:
     x, jac = problem.soles.with_jacobian(q, free)
     weight = contacts.weight / loose
     off = contacts.target_m - x
-    grad = np.einsum("npi,npi,npij->nj", weight**2, off, jac)
-    hess = np.einsum("npij,npik->njk", jac * weight[..., None], jac * weight[..., None])
-    deep = np.clip(contacts.floor_m - x[..., 2], 0, None)
+    deep = np.clip(contacts.floor_m - x[..., 2], 0, None) / (DEPTH_M * loose)
     up = jac[:, :, 2] * ((deep > 0) / (DEPTH_M * loose))[..., None]
-    grad += np.einsum("np,npj->nj", deep / (DEPTH_M * loose), up)
-    hess += np.einsum("npj,npk->njk", up, up)
+    rows = np.concatenate([(jac * weight[..., None]).reshape(n_t, -1, n), up], axis=1)
+    across = rows.swapaxes(1, 2)
+    left = np.concatenate([(weight * off).reshape(n_t, -1), deep], axis=1)
+    grad, hess = (across @ left[..., None])[..., 0], across @ rows
     now = q[:, free]
     edge = np.radians(EDGE_DEG)
     beyond = np.clip(low - now, 0, None) - np.clip(now - high, 0, None)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
@@ -123,7 +123,7 @@ def bridge_table(pairs: pd.DataFrame, names: tuple[str, str]) -> Table:
     cells: dict[tuple[str, str], Cell] = {}
     for measure, n, values in _shifts(pairs):
         mean, sd = float(values.mean()), float(values.std(ddof=1))
-        half = float(student.isf(0.025, n - 1)) * sd / np.sqrt(n)
+        half = float(stdtrit(n - 1, 0.975)) * sd / np.sqrt(n)
         largest = float(values[np.abs(values).argmax()])
         row = {"mean": mean, "low": mean - half, "high": mean + half, "sd": sd, "largest": largest}
         cells |= {(measure, column): Cell(value, n=n) for column, value in row.items()}

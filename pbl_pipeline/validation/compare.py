@@ -14,8 +14,6 @@ from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Z90, GaitCycle, trial_poses
-from pbl_pipeline.stats import niqr as niqr_of_all
-from pbl_pipeline.stats import shapiro_wilk
 
 from .align import (
     MAX_GAP_S,
@@ -57,6 +55,8 @@ def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 
 def niqr(values: Sequence[float] | np.ndarray) -> float:
     """IQR * 0.7413 of the finite values; NaN with fewer than two."""
+    from pbl_pipeline.stats import niqr as niqr_of_all  # loads scipy.stats, which every command would wait for
+
     v = _finite(values)
     return niqr_of_all(v) if v.size >= 2 else float("nan")
 
@@ -66,6 +66,8 @@ def normality_p(values: Sequence[float] | np.ndarray) -> float:
 
     Of more than 5,000 values every second, third ... counts. NaN with fewer than three or where all are the same.
     """
+    from pbl_pipeline.stats import shapiro_wilk
+
     v = _finite(values)
     try:
         return shapiro_wilk(v[:: -(-v.size // _MOST_TESTED) or 1]).p

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.shipped import shipped_text
@@ -193,6 +192,8 @@ def _by_view(rows: Any) -> Table:
 
 
 def _view_tests(measured: Any) -> Table:
+    from scipy import stats
+
     frontal = measured["view"].isin((FRONT, BACK))
     sagittal = measured["view"].isin((IPSILATERAL, CONTRALATERAL))
     cells = {}
@@ -213,6 +214,8 @@ def _view_tests(measured: Any) -> Table:
 
 
 def _residuals(trials: Any) -> Table:
+    from scipy import stats
+
     cells = {}
     for label, column in (("2D residual (px)", "residual_2d_px"), ("3D residual (cm)", "residual_3d_cm")):
         x, y = trials[[column, "median_deg"]].dropna().to_numpy(float).T

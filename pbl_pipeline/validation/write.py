@@ -19,7 +19,6 @@ from pbl_pipeline.csv_cells import frame_to_csv
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.latex import tex_escape
 from pbl_pipeline.shipped import shipped_page, shipped_text
-from pbl_pipeline.stats import bland_altman, correlation
 
 
 @functools.cache
@@ -152,6 +151,8 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
 
     Raises `PblError` STATS_INPUT: fewer than four visits, or indices that are all the same.
     """
+    from pbl_pipeline.stats import bland_altman, correlation
+
     one, several = (pairs[k].to_numpy(float) for k in ("single", "rig"))
     r, agreement, n = correlation(one, several), bland_altman(one, several), len(pairs)
     values = {

@@ -18,6 +18,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.video.reformatter import VideoReformatter
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
@@ -106,6 +107,8 @@ class BorderMeter:
 
     def __init__(self) -> None:
         self._n = 0
+        # One for all frames: a new one each time would start its threads again.
+        self._to_grey, self._to_small = VideoReformatter(), VideoReformatter()
         self._sum: np.ndarray = np.empty(0, np.float32)
         self._first = self._last = self._before = np.empty(0)
         self._moved: np.ndarray = np.empty(0)
@@ -117,9 +120,10 @@ class BorderMeter:
         """Add a frame; all have one size."""
         scale = _SIDE_PX / max(frame.width, frame.height)
         size = max(2, round(frame.width * scale)), max(2, round(frame.height * scale))
-        full = frame.reformat(format="gray")
+        full = self._to_grey.reformat(frame, format="gray", threads=1)
         self._last = full.to_ndarray()
-        grey = full.reformat(*size, interpolation="AREA").to_ndarray().astype(np.int16)
+        small = self._to_small.reformat(full, *size, interpolation="AREA", threads=1)
+        grey = small.to_ndarray().astype(np.int16)
         if not self._n:
             # Of the first and last row, and of the first and last column: a border keeps its colour.
             self._colours = np.array([np.median(grey[[0, -1]]), np.median(grey[:, [0, -1]])])[:, None, None]

@@ -26,10 +26,15 @@ def demo_files() -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
-def folder(demo_files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as a clinic has it: one good video among bad ones. Nobody writes into it."""
-    folder, demo = tmp_path_factory.mktemp("videos"), demo_files["demo_video"]
-    clips.walking(demo, folder / "walking.mp4")
+def walking(demo_files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good short video; its folder is only read."""
+    return clips.walking(demo_files["demo_video"], tmp_path_factory.mktemp("videos") / "walking.mp4")
+
+
+@pytest.fixture(scope="session")
+def folder(demo_files: dict[str, Path], walking: Path) -> Path:
+    """A folder as a clinic has it: the good video among bad ones. It is only read."""
+    folder, demo = walking.parent, demo_files["demo_video"]
     clips.standing(demo, folder / "standing.mp4")
     clips.short(demo, folder / "short.mp4")
     clips.empty_scene(demo, folder / "niemand ist da, früh.mp4")

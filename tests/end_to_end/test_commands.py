@@ -20,9 +20,9 @@ DOCS = Path(__file__).resolve().parents[2] / "docs" / "files.md"
 
 
 @pytest.fixture(scope="module")
-def detected(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def detected(walking: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("files") / "walking.keypoints.npz"
-    done = pbl("detect", folder / "walking.mp4", "--out", path)
+    done = pbl("detect", walking, "--out", path)
     assert done.code == 0, done.err
     assert "CHOSEN" in done.out
     return path
@@ -190,9 +190,9 @@ def test_the_fit_is_exported(fitted, tmp_path):
 
 
 @pytest.mark.long
-def test_run_of_the_installed_wheel_does_the_same_in_one(installed, fitted, folder, tmp_path):
+def test_run_of_the_installed_wheel_does_the_same_in_one(installed, fitted, walking, tmp_path):
     out = tmp_path / "Měření, früh"  # a letter that the encoding of the output lacks
-    done = pbl("run", folder / "walking.mp4", "--out", out, "--subject", "P017", packages=installed)
+    done = pbl("run", walking, "--out", out, "--subject", "P017", packages=installed)
     assert done.code == 0, done.err
     ends = ("keypoints.npz", "fit.npz", "angles.csv", "events.csv", "cycles.npz", "kinetics.npz", "overlay.mp4")
     written = {"report.html", "metrics.json", "kinetics.json", "session.json", *(f"walking.{end}" for end in ends)}

@@ -6,7 +6,6 @@ and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 
 import dataclasses
 import json
-import pickle
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -22,15 +21,14 @@ import pbl_pipeline.tracking
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit, session_fit
-from pbl_pipeline.gait.events import phase
-from pbl_pipeline.gait.events.network import predict as network
-from pbl_pipeline.gait.events.network.predict import Grid, Phases
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.kinetics import compute
 from pbl_pipeline.qc import Check
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import VideoInfo, check_lens, probe
 from tests.exported import with_markers
+from tests.remembered import remembered
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walker import observe
 from tests.walking_fit import walking_fit
@@ -145,23 +143,13 @@ def fit_either(trials, names, paramset=None, camera_motion="static", markers=Non
     return session_fit.fit_session(trials, names, paramset, camera_motion, markers)
 
 
-#: The phases that the event network gave, by its arguments.
-_phases: dict[bytes, Phases] = {}
-
-
-def predict(grid: Grid, model: str) -> Phases:
-    """The library's own, once for each movement: the walker of the stand-ins is the same in most tests."""
-    key = pickle.dumps((grid, model))
-    if key not in _phases:
-        _phases[key] = network.predict(grid, model)
-        for value in vars(_phases[key]).values():
-            value.setflags(write=False)
-    return _phases[key]
+#: The library's own, once for each walk: the walker of the stand-ins is the same in most tests.
+trial_kinetics = remembered(compute.trial_kinetics)
 
 
 def install(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of the library's functions."""
-    patch.setattr(phase, "predict", predict)
+    patch.setattr(compute, "trial_kinetics", trial_kinetics)
     patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
     patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
@@ -179,6 +167,6 @@ def computed_once(build: Callable[[Path], Any]) -> Any:
 
 def install_on_files(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of what the chain on files calls."""
-    patch.setattr(phase, "predict", predict)
+    patch.setattr(compute, "trial_kinetics", trial_kinetics)
     for function in (track_people, detect_keypoints, fit_session):
         patch.setattr(pbl_pipeline.pipeline, function.__name__, function)

@@ -25,6 +25,7 @@ from tests.html_page import commands_in
 from tests.integration import web
 from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
+from tests.source import ROOT, files, nodes
 from tests.videos import constant_rate, numbered_frames, write_video
 from workers.populate import populate
 
@@ -257,9 +258,8 @@ def advice() -> dict[str, str]:
 
 def _checks() -> Iterator[tuple[str, str, str]]:
     """Name (empty where it is made), advice and file of every check."""
-    root = Path(pbl_pipeline.__file__).parent.parent
-    for file in (f for room in ("pbl_pipeline", "schemas") for f in sorted((root / room).rglob("*.py"))):
-        tree = list(ast.walk(ast.parse(file.read_text("utf-8"))))
+    for file in files("pbl_pipeline", "schemas"):
+        tree = nodes(file)
         named: dict[str, list[ast.expr]] = {}
         for node in tree:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
@@ -310,7 +310,8 @@ REFUSING = (
 @pytest.mark.parametrize("file", REFUSING)
 def test_every_refusal_of_a_page_has_its_german(file: str):
     file, _, function = file.partition(":")
-    tree = ast.parse((Path(pbl_pipeline.__file__).parent.parent / file).read_text("utf-8"))
+    tree = nodes(ROOT / file)[0]
+    assert isinstance(tree, ast.Module)
     (top,) = [n for n in tree.body if getattr(n, "name", "") == function] if function else [tree]
     said: list[str] = []
     for node in ast.walk(top):

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import types
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import pytest
 from datajoint import adapters, autopopulate, connection, diagram, heading, jobs, storage, table, user_tables
 
 from schemas.datajoint_setup import MySQLOrMariaDB, columns_read_once, datajoint
+from tests.source import ROOT, files, nodes
 
-ROOT = Path(__file__).resolve().parents[2]
 FACE = ROOT / "schemas" / "datajoint_setup.py"
 
 
@@ -20,9 +21,9 @@ def _parameters(function: object) -> list[str]:
     return list(inspect.signature(function).parameters)
 
 
-def _private(tree: ast.AST) -> set[str]:
+def _private(tree: Sequence[ast.AST]) -> set[str]:
     """Names with one underscore that are read or written as an attribute."""
-    names = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    names = {n.attr for n in tree if isinstance(n, ast.Attribute)}
     return {n for n in names if n.startswith("_") and not n.startswith("__")}
 
 
@@ -30,9 +31,9 @@ def _of_datajoint() -> set[str]:
     """Every private attribute and method of the installed DataJoint."""
     found: set[str] = set()
     for file in Path(datajoint.__file__).parent.rglob("*.py"):
-        tree = ast.parse(file.read_text())
-        defined = {n.name for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
-        stored = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        tree = nodes(file)
+        defined = {n.name for n in tree if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+        stored = {n.id for n in tree if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
         found |= _private(tree) | {n for n in defined | stored if n.startswith("_") and not n.startswith("__")}
     return found
 
@@ -57,18 +58,18 @@ def test_the_installed_version_has_the_private_name(name: str):
 
 
 def test_every_private_name_in_use_is_listed_above():
-    assert _private(ast.parse(FACE.read_text())) == set(USED)
+    assert _private(nodes(FACE)) == set(USED)
 
 
 def test_no_other_file_touches_a_private_name():
     private, found = _of_datajoint(), []
     assert {"_config", "_conn", "_populate1", "_full_path"} <= private
-    for file in [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py") if f != FACE]:
-        tree = ast.parse(file.read_text())
-        own = {n.name for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
-        own |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
-        own |= {n.target.id for n in ast.walk(tree) if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
-        for node in ast.walk(tree):
+    for file in [f for f in files("schemas", "workers") if f != FACE]:
+        tree = nodes(file)
+        own = {n.name for n in tree if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+        own |= {n.attr for n in tree if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
+        own |= {n.target.id for n in tree if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+        for node in tree:
             if not isinstance(node, ast.Attribute) or node.attr not in private:
                 continue
             of_self = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
@@ -96,8 +97,8 @@ def test_cascades_read_columns_once_where_they_are_told_to():
 def test_no_delete_of_ours_asks():
     """DataJoint asks at a terminal before it deletes, which is left on for people; without one it would end us."""
     found = []
-    for file in [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py")]:
-        for node in ast.walk(ast.parse(file.read_text())):
+    for file in files("schemas", "workers"):
+        for node in nodes(file):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "delete":
                 said = {k.arg: ast.unparse(k.value) for k in node.keywords}
                 found += [] if said.get("prompt") == "False" else [f"{file.relative_to(ROOT)}:{node.lineno}"]

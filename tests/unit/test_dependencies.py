@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.source import ROOT, files, nodes
 
 # In a fresh process, so that nothing another test imported counts. `None` in sys.modules makes an import fail.
 BLOCKED = """
@@ -62,26 +62,24 @@ def test_importing_the_tables_loads_no_numerical_library():
 def test_no_import_against_the_direction(package: str, forbidden: set[str]):
     # The benchmarks also measure tables and workers, on the databases that the tests make; tests use other tests.
     research = ROOT / "research"
-    files = [
-        f
-        for f in sorted((ROOT / package).rglob("*.py"))
-        if f.parent not in (research / "benchmarks", research / "tests")
-    ]
-    assert len(files) > 5
-    found = [f"{f.relative_to(ROOT)}: {name}" for f in files for name in _imports(f) if name.split(".")[0] in forbidden]
+    ours = [f for f in files(package) if f.parent not in (research / "benchmarks", research / "tests")]
+    assert len(ours) > 5
+    found = [f"{f.relative_to(ROOT)}: {name}" for f in ours for name in _imports(f) if name.split(".")[0] in forbidden]
     assert not found
 
 
+@functools.cache
 def _modules(package: str) -> dict[str, set[str]]:
     """Module of a package -> modules of it that are imported there, also inside functions and for types alone."""
-    files = sorted((ROOT / package).rglob("*.py"))
-    module_of = {f: ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in files}
+    module_of = {
+        f: ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in files(package)
+    }
     known = set(module_of.values())
     found: dict[str, set[str]] = {}
     for file, name in module_of.items():
         within = name if file.name == "__init__.py" else name.rsplit(".", 1)[0]
         targets: set[str] = set()
-        for node in ast.walk(ast.parse(file.read_text())):
+        for node in nodes(file):
             if isinstance(node, ast.Import):
                 targets |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -158,7 +156,7 @@ def test_a_private_module_is_used_in_its_own_folder_only():
 
 def _imports(file: Path) -> set[str]:
     names = set()
-    for node in ast.walk(ast.parse(file.read_text())):
+    for node in nodes(file):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -171,8 +169,11 @@ def _imports(file: Path) -> set[str]:
 def test_datajoint_is_configured_before_it_is_imported():
     """A datajoint.json in the working directory must never count, so only one file may import DataJoint itself."""
     allowed = {"schemas/datajoint_setup.py"}
-    files = [f for package in ("schemas", "workers") for f in (ROOT / package).rglob("*.py")]
-    found = {str(f.relative_to(ROOT)) for f in files if any(n.split(".")[0] == "datajoint" for n in _imports(f))}
+    found = {
+        str(f.relative_to(ROOT))
+        for f in files("schemas", "workers")
+        if any(n.split(".")[0] == "datajoint" for n in _imports(f))
+    }
     assert found == allowed
 
 
@@ -198,8 +199,7 @@ for room in ("schemas", "workers"):
 
 @pytest.mark.slow
 def test_no_module_needs_another_to_be_imported_before_it():
-    root = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _FIRST], cwd=root, capture_output=True, text=True, check=False
+        [sys.executable, "-W", "ignore", "-c", _FIRST], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (0, ""), done.stderr[-1000:]

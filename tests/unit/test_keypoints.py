@@ -23,7 +23,7 @@ from pbl_pipeline.keypoints.detect import _detect_all
 from pbl_pipeline.keypoints.virtual_camera import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
-from tests.videos import constant_rate, write_video
+from tests.videos import constant_rate, write_as_they_are
 
 CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
 #: Of pictures of 200 x 100.
@@ -189,7 +189,7 @@ class Cross:
 def case(tmp_path):
     """90 frames at 30 fps, 200x100; the person in frames 10..69 but 30..34; frames 50..54 are dark."""
     frames = [np.full((100, 200, 3), 0 if 50 <= i < 55 else 128, np.uint8) for i in range(90)]
-    video = write_video(tmp_path / "v.mkv", frames, constant_rate(90), "ffv1", pixel_format="bgr0")
+    video = write_as_they_are(tmp_path / "v.avi", frames)
     roi = np.full((90, 4), np.nan)
     roi[10:70] = [60.0, 50.0, 70.0, 0.0]
     roi[30:35] = np.nan
@@ -298,9 +298,7 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
         detect_keypoints(video, tracking, 7, CAMERA, None, Cross())
     with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
         detect_keypoints(video, tracking, 1, SMALL, KeypointParams(detector="none"))
-    shorter = write_video(
-        tmp_path / "s.mkv", [np.full((100, 200, 3), 128, np.uint8)] * 40, constant_rate(40), "ffv1", pixel_format="bgr0"
-    )
+    shorter = write_as_they_are(tmp_path / "s.avi", [np.full((100, 200, 3), 128, np.uint8)] * 40)
     with pytest.raises(PblError, match=r"^VIDEO_CHANGED: "):
         detect_keypoints(shorter, tracking, 1, CAMERA, None, Cross())
 

@@ -22,6 +22,7 @@ from pbl_pipeline.kinetics import (
     MOMENTS,
     TOO_UNCERTAIN,
     Dynamics,
+    Kinetics,
     Motion,
     contact_of,
     ground_reaction,
@@ -290,13 +291,16 @@ def walk() -> TrialFit:
 
 
 def kinetics_of(fit: TrialFit, **kwargs):
-    method = METHODS.find()
-    gait = gait_metrics([fit])
-    return visit_kinetics([fit], gait.trials, method, **kwargs)
+    return visit_kinetics([fit], gait_metrics([fit]).trials, METHODS.find(), **kwargs)
 
 
-def test_a_walk_has_measures_with_intervals(walk: TrialFit) -> None:
-    found = kinetics_of(walk, mass_kg=70.0)
+@pytest.fixture(scope="module")
+def found(walk: TrialFit) -> Kinetics:
+    """The kinetics of the walk, of a person of 70 kg."""
+    return kinetics_of(walk, mass_kg=70.0)
+
+
+def test_a_walk_has_measures_with_intervals(walk: TrialFit, found: Kinetics) -> None:
     assert found.status == "PASS"
     assert found.mass_kg == 70.0
     by_markers = kinetics_of(dataclasses.replace(walk, orientation_source="measured: calibration")).measures
@@ -314,9 +318,10 @@ def test_a_walk_has_measures_with_intervals(walk: TrialFit) -> None:
     assert (cycle.curves_sd["force_vertical_bw"] > 0).any()
 
 
-def test_the_result_is_the_same_every_time_and_needs_no_mass(walk: TrialFit) -> None:
-    first, second = kinetics_of(walk), kinetics_of(walk, mass_kg=90.0)
-    assert first.measures == second.measures
+def test_the_result_is_the_same_every_time_and_needs_no_mass(walk: TrialFit, found: Kinetics) -> None:
+    again = kinetics_of(walk)
+    assert (found.mass_kg, again.mass_kg) == (70.0, None)
+    assert found.measures == again.measures
 
 
 def test_what_is_less_certain_than_healthy_people_differ_is_left_out(walk: TrialFit) -> None:
@@ -400,29 +405,31 @@ def test_a_mass_that_no_person_has_is_refused(mass_kg: float) -> None:
     check_mass(68.5)
 
 
-def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(walk: TrialFit, tmp_path: Path) -> None:
+def test_pbl_gait_writes_kinetics_beside_the_fits_and_keeps_the_mass(
+    walk: TrialFit, found: Kinetics, tmp_path: Path
+) -> None:
     walk.save(tmp_path / "walk.fit.npz")
-    save_kinetics(dataclasses.replace(kinetics_of(walk, mass_kg=70.0), trials=()), tmp_path)
+    save_kinetics(dataclasses.replace(found, trials=()), tmp_path)
     done = CliRunner().invoke(gait_command, [str(tmp_path / "walk.fit.npz"), "--out", str(tmp_path / "metrics.json")])
     assert done.exit_code == 0, done.output
-    found = not_none(load_kinetics(tmp_path, ["walk"]))
-    assert found.mass_kg == 70.0
-    assert found.measures.keys() == kinetics_of(walk).measures.keys()
-    series = not_none(found.trials[0].series)
+    written = not_none(load_kinetics(tmp_path, ["walk"]))
+    assert written.mass_kg == 70.0
+    assert written.measures.keys() == found.measures.keys()
+    series = not_none(written.trials[0].series)
     assert series.force_bw.shape == (len(series.time_s), 2, 3)
 
 
-def test_kinetics_of_other_recordings_are_refused(walk: TrialFit, tmp_path: Path) -> None:
-    save_kinetics(kinetics_of(walk), tmp_path)
+def test_kinetics_of_other_recordings_are_refused(found: Kinetics, tmp_path: Path) -> None:
+    save_kinetics(found, tmp_path)
     with pytest.raises(PblError, match=r"^FILE_FORMAT: "):
         load_kinetics(tmp_path, ["another"])
     assert load_kinetics(tmp_path / "empty", ["walk"]) is None
 
 
-def test_the_report_shows_forces_with_intervals_and_newtons(walk: TrialFit, tmp_path: Path) -> None:
+def test_the_report_shows_forces_with_intervals_and_newtons(walk: TrialFit, found: Kinetics, tmp_path: Path) -> None:
     gait = gait_metrics([walk])
     visit = Visit((Recording.of("walk", walk),)).with_measures(gait)
-    visit = dataclasses.replace(visit, kinetics=visit_kinetics([walk], gait.trials, METHODS.find(), mass_kg=70.0))
+    visit = dataclasses.replace(visit, kinetics=found)
     page = write_report(tmp_path / "report.html", visit).read_text()
     assert "Forces and joint moments" in page
     assert "1 BW is 686 N" in page

@@ -4,16 +4,16 @@ Ruff's rule for this (PLW1514) is in preview and sees a path only where its type
 """
 
 import ast
-from pathlib import Path
+from collections.abc import Iterable
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.source import ROOT, files, nodes
 
 
-def without_encoding(source: str) -> list[int]:
+def without_encoding(source: Iterable[ast.AST]) -> list[int]:
     """Lines with a call that opens a text file in the encoding of the system."""
-    return [node.lineno for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call) and _is_text(node)]
+    return [node.lineno for node in source if isinstance(node, ast.Call) and _is_text(node)]
 
 
 def _is_text(call: ast.Call) -> bool:
@@ -55,11 +55,11 @@ def _is_text(call: ast.Call) -> bool:
     ],
 )
 def test_calls_are_told_apart(source, text):
-    assert bool(without_encoding(source)) is text
+    assert bool(without_encoding(ast.walk(ast.parse(source)))) is text
 
 
 def test_text_files_are_opened_as_utf_8():
-    files = [f for package in ("pbl_pipeline", "schemas", "workers") for f in (ROOT / package).rglob("*.py")]
-    assert len(files) > 300
-    found = [f"{f.relative_to(ROOT)}:{n}" for f in files for n in without_encoding(f.read_text(encoding="utf-8"))]
+    ours = files("pbl_pipeline", "schemas", "workers")
+    assert len(ours) > 300
+    found = [f"{f.relative_to(ROOT)}:{n}" for f in ours for n in without_encoding(nodes(f))]
     assert not found

@@ -12,6 +12,7 @@ from pbl_pipeline import texts, words
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.shipped import shipped_text
+from tests.source import files, nodes
 
 WEB = Path(texts.__file__).parents[1] / "workers/web"
 _PAGES = [*WEB.glob("templates/*.html"), *WEB.glob("*.py"), Path(texts.__file__)]
@@ -55,8 +56,8 @@ _NAMED_AT = {"Check": 0, "_limit_check": 0, "warn_if": 1}
 def said_by_the_library() -> tuple[set[str], list[re.Pattern[str]], set[str]]:
     """The texts in the library's sources, patterns of those with places, and the names of its checks."""
     plain, placed, checks = set(), [], set()
-    for path in (p for room in ("pbl_pipeline", "schemas", "workers") for p in (WEB.parents[1] / room).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for path in files("pbl_pipeline", "schemas", "workers"):
+        for node in nodes(path):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 plain.add(node.value)
             elif isinstance(node, ast.JoinedStr):
