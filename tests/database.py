@@ -59,22 +59,9 @@ def leave_nothing_of_the_developer(patch: pytest.MonkeyPatch) -> None:
             patch.delenv(name)
 
 
-def _visible(heading: Any) -> dict[str, Any]:
-    """What `Heading.attributes` is, put together once for each heading and not at each look."""
-    if heading._attributes is None:
-        heading._init_from_database()
-    own: dict[str, Any] = vars(heading)["_attributes"]
-    of, found = getattr(heading, "_seen", (None, {}))
-    if of is not own:
-        found = {name: a for name, a in own.items() if not a.is_hidden}
-        heading._seen = own, found
-    return found
-
-
 @contextlib.contextmanager
-def columns_read_once() -> Iterator[None]:
-    """Let DataJoint parse each line of a definition and put the columns of a heading together once: tests declare,
-    compare and query the same tables again and again."""
+def lines_parsed_once() -> Iterator[None]:
+    """Let DataJoint parse each line of a definition once: tests declare and compare the same tables again and again."""
     parser = datajoint.declare.attribute_parser
 
     @functools.cache
@@ -84,10 +71,7 @@ def columns_read_once() -> Iterator[None]:
     def copied(line: str, parse_all: bool) -> Any:
         return parsed(line).copy()
 
-    with (
-        mock.patch.object(datajoint.declare, "attribute_parser", mock.Mock(parse_string=copied)),
-        mock.patch.object(datajoint.heading.Heading, "attributes", property(_visible)),
-    ):
+    with mock.patch.object(datajoint.declare, "attribute_parser", mock.Mock(parse_string=copied)):
         yield
 
 
@@ -95,7 +79,7 @@ def columns_read_once() -> Iterator[None]:
 def server(home: Path) -> Iterator[dict[str, str]]:
     """Start the database of a home; yields the variables with which `pbl` uses it. MySQL is ended after, the embedded
     server with its home (`remove_home`)."""
-    with columns_read_once():
+    with lines_parsed_once():
         if mysql.chosen():
             with mysql.running(home / "db") as started:
                 yield {"PBL_HOME": str(home), **started.environment}

@@ -75,8 +75,10 @@ def solve_per_frame(
     for i, (session, f) in enumerate(zip(sessions, found, strict=True)):
         # The cost of the second one has a term more.
         trace = np.concatenate([traces[i], f.trace + np.array([len(traces[i]), 0.0])])
-        spent = (time.perf_counter() - begin) / (i + 1), (compile_seconds() - compiled) / len(sessions)
+        # The seconds of all sessions add to those of the batch, without what the caller does meanwhile.
+        spent = time.perf_counter() - begin, (compile_seconds() - compiled) / len(sessions)
         yield _solution(session, spread, f, trace, told[i], *spent)
+        begin = time.perf_counter()
 
 
 def _facing(

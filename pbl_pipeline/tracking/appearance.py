@@ -24,7 +24,7 @@ from .types import Detection, Scene
 _PATCHES = ((0.06, 0.46, 0.14), (-0.62, -0.10, 0.16))
 _PATCH_SIZE = (12, 24)
 #: Column and row of its pixels, and 1: (3, 288).
-_GRID = np.insert(np.indices(_PATCH_SIZE[::-1]).reshape(2, -1)[::-1], 2, 1, axis=0)
+_GRID = np.insert(np.indices(_PATCH_SIZE[::-1], float).reshape(2, -1)[::-1], 2, 1, axis=0)
 #: Bins of lightness, and of each of the two colour axes (CIE Lab as 8 bit).
 _LIGHT_BINS, _COLOUR_BINS = 6, 8
 _SIZE = 2 * (_LIGHT_BINS + _COLOUR_BINS**2)

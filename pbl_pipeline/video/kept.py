@@ -42,7 +42,7 @@ class _Shelf:
     def __init__(self) -> None:
         self.wanted = 0
         self.pictures: Pictures | None = None
-        self.blocks: list[np.ndarray] = []  # memory of released pictures, all of one size
+        self.blocks: list[np.ndarray] = []  # memory of released pictures
 
     def return_block(self, block: np.ndarray) -> None:
         """Keep the memory of a picture that was freed, while pictures are to be kept."""
@@ -91,6 +91,7 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
             stamped.append((pts, _in_used_memory(frame) if stamped else frame))
         else:
             stamped.clear()
+            release_frames()
         yield pts, frame
     if room >= 0:
         _shelf.pictures = Pictures(file, decoder.time_base, stamped)
@@ -99,12 +100,12 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
 def _in_used_memory(frame: av.VideoFrame) -> av.VideoFrame:
     """Return a copy of a picture in a block of released memory; the picture itself in a format that PyAV does not take
     from arrays, or whose conversion uses facts that PyAV does not copy (10 bits: where the colour samples lie)."""
-    if len(frame.planes) != 3 or frame.interlaced_frame or frame.format.components[0].bits != 8:
+    ends, blocks = np.cumsum([plane.buffer_size for plane in frame.planes]), _shelf.blocks
+    fits = len(ends) == 3 and not frame.interlaced_frame and frame.format.components[0].bits == 8
+    if blocks and not (fits and len(blocks[-1]) == ends[-1]):
+        blocks.clear()
+    if not fits:
         return frame
-    ends = np.cumsum([plane.buffer_size for plane in frame.planes])
-    blocks = _shelf.blocks
-    if blocks and len(blocks[-1]) != ends[-1]:
-        blocks = _shelf.blocks = []
     block = blocks.pop() if blocks else np.empty(ends[-1], np.uint8)
     planes = []
     for plane, part in zip(frame.planes, np.split(block, ends[:-1]), strict=True):

@@ -9,6 +9,7 @@ do. A first round, of one video a process, loads the networks and is not counted
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Sequence
@@ -31,9 +32,13 @@ from research.clip_keypoints import clip_keypoints
 SURE = 0.5
 
 
+#: What a process keeps open until it ends.
+_OPEN = contextlib.ExitStack()
+
+
 def keep_frames() -> None:
     """Keep pictures, and their memory from one video to the next, as a worker does until its process ends."""
-    frames_kept().__enter__()
+    _OPEN.enter_context(frames_kept())
 
 
 def frames_of(video: Path, method: str) -> int:
