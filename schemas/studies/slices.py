@@ -356,14 +356,8 @@ def _measures(sets: Any, index: Any, chain: Mapping[str, str], of_sets: Any) -> 
     """Long: measures of both sides and of each, the index and the Gait Profile Score of a side."""
     import pandas as pd
 
-    own = (gdi.SessionGdi.Measure & chain & of_sets).proj(
-        "session_measure_mean",
-        "session_measure_left",
-        "session_measure_right",
-        "session_measure_sd",
-        "session_measure_n",
-    )
-    rows = frame_of(own).rename(columns={"session_measure": "measure", "session_measure_n": "n_cycles"})
+    own = frame_of(gdi.SessionGdi.Measure & chain & of_sets)
+    rows = own.rename(columns={"session_measure": "measure", "session_measure_n": "n_cycles"})
     parts = []
     for column, side in _SIDES.items():
         part = rows.assign(side=side, value=rows[f"session_measure_{column}"].astype(float), sd=np.nan)

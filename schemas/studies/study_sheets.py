@@ -325,12 +325,9 @@ class _Plan:
         cohort = needed(row, "cohort")
         stated = self.members.setdefault((cohort, code), _Stated(row, {}))
         for column, name in MEMBER_COLUMNS.items():
-            if column not in row.cells:
-                continue
-            value: Any = row.cells[column]
-            if column == "included":
-                value = _flag(row, column)
-            self._same(row, stated, name, value, f"{column} in {cohort}", code)
+            if column in row.cells:
+                value = _flag(row, column) if column == "included" else row.cells[column]
+                self._same(row, stated, name, value, f"{column} in {cohort}", code)
 
     def _long_score(self, row: Row) -> None:
         key = self._session(row, self._person(row))
@@ -441,12 +438,12 @@ class _Plan:
         if day is None or not isinstance(event, datetime.date):
             return
         days = (day - event).days
-        given = stated.values.get("visit_days", merged.get("visit_days") if "visit_days" not in stated.values else None)
+        given = stated.values.get("visit_days", merged.get("visit_days"))
         if isinstance(given, int) and given != days:
             raise conflict(
                 f"{given} days, {day} and an intervention on {event}", f"{days} days", "correct one of the three"
             )
-        if "visit_days" not in stated.values and merged.get("visit_days") is None:
+        if given is None:
             stated.values["visit_days"] = days
         after = study.role_days(role)
         if after is not None and (days > 0 if after < 0 else days < 0):
