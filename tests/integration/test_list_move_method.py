@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -15,10 +16,10 @@ from schemas.intake.move import carry_out, plan_move
 from schemas.method_names import keys_named, with_keys
 from tests.command import pbl
 from tests.rows import everything, register
-from workers import incoming
 from workers.populate import populate
 
 from . import chain, test_rigs
+from .drop import twice, upload
 
 
 def visits_of_fits() -> dict[str, int]:
@@ -30,9 +31,13 @@ def visits_of_fits() -> dict[str, int]:
 
 
 @pytest.fixture
-def walks(tables: None, tmp_path: Path) -> dict[str, int]:
+def walks(tables: None, fill: Callable) -> dict[str, int]:
+    return fill(_walks)
+
+
+def _walks(folder: Path) -> dict[str, int]:
     """Two videos of one visit of P001 and one of P002, through the chain."""
-    paths = [chain.small_video(tmp_path, name, n=240 + i) for i, name in enumerate(("one", "two", "three"))]
+    paths = [chain.small_video(folder, name, n=240 + i) for i, name in enumerate(("one", "two", "three"))]
     one, two = register(*paths[:2], session_label="2026-03-01", project="spine", population="patient")
     (three,) = register(paths[2], subject="P002", session_label="2026-03-02", population="healthy")
     populate()
@@ -40,14 +45,7 @@ def walks(tables: None, tmp_path: Path) -> dict[str, int]:
 
 
 @pytest.mark.long
-def test_lists_then_moves(walks):
-    """One chain for both: the lists look at it before anything is moved."""
-    lists_have_a_row_for_each_with_counts_and_filters(walks)
-    a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks)
-    a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks)
-
-
-def lists_have_a_row_for_each_with_counts_and_filters(walks):
+def test_lists_have_a_row_for_each_with_counts_and_filters(walks):
     people = pd.read_csv(io.StringIO(pbl("list", "subjects", "--csv").out))
     assert people[["subject", "population", "visits", "videos"]].to_numpy().tolist() == [
         ["P001", "patient", 1, 2],
@@ -73,7 +71,8 @@ def lists_have_a_row_for_each_with_counts_and_filters(walks):
     assert pbl("list", "methods", "--stage", "feet").error_code == "SOLVER_UNKNOWN"
 
 
-def a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks):
+@pytest.mark.long
+def test_moved_videos_take_their_keypoints_and_plans_and_leave_the_fit(walks):
     assert visits_of_fits() == {"P001/2026-03-01": 2, "P002/2026-03-02": 1}
     made = keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist()
     before = everything()
@@ -89,9 +88,7 @@ def a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks):
     populate()
     assert visits_of_fits() == {"P001/2026-03-01": 1, "P002/2026-03-02": 2}
     assert keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist() == made
-
-
-def a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks):
+    # A visit that is new is made with the plans of the old.
     done = pbl("move", walks["one"], "--to", "P003/first", "--yes")
     assert "a new person" in done.out
     assert "P001/2026-03-01 keeps no video" in done.out
@@ -142,24 +139,17 @@ def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     assert {int(v) for v in moved.to_arrays("video_id")} == numbers
 
 
-def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, tmp_path, monkeypatch):
-    archive = tmp_path / "archive"
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
-    path = drop / "P001" / "1" / "walk.mp4"
-    path.parent.mkdir(parents=True)
-    content = chain.small_video(tmp_path, "walk").read_bytes()
-    path.write_bytes(content)
-    for _ in range(2):
-        incoming.import_uploads(str(drop), archive, settled_s=0)
+def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, archive, monkeypatch):
+    content = upload(drop, "P001/1/walk.mp4").read_bytes()
+    twice(drop, archive)
     number, old = video.Video.fetch1("video_id", "video_path")
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")
-    monkeypatch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        carry_out(plan)
+    with monkeypatch.context() as patch:
+        patch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            carry_out(plan)
     assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)
-    monkeypatch.undo()
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
     carry_out(plan)
     (now,) = archive.rglob("*.mp4")
     assert now.is_relative_to(archive / "P002" / "2")

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, load_visit, norms, session
-from schemas.cli.norm import norm as command
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames
 from tests import not_none
@@ -152,17 +150,15 @@ def test_curves_beside_the_bands(walkers: Path):
 
 
 def test_the_command(walkers: Path, tmp_path: Path):
-    run = CliRunner().invoke
-    out = run(command, ["build", "clinic", "--population", "healthy", "--source", "four walkers"])
-    assert out.exit_code == 0, out.output
-    assert "clinic-v1: registered" in out.output
-    assert "WARN norm_people" in out.output
-    assert "known already" in run(command, ["build", "clinic", "--source", "four walkers"]).output
-    listed = run(command, ["list"]).output
+    built = pbl("norm", "build", "clinic", "--population", "healthy", "--source", "four walkers")
+    assert built.code == 0, built.err
+    assert "clinic-v1: registered" in built.out
+    assert "WARN norm_people" in built.out
+    assert "known already" in pbl("norm", "build", "clinic", "--source", "four walkers").out
+    listed = pbl("norm", "list").out
     assert "clinic-v1" in listed
     assert "gillette-166-nine-angles-v1" in listed
     path = tmp_path / "clinic.json"
-    shown = run(command, ["show", "clinic", "--out", str(path)])
-    assert "four walkers" in shown.output
+    assert "four walkers" in pbl("norm", "show", "clinic", "--out", path).out
     assert json.loads(path.read_text())["name"] == "clinic"
     assert pbl_pipeline.gait.load_norm(str(path)).sha256 == norms.load_norm("clinic").sha256
