@@ -9,10 +9,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
-from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
+from schemas.intake import LaboratoryMarkers, Methods, Registered, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.recording_sheet import ingest_sheet
 from schemas.intake.registration import resolve
-from tests.command import pbl
+from tests.command import Done, pbl
 from tests.rows import everything_but_refreshes
 
 from . import chain, test_markers, test_rigs
@@ -22,20 +22,23 @@ from .drop import look
 Adapter = Callable[[list[Path], VisitRecord], str]
 
 
-def said(recordings: Sequence[Recording]) -> str:
-    """The one outcome of all files of these recordings."""
-    (found,) = {r.error.code if r.error else r.status for r in register(recordings)}
+def outcome(results: Sequence[Registered]) -> str:
+    """The one outcome of all files."""
+    (found,) = {r.error.code if r.error else r.status for r in results}
     return found
+
+
+def printed(done: Done) -> str:
+    """The outcome that `pbl ingest` printed."""
+    return done.error_code or ("registered" if " registered (" in done.out else "known")
 
 
 def by_ingest(paths: list[Path], visit: VisitRecord) -> str:
-    (found,) = {r.error.code if r.error else r.status for r in ingest(paths, visit)}
-    return found
+    return outcome(ingest(paths, visit))
 
 
 def by_command(paths: list[Path], visit: VisitRecord) -> str:
-    done = pbl("ingest", *paths, "--subject", visit.subject, "--session", visit.session_label)
-    return done.error_code or ("registered" if " registered (" in done.out else "known")
+    return printed(pbl("ingest", *paths, "--subject", visit.subject, "--session", visit.session_label))
 
 
 def by_name(paths: list[Path], visit: VisitRecord) -> str:
@@ -43,8 +46,7 @@ def by_name(paths: list[Path], visit: VisitRecord) -> str:
     pattern, named = "(?P<subject>.*)=.*", [p.with_name(f"{visit.subject}={p.name}") for p in paths]
     for path, copy in zip(paths, named, strict=True):
         copy.write_bytes(path.read_bytes())
-    done = pbl("ingest", *named, "--session", visit.session_label, "--name-pattern", pattern)
-    return done.error_code or ("registered" if " registered (" in done.out else "known")
+    return printed(pbl("ingest", *named, "--session", visit.session_label, "--name-pattern", pattern))
 
 
 def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
@@ -52,8 +54,8 @@ def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
     rows = (f"{p.name},{visit.subject},{visit.session_label}" for p in paths)
     sheet.write_text("\n".join(("file,subject,visit", *rows)))
     found = ingest_sheet(sheet)
-    (outcome,) = {e.code for e in found.errors} or {"registered" if line.changes else "known" for line in found.lines}
-    return outcome
+    (code,) = {e.code for e in found.errors} or {"registered" if line.changes else "known" for line in found.lines}
+    return code
 
 
 def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
@@ -64,8 +66,8 @@ def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
         (folder / path.name).write_bytes(path.read_bytes())
     look(drop, archive)
     taken = look(drop, archive)
-    (outcome,) = {e.code for e in taken.refused.values()} or {"registered" if taken.registered else "known"}
-    return outcome
+    (code,) = {e.code for e in taken.refused.values()} or {"registered" if taken.registered else "known"}
+    return code
 
 
 def by_archive(paths: list[Path], visit: VisitRecord) -> str:
@@ -77,11 +79,11 @@ def by_archive(paths: list[Path], visit: VisitRecord) -> str:
 
 
 def by_rig(paths: list[Path], visit: VisitRecord) -> str:
-    return said([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)])
+    return outcome(register([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)]))
 
 
 def by_markers(paths: list[Path], visit: VisitRecord) -> str:
-    return said([LaboratoryMarkers(p, visit) for p in paths])
+    return outcome(register([LaboratoryMarkers(p, visit) for p in paths]))
 
 
 def one_video(folder: Path) -> list[Path]:

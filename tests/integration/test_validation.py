@@ -223,13 +223,6 @@ def test_rotations_of_bodies_are_a_reference(shared_data: Path):
     assert np.nanmax(found.angles_deg["knee_flexion_r"]) > 40
 
 
-@pytest.mark.parametrize("texts", [{"dataset": "d" * 33}, {"source": ""}, {"origin": "o" * 1001}])
-def test_texts_that_do_not_fit_are_refused(tables: None, tmp_path: Path, texts: dict):
-    (number,) = register(chain.small_video(tmp_path, "walk"))
-    with pytest.raises(PblError, match="USAGE"):
-        add_reference(number, saved(tmp_path, "truth.npz", reference()), **texts)
-
-
 # ----------------------------------------------------------------------------------------------------- the command
 def test_the_command_says_what_to_do_where_there_is_nothing(tables: None):
     result = call()
