@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ._kind import kind_option
+
+if TYPE_CHECKING:
+    from pbl_pipeline.study import StudyData
 
 
 @click.command(
@@ -112,15 +116,10 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
-    import schemas
     from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.study import deidentified, write_study
-    from schemas.studies import slices
 
-    schemas.activate(methods=False)
-    data = slices.study_data(name, curves=not no_curves)
-    for text in slices.changes(name):
-        click.echo(f"changed since it was frozen: {text}", err=True)
+    data = load_slice(name, curves=not no_curves)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
@@ -165,6 +164,19 @@ def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     if errors:
         raise click.exceptions.Exit(1)
     click.echo(f"{name}: added")
+
+
+def load_slice(name: str, curves: bool = True) -> StudyData:
+    """Return the `StudyData` of a slice, also for `pbl study report --slice` (entry point `pbl.study_data`); what
+    changed since it was frozen is printed on stderr. Raises as `slices.study_data`."""
+    import schemas
+    from schemas.studies import slices
+
+    schemas.activate(methods=False)
+    data = slices.study_data(name, curves)
+    for text in slices.changes(name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
+    return data
 
 
 def _write_key(path: Path, text: str) -> None:

@@ -228,14 +228,12 @@ class _Plan:
 
     def _wrong_cells(self, row: Row, line: Line, kind: tuple[str, ...]) -> set[str]:
         """Return the columns of a row whose cells are wrong by themselves, or empty and needed; each is an error."""
-        wrong = set()
-        for column in dict.fromkeys((*(SCORE_COLUMNS if kind is SCORE_COLUMNS else ()), *row.cells)):
-            before = len(line.errors)
+        wrong = dict.fromkeys((*(SCORE_COLUMNS if kind is SCORE_COLUMNS else ()), *row.cells))
+        for column in tuple(wrong):
             with line.about():
                 self._check_cell(row, column, needed(row, column), kind)
-            if len(line.errors) > before:
-                wrong.add(column)
-        return wrong
+                del wrong[column]
+        return set(wrong)
 
     def _check_cell(self, row: Row, column: str, text: str, kind: tuple[str, ...]) -> None:
         if kind is TRIAL_COLUMNS or column == "instrument":

@@ -99,10 +99,10 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
             errors[name] = refused("nothing", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
-        "visit": lambda text: check_label("visit", text, NEW["visit"]),
+        "visit": functools.partial(check_label, "visit", longest=NEW["visit"]),
         "date": lambda text: date_of(Row("date", {"date": text}), "date"),
         "role": lambda text: check_role(text, "role"),
-        "population": lambda text: check_label("population", text, NEW["population"]),
+        "population": functools.partial(check_label, "population", longest=NEW["population"]),
         "height_m": functools.partial(_number, "height_m"),
     }
     _check({name: given[name] for name in checks if name in given}, checks, errors)
@@ -234,8 +234,8 @@ def _correct(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tu
     changed = {name: text for name, text in given.items() if not now.same(name, text)}
     checks: dict[str, Callable[[str], Any]] = {
         **{n: functools.partial(_number, n) for n in _NUMBERS},
-        **{n: _label(n, FACTS[n]) for n in ("population", "assistive_device", "orthosis")},
-        **{n: _label(n.partition(":")[0], 32) for n in changed if ":" in n},
+        **{n: functools.partial(check_label, n, longest=m) for n, m in FACTS.items() if n not in _NUMBERS},
+        **{n: functools.partial(check_label, n.partition(":")[0], longest=32) for n in changed if ":" in n},
     }
     errors: dict[str, PblError] = {}
     _check({name: text for name, text in changed.items() if text}, checks, errors)
@@ -301,10 +301,6 @@ def _check(given: Mapping[str, str], checks: Mapping[str, Callable[[str], Any]],
             checks[name](text)
         except PblError as error:
             errors[name] = error
-
-
-def _label(name: str, longest: int) -> Callable[[str], None]:
-    return lambda text: check_label(name, text, longest)
 
 
 def _number(name: str, text: str) -> float:

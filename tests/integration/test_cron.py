@@ -20,6 +20,7 @@ from tests.rows import register
 from workers import incoming
 from workers.heartbeat import Silent
 from workers.loop import Worker
+from workers.populate import populate
 
 from . import chain
 from .drop import codes, files, look, twice, upload
@@ -230,7 +231,7 @@ def test_all_other_jobs_run(tables: None, tmp_path: Path):
 def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp_path: Path):
     before = orphans(young_s=0.0)
     register(chain.small_video(tmp_path, "walk"))
-    Worker(schemas.computed_tables(), Silent()).run(once=True)
+    populate(["VideoInfo", "Tracking"])
     found = orphans(young_s=0.0)
     assert (found.lost, len(found.orphans)) == ([], len(before.orphans))
     assert found.n_files > before.n_files
