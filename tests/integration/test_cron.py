@@ -10,10 +10,8 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 import schemas
-from pbl_pipeline.errors import PblError
-from research.benchmarks.many_recordings import archived, register_many
 from schemas import connection, lab, session, tracking, video
-from schemas.intake import VisitRecord, uploads
+from schemas.intake import uploads
 from schemas.operations.orphans import orphans, remove
 from tests.command import pbl
 from tests.rows import register
@@ -199,21 +197,8 @@ def test_the_command_says_what_it_needs(tables: None, monkeypatch):
     assert pbl("cron", "import").error_code == "USAGE"
 
 
-def test_another_persons_bytes_are_refused_among_many(tables: None):
-    visit = VisitRecord("P001", "2026-01-02")
-    one = archived("a.mp4", "1" * 64, 9, visit)
-    assert register_many([one, one]) == {"registered": 1, "known": 1}
-    with pytest.raises(PblError, match=r"(?s)P001, session 2026-01-02.*subject P002") as error:
-        register_many(
-            [archived("b.mp4", "1" * 64, 9, VisitRecord("P002", "2026-01-02")), archived("a.mp4", "2" * 64, 9, visit)]
-        )
-    assert error.value.code == "VIDEO_DUPLICATE"
-    assert len(video.Video()) == 1
-
-
 def test_all_other_jobs_run(tables: None, tmp_path: Path):
-    path = chain.small_video(tmp_path, "walk")
-    register_many([archived(str(path), "0" * 64, path.stat().st_size, VisitRecord("P001"))])
+    register(chain.small_video(tmp_path, "walk"))
     for words, said in (
         (("refresh",), "1 of VideoInfo"),
         (("release",), "no dead"),

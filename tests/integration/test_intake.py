@@ -9,23 +9,23 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
-from schemas.intake import LaboratoryMarkers, Methods, Registered, SeveralCameras, VisitRecord, ingest, register
+from schemas.intake import LaboratoryMarkers, Methods, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.recording_sheet import ingest_sheet
 from schemas.intake.registration import resolve
 from tests.command import Done, pbl
-from tests.rows import everything_but_refreshes
+from tests.rows import everything_but_refreshes, outcomes
 
 from . import chain, test_markers, test_rigs
-from .drop import look
+from .drop import codes, look
 
 #: Registers the files for a visit; returns "registered", "known" or the code of the error.
 Adapter = Callable[[list[Path], VisitRecord], str]
 
 
-def outcome(results: Sequence[Registered]) -> str:
+def single(found: Sequence[str]) -> str:
     """The one outcome of all files."""
-    (found,) = {r.error.code if r.error else r.status for r in results}
-    return found
+    (one,) = set(found)
+    return one
 
 
 def printed(done: Done) -> str:
@@ -34,7 +34,7 @@ def printed(done: Done) -> str:
 
 
 def by_ingest(paths: list[Path], visit: VisitRecord) -> str:
-    return outcome(ingest(paths, visit))
+    return single(outcomes(ingest(paths, visit)))
 
 
 def by_command(paths: list[Path], visit: VisitRecord) -> str:
@@ -54,8 +54,7 @@ def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
     rows = (f"{p.name},{visit.subject},{visit.session_label}" for p in paths)
     sheet.write_text("\n".join(("file,subject,visit", *rows)))
     found = ingest_sheet(sheet)
-    (code,) = {e.code for e in found.errors} or {"registered" if line.changes else "known" for line in found.lines}
-    return code
+    return single([e.code for e in found.errors] or ["registered" if x.changes else "known" for x in found.lines])
 
 
 def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
@@ -66,24 +65,23 @@ def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
         (folder / path.name).write_bytes(path.read_bytes())
     look(drop, archive)
     taken = look(drop, archive)
-    (code,) = {e.code for e in taken.refused.values()} or {"registered" if taken.registered else "known"}
-    return code
+    return single([*codes(taken).values()] or ["registered" if taken.registered else "known"])
 
 
 def by_archive(paths: list[Path], visit: VisitRecord) -> str:
     try:
-        done = register_many(archived(str(p), sha256_of(p), p.stat().st_size, visit) for p in paths)
+        done = register_many(archived(str(p), sha256_of(p), p.stat().st_size, visit) for p in 2 * paths)
     except PblError as error:
         return error.code
     return "registered" if done["registered"] else "known"
 
 
 def by_rig(paths: list[Path], visit: VisitRecord) -> str:
-    return outcome(register([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)]))
+    return single(outcomes(register([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)])))
 
 
 def by_markers(paths: list[Path], visit: VisitRecord) -> str:
-    return outcome(register([LaboratoryMarkers(p, visit) for p in paths]))
+    return single(outcomes(register([LaboratoryMarkers(p, visit) for p in paths])))
 
 
 def one_video(folder: Path) -> list[Path]:

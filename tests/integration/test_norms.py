@@ -16,7 +16,7 @@ from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames
 from tests import not_none
 from tests.command import pbl
-from tests.rows import remove_all
+from tests.rows import outcomes, remove_all
 from workers.populate import populate
 
 from . import chain
@@ -74,8 +74,7 @@ def _of(population: str):
 def _used_by_a_session(walkers: Path, expected) -> None:
     """A visit that is planned with the built set is scored with it, and its old result stays."""
     old = (gdi.SessionGdi & _sets("P01")).fetch1("session_gdi", "norm")
-    (result,) = ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))
-    assert result.status == "updated"
+    assert outcomes(ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))) == ["updated"]
     populate()
     rows = {r["norm"]: r for r in (gdi.SessionGdi & _sets("P01")).to_dicts()}
     assert set(rows) == {old[1], "our-lab-v1"}
@@ -102,8 +101,7 @@ def _sets(subject: str):
 
 
 def test_nine_angles_in_the_tables(walkers: Path):
-    (result,) = ingest([walkers / "walk0.mp4"], VisitRecord("C01"), Methods(gdi="gillette-2008"))
-    assert result.status == "updated"
+    assert outcomes(ingest([walkers / "walk0.mp4"], VisitRecord("C01"), Methods(gdi="gillette-2008"))) == ["updated"]
     populate()
     found = (gdi.SessionGdi & _sets("C01") & {"gdi_method": "gillette-2008-v1"}).to_dicts()[0]
     assert found["norm"] == "gillette-166-nine-angles-v1"
