@@ -117,13 +117,16 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
     from pbl_pipeline.csv_cells import frame_to_csv
+    from pbl_pipeline.errors import os_errors_as
     from pbl_pipeline.study import deidentified, write_study
+    from schemas.operations.folders import write_text
 
     data = load_slice(name, curves=not no_curves)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
-            _write_key(key, frame_to_csv(codes))
+            with os_errors_as("FILE_UNWRITABLE", "a file for the key to the codes", "pass another --key", key):
+                write_text(key, frame_to_csv(codes))
     paths = write_study(data, out)
     click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
 
@@ -177,16 +180,3 @@ def load_slice(name: str, curves: bool = True) -> StudyData:
     for text in slices.changes(name):
         click.echo(f"changed since it was frozen: {text}", err=True)
     return data
-
-
-def _write_key(path: Path, text: str) -> None:
-    """The key to the codes, for its owner alone. Raises FILE_UNWRITABLE."""
-    import os
-
-    from pbl_pipeline.errors import os_errors_as
-
-    with (
-        os_errors_as("FILE_UNWRITABLE", "a file for the key to the codes", "pass another --key", path),
-        os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out,
-    ):
-        out.write(text)

@@ -138,21 +138,17 @@ def _retried(changes: list[Change]) -> list[Change]:
 
 
 def calibrations() -> list[dict[str, Any]]:
-    """The calibrations of devices: rows of DeviceCalibration and CameraCalibration, `lens` (the library's `PhoneLens`)
-    and `n_keypoints`, the keypoints that were made with each."""
+    """The calibrations of devices: rows of DeviceCalibration, Device and CameraCalibration, `lens` (the library's
+    `PhoneLens`) and `n_keypoints`, the keypoints that were made with each."""
     from pbl_pipeline.video import PhoneLens
 
     used = [int(n) for n in (keypoints.Keypoints & "keypoints_camera_id IS NOT NULL").to_arrays("keypoints_camera_id")]
-    rows = []
-    for row in lab.DeviceCalibration.to_dicts(order_by=list(lab.DeviceCalibration.primary_key)):
-        device = (lab.Device & {"device": row["device"]}).fetch1()
-        camera = (lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1()
-        camera.pop("device")
-        size = (int(row["stored_width"]), int(row["stored_height"]))
-        lens = PhoneLens(
-            device["device_make"], device["device_model"], device["device_lens"], size, int(row["capture_rate"])
-        )
-        rows.append({**camera, **row, "lens": lens, "n_keypoints": used.count(int(row["camera_id"]))})
+    query = lab.DeviceCalibration * lab.Device * lab.CameraCalibration.proj(..., "-device")
+    rows = query.to_dicts(order_by=list(lab.DeviceCalibration.primary_key))
+    for row in rows:
+        names = (row[f"device_{part}"] for part in ("make", "model", "lens"))
+        row["lens"] = PhoneLens(*names, (int(row["stored_width"]), int(row["stored_height"])), int(row["capture_rate"]))
+        row["n_keypoints"] = used.count(int(row["camera_id"]))
     return rows
 
 
