@@ -45,7 +45,8 @@ def test_built_registered_and_used(walkers: Path):
     assert {r["norm_name"] for r in before} == set(pbl_pipeline.gait.norm_names())
     built = norms.build_norm("our-lab")
     assert (built.norm, built.new, built.n_people) == ("our-lab-v1", True, 4)
-    used = sum(int(n) for n in (gait.GaitCycle & (fit.FitSet & _of("healthy"))).to_arrays("n_cycles_used"))
+    healthy = session.Session & (lab.Subject & {"population": "healthy"})
+    used = sum(int(n) for n in (gait.GaitCycle & (fit.FitSet & healthy)).to_arrays("n_cycles_used"))
     assert built.n_cycles == used >= 30
     row = (gdi.NormativeSet & {"norm": "our-lab-v1"}).to_dicts()[0]
     assert (row["norm_n"], row["norm_angle_model"], row["norm_name"]) == (used, "pbl_body", "our-lab")
@@ -64,15 +65,7 @@ def test_built_registered_and_used(walkers: Path):
     assert shipped() == before
     pooled = norms.build_norm("our-lab", pooled_populations=("patient",))
     assert (pooled.norm, pooled.n_people, pooled.n_cycles) == ("our-lab-v3", 4, used)
-    _used_by_a_session(walkers, built.set)
-
-
-def _of(population: str):
-    return session.Session & (lab.Subject & {"population": population})
-
-
-def _used_by_a_session(walkers: Path, expected) -> None:
-    """A visit that is planned with the built set is scored with it, and its old result stays."""
+    # A visit that is planned with the built set is scored with it, and its old result stays.
     old = (gdi.SessionGdi & _sets("P01")).fetch1("session_gdi", "norm")
     assert outcomes(ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))) == ["updated"]
     populate()
@@ -80,7 +73,7 @@ def _used_by_a_session(walkers: Path, expected) -> None:
     assert set(rows) == {old[1], "our-lab-v1"}
     assert rows[old[1]]["session_gdi"] == pytest.approx(old[0])
     cycles = metrics_of({"subject": "P01", "norm": "our-lab-v1"}).trials[0].cycles
-    scored = pbl_pipeline.gait.score_gdi(cycles, expected)
+    scored = pbl_pipeline.gait.score_gdi(cycles, built.set)
     assert rows["our-lab-v1"]["session_gdi"] == pytest.approx(scored.mean, abs=1e-3)
     checks = gdi.SessionGdi.Check & _sets("P01") & {"norm": "our-lab-v1", "gdi_check": "norm_convention"}
     assert checks.fetch1("gdi_check_outcome") == "PASS"

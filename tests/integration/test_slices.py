@@ -175,14 +175,10 @@ def test_the_views_of_a_study(cohort: Path):
     cycles: Any = frames.cycle_frame({"subject": "P001", "session_label": "pre"})
     assert {"fast", "unknown"} <= set(cycles["pace"])
     assert set(cycles["activity"]) == {"walking"}
-    assert len(cycles) == sum(
-        (gait.GaitCycle & (fit.FitSelection & {"fit_current": True}).proj() & video_ids()).to_arrays("n_cycles_used")
-    )
-
-
-def video_ids() -> list[dict]:
     own = session.Session & {"subject": "P001", "session_label": "pre"}
-    return list((video.Video & own.proj()).proj().to_dicts())
+    videos = (video.Video & own.proj()).proj().to_dicts()
+    current = (fit.FitSelection & {"fit_current": True}).proj()
+    assert len(cycles) == sum((gait.GaitCycle & current & videos).to_arrays("n_cycles_used"))
 
 
 @pytest.mark.long
