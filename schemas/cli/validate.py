@@ -139,14 +139,15 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
         click.echo(f"{n} gait cycles of fit and reference in pairs" + (f": {out / 'curves.npz'}" if n else ""))
 
 
-def _write(out: Path, made: dict[str, Any], **frames: pd.DataFrame) -> None:
-    """Write tables, and the frames that they are made from as CSV files of these names."""
+def _write(out: Path, made: dict[str, Any], **frames: pd.DataFrame | None) -> None:
+    """Write tables, and the frames that they are made from as CSV files of these names (None: no such file)."""
     from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.validation import write_tables
 
     write_tables(made, out)
     for name, frame in frames.items():
-        (out / f"{name}.csv").write_bytes(frame_to_csv(frame).encode())
+        if frame is not None:
+            (out / f"{name}.csv").write_bytes(frame_to_csv(frame).encode())
 
 
 @validate.command(epilog="Example: pbl validate index --where method=paper-2025-v1 --out agreement")
@@ -231,7 +232,7 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
             click.echo(f"  {row['subject']}: {row['before']} by {old}, {row['visit']} by {new}, or the other way round")
         click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (pbl reprocess adds {new})")
     if out is not None:
-        _write(out, made, pairs=pairs, **({} if comparisons is None else {"comparisons": comparisons}))
+        _write(out, made, pairs=pairs, comparisons=comparisons)
         click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 

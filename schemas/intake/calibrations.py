@@ -146,8 +146,9 @@ def calibrations() -> list[dict[str, Any]]:
     query = lab.DeviceCalibration * lab.Device * lab.CameraCalibration.proj(..., "-device")
     rows = query.to_dicts(order_by=list(lab.DeviceCalibration.primary_key))
     for row in rows:
-        names = (row[f"device_{part}"] for part in ("make", "model", "lens"))
-        row["lens"] = PhoneLens(*names, (int(row["stored_width"]), int(row["stored_height"])), int(row["capture_rate"]))
+        make, model, lens = (row[f"device_{part}"] for part in ("make", "model", "lens"))
+        size = (int(row["stored_width"]), int(row["stored_height"]))
+        row["lens"] = PhoneLens(make, model, lens, size, int(row["capture_rate"]))
         row["n_keypoints"] = used.count(int(row["camera_id"]))
     return rows
 

@@ -260,9 +260,9 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     for key, date in dates.items():
         if key in stored and stored[key]["session_date"] != date:
             session.Session.update1({"session_id": numbers[key], "session_date": date})
-    for v in visits:
-        if v.mass_kg is not None:
-            set_mass(numbers[v.subject, v.session_label], v.mass_kg)
+    masses = {(v.subject, v.session_label): v.mass_kg for v in visits if v.mass_kg is not None}
+    for key, mass_kg in masses.items():
+        set_mass(numbers[key], mass_kg)
     return {key: numbers[key] for key in keys}
 
 
