@@ -13,7 +13,9 @@ from schemas.operations import backup_files, catalog
 
 
 def outcomes(results: Iterable[Registered]) -> list[str]:
-    """The outcome of each file: "registered", "known", ..., or the code of its error."""
+    """The outcome of each file: "registered", "known", ..., or the code of the error with which it was refused."""
+    results = list(results)
+    assert all((r.error is None) == (r.status != "refused") for r in results), results
     return [r.error.code if r.error else r.status for r in results]
 
 
