@@ -88,6 +88,15 @@ def changed(array: np.ndarray, value: float) -> np.ndarray:
     return array
 
 
+def rewritten(path: Path, *without: str, **changes: object) -> Path:
+    """An npz file without some of its fields and with others changed, written beside it."""
+    with np.load(path) as f:
+        fields = {name: f[name] for name in f.files if name not in without}
+    new = path.with_stem(f"{path.stem}-new")
+    np.savez(new, **{**fields, **changes})
+    return new
+
+
 def trc_text(rows: list[str], units: str = "mm", n_frames: int | None = None, names: str = "Hip\t\t\tHead\t\t") -> str:
     header = [
         "PathFileType\t4\t(X/Y/Z)\tC:\\walk.trc",

@@ -2,19 +2,27 @@
 
 import os
 import shutil
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
 from pbl_pipeline import settings
 from schemas import connection
-from schemas.intake import VisitRecord, ingest
+from schemas.intake import Registered, VisitRecord, ingest
 from schemas.operations import backup_files, catalog
+
+
+def outcomes(results: Iterable[Registered]) -> list[str]:
+    """The outcome of each file: "registered", "known", ..., or the code of the error with which it was refused."""
+    results = list(results)
+    assert all((r.error is None) == (r.status != "refused") for r in results), results
+    return [r.error.code if r.error else r.status for r in results]
 
 
 def register(*paths: Path, **visit) -> list[int]:
     """Ingest videos that are all new, of P001 where nothing else is said; their `video_id`s."""
     results = ingest(paths, VisitRecord(subject=visit.pop("subject", "P001"), **visit))
-    assert [r.status for r in results] == ["registered"] * len(paths), results
+    assert outcomes(results) == ["registered"] * len(paths), results
     return [r.video_id or 0 for r in results]
 
 

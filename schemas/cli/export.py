@@ -36,7 +36,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl export --help`
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder; one below it for each trial.")
 @click.option("--subject", help="Code of the subject: from the tables instead of FILES.")
-@click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
+@click.option("--session", "session_label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--all", "every", is_flag=True, help="All fitted visits of the tables, or all of --subject.")
 @click.option("--slice", "slice_name", help="The visits that count in this slice (`pbl study slice`).")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
@@ -57,12 +57,8 @@ def export(
     files: tuple[Path, ...],
     formats: tuple[str, ...],
     out: Path,
-    subject: str | None,
-    label: str | None,
     every: bool,
     slice_name: str | None,
-    fit_method: str | None,
-    fit_set_kind: str | None,
     attitude: tuple[Path, ...],
     marker_set: Path | None,
     name: str,
@@ -70,6 +66,7 @@ def export(
     markers_only: bool,
     allow_failed: bool,
     overwrite: bool,
+    **named: str | None,
 ) -> None:
     """Write the trials of one visit, or of many, for OpenSim, Visual3D, Mokka, R, pandas, movement or as Motion-BIDS.
 
@@ -81,19 +78,18 @@ def export(
     from pbl_pipeline.export import GAIT_FORMATS, ExportOptions, check_export, write_export
 
     many = every or slice_name is not None
-    if not files and subject is None and not many:
+    if not files and named["subject"] is None and not many:
         raise _usage("neither FILES nor --subject, --all or --slice", "one of them")
-    if files and (subject or label or fit_method or fit_set_kind or many):
+    if files and (any(named.values()) or many):
         raise _usage("FILES with an option that picks visits of the tables", "FILES, or visits of the tables")
-    if slice_name is not None and (every or subject or label or fit_method or fit_set_kind):
+    if slice_name is not None and (every or any(named.values())):
         raise _usage("--slice with --all, --subject, --session, --fit-method or --kind", "--slice alone: it names them")
-    if every and label:
+    if every and named["session_label"]:
         raise _usage("--all with --session", "one of them")
     if not files and (attitude or marker_set):
         raise _usage("--attitude or --marker-set without FILES", "them with FILES: the tables have the log")
     options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
     check_export(formats, out, options)
-    named = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
     wanted = {column: value for column, value in named.items() if value is not None}
     if many:
         _write_many(wanted, slice_name, formats, out, options)

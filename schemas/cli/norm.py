@@ -101,14 +101,11 @@ def build(
     populations: tuple[str, ...],
     subjects: tuple[str, ...],
     pooled: tuple[str, ...],
-    fit_method: str | None,
-    gait_method: str | None,
-    keypoint_method: str | None,
-    fit_set_kind: str | None,
     nine_angles: bool,
     variance: float,
     pace: str,
     source: str,
+    **methods: str | None,
 ) -> None:
     """Build the set NAME from the gait cycles of people in the database and register it as a new version.
 
@@ -118,8 +115,6 @@ def build(
     from schemas.norms import build_norm
 
     schemas.activate()
-    methods = {"fit_method": fit_method, "gait_method": gait_method, "keypoint_method": keypoint_method}
-    methods["fit_set_kind"] = fit_set_kind
     built = build_norm(
         name,
         populations or (() if subjects else ("healthy",)),

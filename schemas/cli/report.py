@@ -13,14 +13,12 @@ from ._kind import kind_option
 
 @click.command(epilog="Example: pbl report --subject P017 --session 2026-03-01 --out P017")
 @click.option("--subject", required=True, help="Code of the subject.")
-@click.option("--session", "label", help="Date or label of the visit; needed where the subject has several.")
+@click.option("--session", "session_label", help="Date or label of the visit; needed where the subject has several.")
 @click.option("--fit-method", help="Name of the fit method; needed where several were used.")
 @kind_option
 @LANGUAGE
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder for the files.")
-def report(
-    subject: str, label: str | None, fit_method: str | None, fit_set_kind: str | None, language: str, out: Path
-) -> None:
+def report(language: str, out: Path, **named: str | None) -> None:
     """Write report.html, overlay videos, angles and events of one visit from the tables."""
     import schemas
     from pbl_pipeline.files import check_out_folder
@@ -28,6 +26,5 @@ def report(
 
     check_out_folder(out)
     schemas.activate(methods=False)
-    wanted = {"subject": subject, "session_label": label, "fit_method": fit_method, "fit_set_kind": fit_set_kind}
-    for path in write_visit({k: v for k, v in wanted.items() if v is not None}, out, language):
+    for path in write_visit({k: v for k, v in named.items() if v is not None}, out, language):
         click.echo(path)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ._kind import kind_option
+
+if TYPE_CHECKING:
+    from pbl_pipeline.study import StudyData
 
 
 @click.command(
@@ -112,19 +116,17 @@ def export(name: str, out: Path, key: Path | None, keep_codes: bool, no_curves: 
 
     `pbl study report DIR` makes figures and tables of it, without a database.
     """
-    import schemas
     from pbl_pipeline.csv_cells import frame_to_csv
+    from pbl_pipeline.errors import os_errors_as
     from pbl_pipeline.study import deidentified, write_study
-    from schemas.studies import slices
+    from schemas.operations.folders import write_text
 
-    schemas.activate(methods=False)
-    data = slices.study_data(name, curves=not no_curves)
-    for text in slices.changes(name):
-        click.echo(f"changed since it was frozen: {text}", err=True)
+    data = load_slice(name, curves=not no_curves)
     if not keep_codes:
         data, codes = deidentified(data)
         if key is not None:
-            _write_key(key, frame_to_csv(codes))
+            with os_errors_as("FILE_UNWRITABLE", "a file for the key to the codes", "pass another --key", key):
+                write_text(key, frame_to_csv(codes))
     paths = write_study(data, out)
     click.echo(f"{data.n_subjects} persons, {data.n_visits} visits: {len(paths)} files in {out}")
 
@@ -167,14 +169,14 @@ def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     click.echo(f"{name}: added")
 
 
-def _write_key(path: Path, text: str) -> None:
-    """The key to the codes, for its owner alone. Raises FILE_UNWRITABLE."""
-    import os
+def load_slice(name: str, curves: bool = True) -> StudyData:
+    """Return the `StudyData` of a slice, also for `pbl study report --slice` (entry point `pbl.study_data`); what
+    changed since it was frozen is printed on stderr. Raises as `slices.study_data`."""
+    import schemas
+    from schemas.studies import slices
 
-    from pbl_pipeline.errors import os_errors_as
-
-    with (
-        os_errors_as("FILE_UNWRITABLE", "a file for the key to the codes", "pass another --key", path),
-        os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out,
-    ):
-        out.write(text)
+    schemas.activate(methods=False)
+    data = slices.study_data(name, curves)
+    for text in slices.changes(name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
+    return data

@@ -117,8 +117,7 @@ def tables(
 
 def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_database: bool) -> None:
     """Print the tables of the rows that `where` leaves, and write them where a folder is given."""
-    from pbl_pipeline.csv_cells import frame_to_csv
-    from pbl_pipeline.validation import paper_tables, print_tables, save_curves, write_tables
+    from pbl_pipeline.validation import paper_tables, print_tables, save_curves
 
     chosen = select(frame, where)
     if chosen.empty:
@@ -128,8 +127,7 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     print_tables(made)
     if out is None:
         return
-    write_tables(made, out)
-    (out / "errors.csv").write_bytes(frame_to_csv(chosen).encode())
+    _write(out, made, errors=chosen)
     click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
     if in_database:
         from schemas.reading.frames import validation_curves
@@ -139,6 +137,17 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
         if n:
             save_curves(curves, out / "curves.npz")
         click.echo(f"{n} gait cycles of fit and reference in pairs" + (f": {out / 'curves.npz'}" if n else ""))
+
+
+def _write(out: Path, made: dict[str, Any], **frames: pd.DataFrame | None) -> None:
+    """Write tables, and the frames that they are made from as CSV files of these names (None: no such file)."""
+    from pbl_pipeline.csv_cells import frame_to_csv
+    from pbl_pipeline.validation import write_tables
+
+    write_tables(made, out)
+    for name, frame in frames.items():
+        if frame is not None:
+            (out / f"{name}.csv").write_bytes(frame_to_csv(frame).encode())
 
 
 @validate.command(epilog="Example: pbl validate index --where method=paper-2025-v1 --out agreement")
@@ -153,9 +162,8 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     named when the visits are ingested. The published figure is printed for comparison.
     """
     import schemas
-    from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.validation import index_agreement, index_pairs, print_tables, write_tables
+    from pbl_pipeline.validation import index_agreement, index_pairs, print_tables
     from schemas.reading.frames import index_frame
 
     if out is not None:
@@ -169,8 +177,7 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     made = {"index_agreement": index_agreement(pairs)}
     print_tables(made)
     if out is not None:
-        write_tables(made, out)
-        (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
+        _write(out, made, pairs=pairs)
         click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 
@@ -192,10 +199,9 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
     is only refitted. With --tables both are methods, and every visit that has results by both counts; the comparisons
     between visits that the change touches are listed.
     """
-    from pbl_pipeline.csv_cells import frame_to_csv
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.temporary import new_folder
-    from pbl_pipeline.validation import bridge_pairs, bridge_table, print_tables, write_tables
+    from pbl_pipeline.validation import bridge_pairs, bridge_table, print_tables
 
     if new is None and (keep is None or in_tables):
         raise click.UsageError("Missing argument 'NEW' (or --keep DIR, which refits by OLD alone).")
@@ -226,10 +232,7 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
             click.echo(f"  {row['subject']}: {row['before']} by {old}, {row['visit']} by {new}, or the other way round")
         click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (pbl reprocess adds {new})")
     if out is not None:
-        write_tables(made, out)
-        (out / "pairs.csv").write_bytes(frame_to_csv(pairs).encode())
-        if comparisons is not None:
-            (out / "comparisons.csv").write_bytes(frame_to_csv(comparisons).encode())
+        _write(out, made, pairs=pairs, comparisons=comparisons)
         click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 

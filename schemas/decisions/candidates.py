@@ -38,22 +38,20 @@ def candidates(video_id: int, tracking_method: str | None = None) -> list[Candid
     out, found = [], (tracking.Tracking & key).keys()
     for tracked in found:
         persons = sorted(int(p) for p in (tracking.Tracking.Person & tracked).to_arrays("person_id"))
-        rows = (tracking.SubjectChoice & tracked).to_dicts()
-        if not rows:
-            decided = (tracking.SubjectOverride & tracked).to_arrays("override_person_id")
-            chosen = int(decided[0]) if len(decided) else None
-            out.append(Candidates(dict(tracked), name, "TRACKED", chosen, "", dict.fromkeys(persons)))
-            continue
-        scores = {int(k): v for k, v in rows[0]["choice_scores"].items()}
+        status, reason, scores = "TRACKED", "", {}
+        if rows := (tracking.SubjectChoice & tracked).to_dicts():
+            status, reason, chosen = (rows[0][k] for k in ("choice_status", "choice_reason", "chosen_person_id"))
+            scores = {int(k): v for k, v in rows[0]["choice_scores"].items()}
+        else:
+            chosen = next(iter((tracking.SubjectOverride & tracked).to_arrays("override_person_id")), None)
         ranked = sorted(persons, key=lambda p: -(scores.get(p) or 0.0))
-        chosen = rows[0]["chosen_person_id"]
         out.append(
             Candidates(
                 key=dict(tracked),
                 name=name,
-                status=rows[0]["choice_status"],
+                status=status,
                 chosen=None if chosen is None else int(chosen),
-                reason=rows[0]["choice_reason"],
+                reason=reason,
                 scores={p: scores.get(p) for p in ranked},
             )
         )

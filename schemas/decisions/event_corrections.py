@@ -12,10 +12,9 @@ from pbl_pipeline.errors import PblError
 from .. import fit, gait, video
 from ..plan import locked
 from ..reading.objects import load_trial_fit
-from ..review import Decision
 from ..rows import delete_below, utc_now
 from ..transactions import repeated
-from .review_decisions import meanwhile, record
+from .review_decisions import last_decision, meanwhile, record
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -69,7 +68,7 @@ def shown_events(video_id: int) -> ShownEvents | None:
     counts = gait.correction_of(key)
     about = {} if counts is None else (gait.EventCorrection & counts).fetch1()
     hand = [] if counts is None else (gait.EventCorrection.Event & counts).to_dicts(order_by="corrected_no")
-    last = (Decision & {"video_id": key["video_id"], "decision_what": "events"}).to_arrays("decision_id")
+    last = last_decision(key["video_id"], "events")
     computed = (gait.GaitEvents & key).fetch1("events_computed")
     return ShownEvents(
         key=key,
@@ -79,7 +78,7 @@ def shown_events(video_id: int) -> ShownEvents | None:
         at=about.get("correction_at"),
         n_changed=int(about.get("correction_changed", 0)),
         stale=counts is None and bool(_standing(key)),
-        state=f"{max(map(int, last), default=0)}-{key['gait_method']}-{computed}-{key['fit_set']}",
+        state=f"{last}-{key['gait_method']}-{computed}-{key['fit_set']}",
     )
 
 

@@ -62,11 +62,16 @@ def decisions(session_id: int) -> tuple[Decided, ...]:
     return tuple(_decided(row) for row in rows)
 
 
+def last_decision(video_id: int, what: str) -> int:
+    """Return the number of the last decision of a kind about a recording, 0 if there is none."""
+    of_kind = Decision & {"video_id": video_id, "decision_what": what}
+    return max((int(n) for n in of_kind.to_arrays("decision_id")), default=0)
+
+
 def person_state(video_id: int, tracking_method: str) -> str:
     """Return a text for the state of the choice in a video that each decision changes, also one by `pbl choose`."""
     key = {"video_id": video_id, "tracking_method": tracking_method}
-    of_person = Decision & {"video_id": video_id, "decision_what": "person"}
-    last = max((int(n) for n in of_person.to_arrays("decision_id")), default=0)
+    last = last_decision(video_id, "person")
     by_hand = (tracking.SubjectOverride & key).to_arrays("override_person_id")
     chosen = (tracking.SubjectChoice & key).to_arrays("chosen_person_id")
     return f"{last}-{by_hand[0] if len(by_hand) else ''}-{chosen[0] if len(chosen) else ''}"
@@ -105,9 +110,8 @@ def decide_person(
 
 def usable_state(video_id: int) -> str:
     """Return a text for the mark of a recording that each decision changes."""
-    last = (Decision & {"video_id": video_id, "decision_what": "usable"}).to_arrays("decision_id")
     marked = (video.NotUsable & {"video_id": video_id}).to_dicts()
-    return f"{max(map(int, last), default=0)}-{marked[0]['unusable_reason'] if marked else ''}"
+    return f"{last_decision(video_id, 'usable')}-{marked[0]['unusable_reason'] if marked else ''}"
 
 
 def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", seen: str | None = None) -> None:

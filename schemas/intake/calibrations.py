@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +74,7 @@ class Change:
     camera_id: int | None  # its number now, None: removed
     before: int | None  # its number before, None: there was none
     deleted: dict[str, int]  # deleted rows by table
+    videos: frozenset[int]  # whose keypoints were deleted
 
 
 def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
@@ -86,7 +87,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
 
     found = load_lens_calibration(file, like)
 
-    def insert() -> list[_Outdated]:
+    def insert() -> list[Change]:
         key = {"device": _device(found.lens), **lab.mode_columns(found.lens)}
         row = {
             **key,
@@ -117,11 +118,7 @@ def remove_calibration(camera_id: int) -> list[Change]:
     return _retried(in_transaction(lambda: [_replace(key, None) for key in keys]))
 
 
-#: A change, and the keys of the keypoints that it makes outdated.
-_Outdated = tuple[Change, list[dict[str, Any]]]
-
-
-def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> _Outdated:
+def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> Change:
     """Put a row of DeviceCalibration, or none, in the place of that with this key; delete the outdated keypoints."""
     before = (lab.DeviceCalibration & key).to_dicts()
     (lab.DeviceCalibration & key).delete_quick()
@@ -129,32 +126,30 @@ def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> _Outdated:
         lab.DeviceCalibration.insert1(row)
     outdated = _outdated(key)
     now, old = (None if r is None else int(r["camera_id"]) for r in (row, before[0] if before else None))
-    return Change(key["device"], now, old, delete_below(keypoints.Keypoints, outdated)), outdated
+    deleted = delete_below(keypoints.Keypoints, outdated)
+    return Change(key["device"], now, old, deleted, frozenset(key["video_id"] for key in outdated))
 
 
-def _retried(changes: Sequence[_Outdated]) -> list[Change]:
+def _retried(changes: list[Change]) -> list[Change]:
     """Forget errors of the other calibration. Not in a transaction: it may declare job tables."""
-    for video_id in sorted({key["video_id"] for _, outdated in changes for key in outdated}):
+    for video_id in sorted(frozenset().union(*(change.videos for change in changes))):
         forget_errors(video_id)
-    return [change for change, _ in changes]
+    return changes
 
 
 def calibrations() -> list[dict[str, Any]]:
-    """The calibrations of devices: rows of DeviceCalibration and CameraCalibration, `lens` (the library's `PhoneLens`)
-    and `n_keypoints`, the keypoints that were made with each."""
+    """The calibrations of devices: rows of DeviceCalibration, Device and CameraCalibration, `lens` (the library's
+    `PhoneLens`) and `n_keypoints`, the keypoints that were made with each."""
     from pbl_pipeline.video import PhoneLens
 
     used = [int(n) for n in (keypoints.Keypoints & "keypoints_camera_id IS NOT NULL").to_arrays("keypoints_camera_id")]
-    rows = []
-    for row in lab.DeviceCalibration.to_dicts(order_by=list(lab.DeviceCalibration.primary_key)):
-        device = (lab.Device & {"device": row["device"]}).fetch1()
-        camera = (lab.CameraCalibration & {"camera_id": row["camera_id"]}).fetch1()
-        camera.pop("device")
+    query = lab.DeviceCalibration * lab.Device * lab.CameraCalibration.proj(..., "-device")
+    rows = query.to_dicts(order_by=list(lab.DeviceCalibration.primary_key))
+    for row in rows:
+        make, model, lens = (row[f"device_{part}"] for part in ("make", "model", "lens"))
         size = (int(row["stored_width"]), int(row["stored_height"]))
-        lens = PhoneLens(
-            device["device_make"], device["device_model"], device["device_lens"], size, int(row["capture_rate"])
-        )
-        rows.append({**camera, **row, "lens": lens, "n_keypoints": used.count(int(row["camera_id"]))})
+        row["lens"] = PhoneLens(make, model, lens, size, int(row["capture_rate"]))
+        row["n_keypoints"] = used.count(int(row["camera_id"]))
     return rows
 
 

@@ -18,6 +18,8 @@ from .sheets import needed, number_of, read_sheets, refused
 
 VIEWS = ("left", "right", "front", "any")
 COLUMNS = ("activity", "pace", "view", "passes")
+#: Column of Protocol.Step -> field of `Step`.
+_STEP = {"step_no": "number", **{f"step_{name}": name for name in COLUMNS}}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,15 +75,7 @@ def add_protocol(name: str, steps: Sequence[Step]) -> bool:
     def insert() -> None:
         Protocol.insert1({"protocol": name, "protocol_created": utc_now()})
         Protocol.Step.insert(
-            {
-                "protocol": name,
-                "step_no": step.number,
-                "step_activity": step.activity,
-                "step_pace": step.pace,
-                "step_view": step.view,
-                "step_passes": step.passes,
-            }
-            for step in steps
+            {"protocol": name, **{column: getattr(step, field) for column, field in _STEP.items()}} for step in steps
         )
 
     in_transaction(insert)
@@ -105,6 +99,4 @@ def steps_of(session_id: int) -> list[Step]:
 
 def _steps(name: str) -> list[Step]:
     rows = (Protocol.Step & {"protocol": name}).to_dicts(order_by="step_no")
-    return [
-        Step(int(r["step_no"]), r["step_activity"], r["step_pace"], r["step_view"], int(r["step_passes"])) for r in rows
-    ]
+    return [Step(**{field: row[column] for column, field in _STEP.items()}) for row in rows]

@@ -70,8 +70,8 @@ def ingest_sheet(sheet: Path, methods: Methods | None = None, dry_run: bool = Fa
             one.read()
             sha256, file = one.files[0].sha256, row.cells["file"]
             if (first := seen.setdefault(sha256, row.where)) != row.where:
-                error = conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
-                line.errors.append(error.with_key(line.where))
+                with line.about():
+                    raise conflict(f"the same bytes as in {first}", "each recording once", "remove one of the rows")
             if visit is None or line.errors:
                 one.complete(chosen)
                 continue
@@ -178,19 +178,19 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
             continue
         key, whose = (visit.subject, visit.session_label), f"{visit.subject}, {visit.session_label}"
         if others := similar.get(visit.subject):
-            error = conflict(
-                f"the codes {visit.subject} and {', '.join(others)}",
-                "one code for one person, or codes that differ by more than case, zeros and hyphens",
-                "write the same code",
-            )
-            line.errors.append(error.with_key(line.where))
+            with line.about():
+                raise conflict(
+                    f"the codes {visit.subject} and {', '.join(others)}",
+                    "one code for one person, or codes that differ by more than case, zeros and hyphens",
+                    "write the same code",
+                )
         if visit.date is not None and dates.get(key) not in (None, visit.date):
-            error = conflict(
-                f"date {visit.date} of {whose}, registered with {dates[key]}",
-                "one day for one visit",
-                "two visits need two labels; a wrong day is corrected by `pbl study import`",
-            )
-            line.errors.append(error.with_key(line.where))
+            with line.about():
+                raise conflict(
+                    f"date {visit.date} of {whose}, registered with {dates[key]}",
+                    "one day for one visit",
+                    "two visits need two labels; a wrong day is corrected by `pbl study import`",
+                )
         for what in ("date", "population", "project", "height_m", "mass_kg"):
             value = getattr(visit, what)
             if value is not None:

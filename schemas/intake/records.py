@@ -278,7 +278,8 @@ def add_people(visits: Iterable[VisitRecord]) -> None:
     lab.Subject.insert(new, skip_duplicates=True)
     for v in visits:
         set_population(v.subject, v.population)
-        set_height(v.subject, v.height_m)
+        if v.height_m is not None:
+            set_height(v.subject, v.height_m)
 
 
 def set_population(subject: str, population: str | None) -> list[str]:
@@ -292,16 +293,11 @@ def set_population(subject: str, population: str | None) -> list[str]:
 
 
 def set_height(subject: str, height_m: float | None) -> list[str]:
-    """State the body height (m) of a registered person (None: as it is); returns what changed, in words.
+    """State the body height (m) of a registered person, None to remove it; returns what changed, in words.
 
     Fits of videos of one camera that were told another height are deleted with their dependent results, so that the
     next populate recomputes them. Call it inside a transaction.
     """
-    return [] if height_m is None else replace_height(subject, height_m)
-
-
-def replace_height(subject: str, height_m: float | None) -> list[str]:
-    """Set the height as `set_height` does; None removes it."""
     key = {"subject": subject}
     if number((lab.Subject & key).fetch1("subject_height")) == height_m:
         return []
@@ -314,16 +310,11 @@ def replace_height(subject: str, height_m: float | None) -> list[str]:
 
 
 def set_mass(session_id: int, mass_kg: float | None) -> list[str]:
-    """State the body mass (kg) of the person at a visit (None: as it is); returns what changed, in words.
+    """State the body mass (kg) of the person at a visit, None to remove it; returns what changed, in words.
 
     Forces that were told another mass are deleted, so that the next populate recomputes them. Call it inside a
     transaction.
     """
-    return [] if mass_kg is None else replace_mass(session_id, mass_kg)
-
-
-def replace_mass(session_id: int, mass_kg: float | None) -> list[str]:
-    """Set the mass as `set_mass` does; None removes it."""
     key = {"session_id": session_id}
     session.lock(session_id)  # who inserts forces waits here, then reads this mass
     stored = (session.BodyMass & key).to_arrays("body_mass")

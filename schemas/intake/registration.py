@@ -252,7 +252,7 @@ def _update(
 def _update_file(
     one: Recording, file: File, row: Mapping[str, Any], chosen: Mapping[str, str], named: set[str]
 ) -> Registered:
-    number, visit = int(row["video_id"]), one.visit
+    number, session_id, visit = int(row["video_id"]), int(row["session_id"]), one.visit
     status, notes = "known", [f"already video_id {number} of subject {row['subject']}, session {row['session_label']}"]
     if str(file.path) != row["video_path"] and not Path(row["video_path"]).is_file():
         video.Video.update1({"video_id": number, "video_path": str(file.path), "video_name": file.path.name[-255:]})
@@ -261,13 +261,13 @@ def _update_file(
         notes.append(f"it was {row['video_path']}, which is gone")
 
     def work() -> list[str]:
-        return [
-            *plan_named(number, int(row["session_id"]), chosen, named),
-            *set_condition(number, visit.activity, visit.pace),
-            *set_population(row["subject"], visit.population),
-            *set_height(row["subject"], visit.height_m),
-            *set_mass(int(row["session_id"]), visit.mass_kg),
-        ]
+        done = plan_named(number, session_id, chosen, named)
+        done += set_condition(number, visit.activity, visit.pace) + set_population(row["subject"], visit.population)
+        if visit.height_m is not None:
+            done += set_height(row["subject"], visit.height_m)
+        if visit.mass_kg is not None:
+            done += set_mass(session_id, visit.mass_kg)
+        return done
 
     changes = one.update(row) + in_transaction(work)
     if changes and status == "known":

@@ -91,8 +91,9 @@ def freeze(
     def work() -> Slice:
         visits = _candidates(cohort, roles)
         chain = _chain(visits, with_keys(methods or {}))
-        rows = _decided(visits, chain, cohort)
-        said = " ".join(filter(None, (note, _absent(visits, cohort))))[:1000]
+        members = [] if cohort is None else (study.CohortMember & {"cohort": cohort}).to_dicts()
+        rows = _decided(visits, chain, members)
+        said = " ".join(filter(None, (note, _absent(visits, members))))[:1000]
         about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
@@ -235,9 +236,8 @@ def _measured(visits: Any) -> Any:
     return sets * of_set * gdi.SessionGdi.proj(*columns) & inside("session_id", map(int, visits["session_id"]))
 
 
-def _decided(visits: Any, chain: Mapping[str, str | None], cohort: str | None) -> Any:
+def _decided(visits: Any, chain: Mapping[str, str | None], members: Sequence[Mapping[str, Any]]) -> Any:
     """The visits with their set of videos, and whether each counts."""
-    members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
     left_out = {m["subject"]: m["member_reason"] for m in members if not m["member_included"]}
     measured = {int(r["session_id"]): r for r in (_measured(visits) & dict(chain)).to_dicts()}
     taken: set[tuple[str, str]] = set()
@@ -261,22 +261,16 @@ def _decided(visits: Any, chain: Mapping[str, str | None], cohort: str | None) -
     return visits.rename(columns=columns).assign(fit_set=fit_set, included=included, reason=reasons)
 
 
-def _absent(visits: Any, cohort: str | None) -> str:
+def _absent(visits: Any, members: Sequence[Mapping[str, Any]]) -> str:
     """A sentence on the people of a cohort who have none of the visits; "" if there are none."""
-    members = (study.CohortMember & {"cohort": cohort}).to_dicts() if cohort is not None else []
     there = set(visits["subject"])
     absent = [m for m in members if m["subject"] not in there]
     if not absent:
         return ""
     reasons = Counter(m["member_reason"] or "no reason stated" for m in absent if not m["member_included"])
     why = ", ".join(f"{n} excluded: {reason}" for reason, n in sorted(reasons.items()))
-    return (
-        _line(
-            f"{len(absent)} of {len(members)} people of the cohort have none of these visits"
-            + (f" ({why})" if why else "")
-        )
-        + "."
-    )
+    said = f"{len(absent)} of {len(members)} people of the cohort have none of these visits"
+    return _line(f"{said} ({why})" if why else said) + "."
 
 
 def _line(text: str) -> str:
@@ -318,16 +312,7 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
 
     scores = frame_of(study.ClinicalScore & ids).merge(key, on="session_id")
     instruments = frame_of(study.ClinicalInstrument & (study.ClinicalScore & ids).proj("instrument"))
-    named = instruments.rename(
-        columns={
-            "instrument_unit": "unit",
-            "instrument_low": "low",
-            "instrument_high": "high",
-            "minimal_change": "mic",
-            "instrument_classes": "classes",
-            "minimal_change_classes": "mic_classes",
-        }
-    )
+    named = instruments.rename(columns=lambda c: c.removeprefix("instrument_").replace("minimal_change", "mic"))
     sources = [
         "; ".join(filter(None, (a, f"minimal important change: {b}" if b else "")))[:200]
         for a, b in zip(instruments["instrument_source"], instruments["minimal_change_source"], strict=True)
@@ -356,14 +341,8 @@ def _measures(sets: Any, index: Any, chain: Mapping[str, str], of_sets: Any) -> 
     """Long: measures of both sides and of each, the index and the Gait Profile Score of a side."""
     import pandas as pd
 
-    own = (gdi.SessionGdi.Measure & chain & of_sets).proj(
-        "session_measure_mean",
-        "session_measure_left",
-        "session_measure_right",
-        "session_measure_sd",
-        "session_measure_n",
-    )
-    rows = frame_of(own).rename(columns={"session_measure": "measure", "session_measure_n": "n_cycles"})
+    own = frame_of(gdi.SessionGdi.Measure & chain & of_sets)
+    rows = own.rename(columns={"session_measure": "measure", "session_measure_n": "n_cycles"})
     parts = []
     for column, side in _SIDES.items():
         part = rows.assign(side=side, value=rows[f"session_measure_{column}"].astype(float), sd=np.nan)

@@ -228,14 +228,12 @@ class _Plan:
 
     def _wrong_cells(self, row: Row, line: Line, kind: tuple[str, ...]) -> set[str]:
         """Return the columns of a row whose cells are wrong by themselves, or empty and needed; each is an error."""
-        wrong = set()
-        for column in dict.fromkeys((*(SCORE_COLUMNS if kind is SCORE_COLUMNS else ()), *row.cells)):
-            before = len(line.errors)
+        wrong = dict.fromkeys((*(SCORE_COLUMNS if kind is SCORE_COLUMNS else ()), *row.cells))
+        for column in tuple(wrong):
             with line.about():
                 self._check_cell(row, column, needed(row, column), kind)
-            if len(line.errors) > before:
-                wrong.add(column)
-        return wrong
+                del wrong[column]
+        return set(wrong)
 
     def _check_cell(self, row: Row, column: str, text: str, kind: tuple[str, ...]) -> None:
         if kind is TRIAL_COLUMNS or column == "instrument":
@@ -325,12 +323,9 @@ class _Plan:
         cohort = needed(row, "cohort")
         stated = self.members.setdefault((cohort, code), _Stated(row, {}))
         for column, name in MEMBER_COLUMNS.items():
-            if column not in row.cells:
-                continue
-            value: Any = row.cells[column]
-            if column == "included":
-                value = _flag(row, column)
-            self._same(row, stated, name, value, f"{column} in {cohort}", code)
+            if column in row.cells:
+                value = _flag(row, column) if column == "included" else row.cells[column]
+                self._same(row, stated, name, value, f"{column} in {cohort}", code)
 
     def _long_score(self, row: Row) -> None:
         key = self._session(row, self._person(row))
@@ -441,12 +436,12 @@ class _Plan:
         if day is None or not isinstance(event, datetime.date):
             return
         days = (day - event).days
-        given = stated.values.get("visit_days", merged.get("visit_days") if "visit_days" not in stated.values else None)
+        given = stated.values.get("visit_days", merged.get("visit_days"))
         if isinstance(given, int) and given != days:
             raise conflict(
                 f"{given} days, {day} and an intervention on {event}", f"{days} days", "correct one of the three"
             )
-        if "visit_days" not in stated.values and merged.get("visit_days") is None:
+        if given is None:
             stated.values["visit_days"] = days
         after = study.role_days(role)
         if after is not None and (days > 0 if after < 0 else days < 0):

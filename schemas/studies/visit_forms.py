@@ -6,6 +6,7 @@ Each change is a row of Decision. Role and scores are checked and written as the
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Collection, Mapping
@@ -16,7 +17,7 @@ from pbl_pipeline.names import check_height, check_label, check_mass
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import decisions, record
-from ..intake.records import replace_height, replace_mass, set_condition, set_population
+from ..intake.records import set_condition, set_height, set_mass, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..subject_codes import check_subject
 from ..transactions import in_transaction
@@ -30,7 +31,8 @@ DISTINCT = "distinct"
 FACTS = {"height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
 #: Prefixes of the names of the fields of a recording, followed by its video_id.
 ACTIVITY, PACE = "activity:", "pace:"
-_NUMBERS = ("height_m", "mass_kg")
+#: Fields that are numbers, and their checks.
+_NUMBERS = {"height_m": check_height, "mass_kg": check_mass}
 #: Kind of decision by the first part of a field's name.
 _KINDS = {
     "height_m": "height",
@@ -97,11 +99,11 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
             errors[name] = refused("nothing", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
-        "visit": lambda text: check_label("visit", text, NEW["visit"]),
+        "visit": functools.partial(check_label, "visit", longest=NEW["visit"]),
         "date": lambda text: date_of(Row("date", {"date": text}), "date"),
         "role": lambda text: check_role(text, "role"),
-        "population": lambda text: check_label("population", text, NEW["population"]),
-        "height_m": _height,
+        "population": functools.partial(check_label, "population", longest=NEW["population"]),
+        "height_m": functools.partial(_number, "height_m"),
     }
     _check({name: given[name] for name in checks if name in given}, checks, errors)
     of_visit = {"subject": given.get("subject", ""), "session_label": given.get("visit", "")}
@@ -231,10 +233,9 @@ def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str]
 def _correct(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tuple[str, ...], dict[str, PblError]]:
     changed = {name: text for name, text in given.items() if not now.same(name, text)}
     checks: dict[str, Callable[[str], Any]] = {
-        "height_m": _height,
-        "mass_kg": _mass,
-        **{n: _label(n, FACTS[n]) for n in ("population", "assistive_device", "orthosis")},
-        **{n: _label(n.partition(":")[0], 32) for n in changed if ":" in n},
+        **{n: functools.partial(_number, n) for n in _NUMBERS},
+        **{n: functools.partial(check_label, n, longest=m) for n, m in FACTS.items() if n not in _NUMBERS},
+        **{n: functools.partial(check_label, n.partition(":")[0], longest=32) for n in changed if ":" in n},
     }
     errors: dict[str, PblError] = {}
     _check({name: text for name, text in changed.items() if text}, checks, errors)
@@ -277,9 +278,9 @@ def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
     for name, text in changed.items():
         kind, _, number = name.partition(":")
         if name == "height_m":
-            replace_height(now.subject, _height(text) if text else None)
+            set_height(now.subject, _number(name, text) if text else None)
         elif name == "mass_kg":
-            replace_mass(now.session_id, _mass(text) if text else None)
+            set_mass(now.session_id, _number(name, text) if text else None)
         elif name == "population":
             set_population(now.subject, text or "unknown")
         elif number:
@@ -302,19 +303,10 @@ def _check(given: Mapping[str, str], checks: Mapping[str, Callable[[str], Any]],
             errors[name] = error
 
 
-def _label(name: str, longest: int) -> Callable[[str], None]:
-    return lambda text: check_label(name, text, longest)
-
-
-def _height(text: str) -> float:
-    value = number_of(Row("height", {}), "height", text[:40])
-    check_height(value)
-    return value
-
-
-def _mass(text: str) -> float:
-    value = number_of(Row("mass", {}), "mass", text[:40])
-    check_mass(value)
+def _number(name: str, text: str) -> float:
+    what = _KINDS[name]
+    value = number_of(Row(what, {}), what, text[:40])
+    _NUMBERS[name](value)
     return value
 
 

@@ -61,11 +61,19 @@ def module_tables(
 
 
 @pytest.fixture
-def drop(tables: None, tmp_path: Path) -> Path:
-    """An empty drop folder."""
+def drop(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty drop folder, which PBL_INCOMING names."""
     folder = tmp_path / "uploads"
     folder.mkdir()
+    monkeypatch.setenv("PBL_INCOMING", str(folder))
     return folder
+
+
+@pytest.fixture
+def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the archive, which PBL_ARCHIVE names; whoever writes first makes it."""
+    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    return tmp_path / "archive"
 
 
 @pytest.fixture(scope="session")

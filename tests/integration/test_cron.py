@@ -8,26 +8,26 @@ import time
 from pathlib import Path, PurePosixPath
 
 import pytest
-from click.testing import CliRunner
 
 import schemas
-from pbl_pipeline.errors import PblError
-from research.benchmarks.many_recordings import archived, register_many
 from schemas import connection, lab, session, tracking, video
-from schemas.intake import VisitRecord, uploads
+from schemas.intake import uploads
 from schemas.operations.orphans import orphans, remove
+from tests.command import pbl
 from tests.rows import register
 from workers import incoming
-from workers.cli.cron import cron
 from workers.heartbeat import Silent
 from workers.loop import Worker
+from workers.populate import populate
 
 from . import chain
 from .drop import codes, files, look, twice, upload
 
+#: A phone's log of four seconds.
+LOG = "time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200))
 
-def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+
+def test_whole_files_are_taken_checked_and_registered(drop: Path, archive: Path):
     content = upload(drop, "P001/2026-11-20/walk.mp4").read_bytes()
     upload(drop, "P002/2026-11-20/walk.MOV", "other")
     (drop / "notes.txt").write_text("no place in the layout")
@@ -48,8 +48,7 @@ def test_whole_files_are_taken_checked_and_registered(drop: Path, tmp_path: Path
     assert (len(video.VideoInfo()), one.failed) == (2, 0)
 
 
-def test_a_file_that_grows_is_left_until_it_is_whole(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_a_file_that_grows_is_left_until_it_is_whole(drop: Path, archive: Path):
     path = upload(drop, "P001/1/walk.mp4")
     content = path.read_bytes()
     path.write_bytes(content[:1000])
@@ -62,11 +61,9 @@ def test_a_file_that_grows_is_left_until_it_is_whole(drop: Path, tmp_path: Path)
     assert look(drop, archive, settled_s=0.05).registered == ["P001/1/walk.mp4"]
 
 
-def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_the_phones_log_comes_along(drop: Path, archive: Path):
     upload(drop, "P001/1/walk.mp4")
-    lines = ["time_s,qw,qx,qy,qz"] + [f"{0.02 * i},1,0,0,0" for i in range(200)]
-    (drop / "P001/1/walk.csv").write_text("\n".join(lines))
+    (drop / "P001/1/walk.csv").write_text(LOG)
     assert twice(drop, archive).registered == ["P001/1/walk.mp4"]
     assert files(drop) == []
     stored, log = sorted(files(archive), key=lambda name: name.endswith(".csv"))
@@ -75,29 +72,18 @@ def test_the_phones_log_comes_along(drop: Path, tmp_path: Path):
     assert video.Video.fetch1("camera_motion") == "handheld"
 
 
-def test_a_video_waits_for_the_log_that_is_on_its_way(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_a_video_waits_for_the_log_that_is_on_its_way(drop: Path, archive: Path):
     upload(drop, "P001/1/walk.mp4")
     look(drop, archive, settled_s=0.0)
     log = drop / "P001/1/walk.csv"
-    log.write_text("time_s,qw,qx,qy,qz\n")  # still being uploaded
+    log.write_text(LOG[:20])  # still being uploaded
     assert look(drop, archive, settled_s=0.0).registered == []
-    log.write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200)))
+    log.write_text(LOG)
     assert twice(drop, archive).registered == ["P001/1/walk.mp4"]
     assert len(video.PhoneAttitude()) == 1
 
 
-def test_a_log_that_cannot_be_read_is_kept_aside_with_its_video(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
-    upload(drop, "P001/1/walk.mp4")
-    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\nnan,1,0,0,0\n")
-    assert codes(twice(drop, archive)) == {"P001/1/walk.mp4": "PHONE_LOG"}
-    assert (files(drop), len(video.Video())) == ([], 0)
-    assert [Path(name).suffix for name in files(archive)] == [".mp4", ".csv", ".txt"]
-
-
-def test_what_grows_while_it_is_copied_is_left(drop: Path, tmp_path: Path, monkeypatch):
-    archive = tmp_path / "archive"
+def test_what_grows_while_it_is_copied_is_left(drop: Path, archive: Path, monkeypatch):
     path = upload(drop, "P001/1/walk.mp4")
     look(drop, archive, settled_s=0.0)
     real = uploads.Folder.open
@@ -117,8 +103,7 @@ def test_what_grows_while_it_is_copied_is_left(drop: Path, tmp_path: Path, monke
     assert [p.name for p in archive.rglob("*") if p.is_file()] == ["seen.json"]
 
 
-def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, archive: Path):
     content = upload(drop, "P001/1/walk.mp4").read_bytes()
     twice(drop, archive)
     (drop / "P001/2").mkdir()
@@ -131,8 +116,7 @@ def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, tmp_path: P
     assert files(drop) == []
 
 
-def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_path: Path, monkeypatch):
-    archive = tmp_path / "archive"
+def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, archive: Path, monkeypatch):
     upload(drop, "P001/1/walk.mp4")
     real = incoming.register
 
@@ -152,10 +136,9 @@ def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, tmp_
 
 
 @pytest.mark.parametrize("n", [2, 3], ids=["at the video", "at its log"])  # the first is the list of what lies there
-def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path, tmp_path: Path, monkeypatch, n: int):
-    archive = tmp_path / "archive"
+def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path, archive: Path, monkeypatch, n: int):
     upload(drop, "P001/1/walk.mp4")
-    (drop / "P001/1/walk.csv").write_text("time_s,qw,qx,qy,qz\n" + "".join(f"{0.02 * i},1,0,0,0\n" for i in range(200)))
+    (drop / "P001/1/walk.csv").write_text(LOG)
     look(drop, archive)
     calls = []
 
@@ -174,23 +157,23 @@ def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path,
     assert look(drop, archive).registered == ["P001/1/walk.mp4"]
 
 
-def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_what_cannot_be_registered_is_kept_with_its_reason(drop: Path, archive: Path):
     upload(drop, "Jane Doe/1/walk.mp4")
     (drop / "P001/1").mkdir(parents=True)
     (drop / "P001/1/empty.mp4").touch()
-    taken = twice(drop, archive)
-    assert codes(taken) == {"Jane Doe/1/walk.mp4": "USAGE", "P001/1/empty.mp4": "VIDEO_EMPTY"}
+    upload(drop, "P002/1/walk.mp4").with_suffix(".csv").write_text("time_s,qw,qx,qy,qz\nnan,1,0,0,0\n")
+    expected = {"Jane Doe/1/walk.mp4": "USAGE", "P001/1/empty.mp4": "VIDEO_EMPTY", "P002/1/walk.mp4": "PHONE_LOG"}
+    assert codes(twice(drop, archive)) == expected
     assert files(drop) == []
     assert len(video.Video()) == 0
     names = files(archive)
     assert all(n.startswith("_refused/") for n in names)
     assert not (archive / "Jane Doe").exists()  # a folder would keep a name
-    assert len([n for n in names if n.endswith(".txt")]) == 2
+    assert len([n for n in names if n.endswith(".txt")]) == 3
+    assert [Path(n).suffix for n in names if "P002" in n] == [".mp4", ".csv", ".txt"]  # with its log
 
 
-def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path, archive: Path):
     hostile = drop / "P001" / "a..%2f..%2fetc" / "b..\\..\\x;rm -rf $(touch hacked) \x1b[2J.mp4"
     hostile.parent.mkdir(parents=True)
     chain.small_video(tmp_path, "x", n=60).rename(hostile)
@@ -211,36 +194,21 @@ def test_places_that_an_object_store_can_hold_but_the_layout_does_not(name: str)
 
 def test_the_command_says_what_it_needs(tables: None, monkeypatch):
     monkeypatch.delenv("PBL_INCOMING", raising=False)
-    result = CliRunner().invoke(cron, ["import"])
-    assert isinstance(result.exception, PblError)
-    assert result.exception.code == "USAGE"
-
-
-def test_another_persons_bytes_are_refused_among_many(tables: None):
-    visit = VisitRecord("P001", "2026-01-02")
-    one = archived("a.mp4", "1" * 64, 9, visit)
-    assert register_many([one, one]) == {"registered": 1, "known": 1}
-    with pytest.raises(PblError, match=r"(?s)P001, session 2026-01-02.*subject P002") as error:
-        register_many(
-            [archived("b.mp4", "1" * 64, 9, VisitRecord("P002", "2026-01-02")), archived("a.mp4", "2" * 64, 9, visit)]
-        )
-    assert error.value.code == "VIDEO_DUPLICATE"
-    assert len(video.Video()) == 1
+    assert pbl("cron", "import").error_code == "USAGE"
 
 
 def test_all_other_jobs_run(tables: None, tmp_path: Path):
-    path = chain.small_video(tmp_path, "walk")
-    register_many([archived(str(path), "0" * 64, path.stat().st_size, VisitRecord("P001"))])
+    register(chain.small_video(tmp_path, "walk"))
     for words, said in (
-        (["refresh"], "1 of VideoInfo"),
-        (["release"], "no dead"),
-        (["reprocess"], "nothing to try again"),
-        (["summary", "--out", str(tmp_path / "out")], "new videos"),
-        (["disk", "--least-free", "0"], "files without a row: 0"),
+        (("refresh",), "1 of VideoInfo"),
+        (("release",), "no dead"),
+        (("reprocess",), "nothing to try again"),
+        (("summary", "--out", tmp_path / "out"), "new videos"),
+        (("disk", "--least-free", 0), "files without a row: 0"),
     ):
-        result = CliRunner().invoke(cron, words)
-        assert result.exit_code == 0, (words, result.output, result.exception)
-        assert said in result.output
+        done = pbl("cron", *words)
+        assert done.code == 0, done.err
+        assert said in done.out
     (page,) = (tmp_path / "out").glob("*.html")
     assert "<script" not in page.read_text()
 
@@ -248,7 +216,7 @@ def test_all_other_jobs_run(tables: None, tmp_path: Path):
 def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp_path: Path):
     before = orphans(young_s=0.0)
     register(chain.small_video(tmp_path, "walk"))
-    Worker(schemas.computed_tables(), Silent()).run(once=True)
+    populate(["VideoInfo", "Tracking"])
     found = orphans(young_s=0.0)
     assert (found.lost, len(found.orphans)) == ([], len(before.orphans))
     assert found.n_files > before.n_files

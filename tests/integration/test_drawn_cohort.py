@@ -196,10 +196,10 @@ def test_the_report_is_the_same_from_cohort_tables_and_folder(from_tables: Study
     for other in (from_tables, read_study(tmp_path)):
         found = study_results(other, plan(other), permutations=500)
         assert found.plan == expected.plan
+        shown = all_tables(other, found)
         for name, table in all_tables(own, expected).items():
-            shown = all_tables(other, found)[name]
-            pd.testing.assert_frame_equal(shown.body, table.body, obj=name)
-            assert shown.messages == table.messages
+            pd.testing.assert_frame_equal(shown[name].body, table.body, obj=name)
+            assert shown[name].messages == table.messages
         figures = study_figures(other, found)
         for name, figure in study_figures(own, expected).items():
             (words, at), (expected_words, expected_at) = (_split(f.svg()) for f in (figures.pop(name), figure))

@@ -104,9 +104,7 @@ def hostile(drop: Path, outside: Path, known: bytes) -> dict[str, str]:
 
 
 @pytest.mark.slow
-def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(
-    drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(drop: Path, tmp_path: Path, archive: Path):
     """The real command: everything good is taken, everything else is named, in at most 1 GiB."""
     before = chain.small_video(tmp_path, "before", n=5)
     ingest([before], VisitRecord(subject="P099", session_label="first"))
@@ -118,9 +116,6 @@ def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(
         (drop / name).write_bytes(content)
     bad = hostile(drop, outside, before.read_bytes())
     assert len(bad) >= 30
-    archive = tmp_path / "archive"
-    monkeypatch.setenv("PBL_INCOMING", str(drop))
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
     look(drop, archive)
     command = [sys.executable, "-c", PBL_AND_STATE, str(tmp_path / "import"), "--quiet", "cron", "import"]
     with (tmp_path / "printed").open("wb") as out:
@@ -159,9 +154,8 @@ def test_thirty_kinds_of_hostile_entries_between_thirty_good_ones(
     assert all(next(p.parent.glob(f"{p.name.split('.log')[0]}.txt")).read_text() for p in refused)
 
 
-def test_a_lock_that_is_held_is_reported(drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PBL_INCOMING", str(drop))
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+@pytest.mark.usefixtures("archive")
+def test_a_lock_that_is_held_is_reported(drop: Path):
     other = connection.another()
     with worker.installation_lock(layout.LOCK, other) as obtained:
         assert obtained
@@ -181,8 +175,7 @@ def test_a_run_that_hangs_is_ended():
     assert subprocess.run(run, timeout=300, check=False).returncode == -signal.SIGALRM
 
 
-def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, archive: Path):
     names = {str(upload(drop, f"P00{i}/1/walk.mp4", f"v{i}").relative_to(drop)) for i in range(3)}
     look(drop, archive)
     none = incoming.import_uploads(str(drop), archive, 0.0, run_s=-1.0)
@@ -192,9 +185,8 @@ def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, tmp_path: P
 
 
 def test_an_error_that_nobody_foresaw_keeps_one_upload_and_takes_the_others(
-    drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drop: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    archive = tmp_path / "archive"
     bad, good = upload(drop, "P001/1/walk.mp4"), upload(drop, "P002/1/walk.mp4", "other")
     content = bad.read_bytes()
     real = incoming.register
@@ -212,8 +204,7 @@ def test_an_error_that_nobody_foresaw_keeps_one_upload_and_takes_the_others(
     assert "a defect" in kept.with_name(kept.name + ".txt").read_text()
 
 
-def test_the_same_bytes_for_another_person_are_kept_and_named(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_the_same_bytes_for_another_person_are_kept_and_named(drop: Path, archive: Path):
     content = upload(drop, "P001/2026-01-10/walk.mp4").read_bytes()
     assert twice(drop, archive).registered
     (drop / "P002/2026-04-10").mkdir(parents=True)
@@ -234,8 +225,7 @@ def test_the_same_bytes_for_another_person_are_kept_and_named(drop: Path, tmp_pa
     assert len(lab.Subject()) == 1
 
 
-def test_a_registered_recording_stays_when_it_comes_again_with_a_bad_log(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_a_registered_recording_stays_when_it_comes_again_with_a_bad_log(drop: Path, archive: Path):
     content = upload(drop, "P001/1/walk.mp4").read_bytes()
     assert twice(drop, archive).registered
     (drop / "P001/1/walk.mp4").write_bytes(content)
@@ -244,8 +234,7 @@ def test_a_registered_recording_stays_when_it_comes_again_with_a_bad_log(drop: P
     assert Path(video.Video.fetch1("video_path")).read_bytes() == content
 
 
-def test_a_damaged_archive_gets_its_recording_back(drop: Path, tmp_path: Path):
-    archive = tmp_path / "archive"
+def test_a_damaged_archive_gets_its_recording_back(drop: Path, archive: Path):
     content = upload(drop, "P001/1/walk.mp4").read_bytes()
     assert twice(drop, archive).registered
     Path(video.Video.fetch1("video_path")).write_bytes(b"damaged")
@@ -255,11 +244,8 @@ def test_a_damaged_archive_gets_its_recording_back(drop: Path, tmp_path: Path):
 
 
 def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
-    drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drop: Path, tmp_path: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    archive = tmp_path / "archive"
-    monkeypatch.setenv("PBL_INCOMING", str(drop))
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
     def kill() -> Path:
@@ -306,9 +292,8 @@ def test_what_a_killed_import_left_goes_with_the_next_run_and_with_the_person(
     assert (proof["state"], proof["kept"], proof["left"]) == ("done", {}, [])
 
 
-def test_the_proof_names_what_could_not_be_removed(drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PBL_INCOMING", str(drop))
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+@pytest.mark.usefixtures("archive")
+def test_the_proof_names_what_could_not_be_removed(drop: Path, tmp_path: Path):
     ingest([upload(tmp_path, "walk.mp4")], VisitRecord(subject="P017"))
     (drop / "P017/1/deeper").mkdir(parents=True)
     done = pbl("forget", "P017", "--yes", "--videos")

@@ -9,33 +9,36 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
-from schemas.intake import LaboratoryMarkers, Methods, Recording, SeveralCameras, VisitRecord, ingest, register
+from schemas.intake import LaboratoryMarkers, Methods, SeveralCameras, VisitRecord, ingest, register
 from schemas.intake.recording_sheet import ingest_sheet
 from schemas.intake.registration import resolve
-from tests.command import pbl
-from tests.rows import everything_but_refreshes
+from tests.command import Done, pbl
+from tests.rows import everything_but_refreshes, outcomes
 
 from . import chain, test_markers, test_rigs
-from .drop import look
+from .drop import codes, look
 
 #: Registers the files for a visit; returns "registered", "known" or the code of the error.
 Adapter = Callable[[list[Path], VisitRecord], str]
 
 
-def said(recordings: Sequence[Recording]) -> str:
-    """The one outcome of all files of these recordings."""
-    (found,) = {r.error.code if r.error else r.status for r in register(recordings)}
-    return found
+def single(found: Sequence[str]) -> str:
+    """The one outcome of all files."""
+    (one,) = set(found)
+    return one
+
+
+def printed(done: Done) -> str:
+    """The outcome that `pbl ingest` printed."""
+    return done.error_code or ("registered" if " registered (" in done.out else "known")
 
 
 def by_ingest(paths: list[Path], visit: VisitRecord) -> str:
-    (found,) = {r.error.code if r.error else r.status for r in ingest(paths, visit)}
-    return found
+    return single(outcomes(ingest(paths, visit)))
 
 
 def by_command(paths: list[Path], visit: VisitRecord) -> str:
-    done = pbl("ingest", *paths, "--subject", visit.subject, "--session", visit.session_label)
-    return done.error_code or ("registered" if " registered (" in done.out else "known")
+    return printed(pbl("ingest", *paths, "--subject", visit.subject, "--session", visit.session_label))
 
 
 def by_name(paths: list[Path], visit: VisitRecord) -> str:
@@ -43,8 +46,7 @@ def by_name(paths: list[Path], visit: VisitRecord) -> str:
     pattern, named = "(?P<subject>.*)=.*", [p.with_name(f"{visit.subject}={p.name}") for p in paths]
     for path, copy in zip(paths, named, strict=True):
         copy.write_bytes(path.read_bytes())
-    done = pbl("ingest", *named, "--session", visit.session_label, "--name-pattern", pattern)
-    return done.error_code or ("registered" if " registered (" in done.out else "known")
+    return printed(pbl("ingest", *named, "--session", visit.session_label, "--name-pattern", pattern))
 
 
 def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
@@ -52,8 +54,7 @@ def by_sheet(paths: list[Path], visit: VisitRecord) -> str:
     rows = (f"{p.name},{visit.subject},{visit.session_label}" for p in paths)
     sheet.write_text("\n".join(("file,subject,visit", *rows)))
     found = ingest_sheet(sheet)
-    (outcome,) = {e.code for e in found.errors} or {"registered" if line.changes else "known" for line in found.lines}
-    return outcome
+    return single([e.code for e in found.errors] or ["registered" if x.changes else "known" for x in found.lines])
 
 
 def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
@@ -64,24 +65,23 @@ def by_drop_folder(paths: list[Path], visit: VisitRecord) -> str:
         (folder / path.name).write_bytes(path.read_bytes())
     look(drop, archive)
     taken = look(drop, archive)
-    (outcome,) = {e.code for e in taken.refused.values()} or {"registered" if taken.registered else "known"}
-    return outcome
+    return single([*codes(taken).values()] or ["registered" if taken.registered else "known"])
 
 
 def by_archive(paths: list[Path], visit: VisitRecord) -> str:
     try:
-        done = register_many(archived(str(p), sha256_of(p), p.stat().st_size, visit) for p in paths)
+        done = register_many(archived(str(p), sha256_of(p), p.stat().st_size, visit) for p in 2 * paths)
     except PblError as error:
         return error.code
     return "registered" if done["registered"] else "known"
 
 
 def by_rig(paths: list[Path], visit: VisitRecord) -> str:
-    return said([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)])
+    return single(outcomes(register([SeveralCameras(paths, paths[0].parent / "rig.toml", visit)])))
 
 
 def by_markers(paths: list[Path], visit: VisitRecord) -> str:
-    return said([LaboratoryMarkers(p, visit) for p in paths])
+    return single(outcomes(register([LaboratoryMarkers(p, visit) for p in paths])))
 
 
 def one_video(folder: Path) -> list[Path]:

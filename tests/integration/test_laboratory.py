@@ -6,10 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from pbl_pipeline.cli.events import events as events_command
-from pbl_pipeline.cli.gait import gait as command
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     NINE_ANGLES,
@@ -26,6 +23,7 @@ from pbl_pipeline.gait.laboratory import _read
 from pbl_pipeline.gait.normative import gait_norm
 from research.benchmarks.gdi import children, conventions
 from tests import not_none
+from tests.command import pbl
 
 MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 
@@ -109,17 +107,14 @@ def test_measures_of_a_child(walk):
 
 def test_the_command(walk, tmp_path):
     out = tmp_path / "metrics.json"
-    run = CliRunner().invoke(command, [str(walk), "--out", str(out)])
-    assert run.exit_code == 0, run.output
-    assert "GDI of nine angles" in run.output
+    done = pbl("gait", walk, "--out", out)
+    assert done.code == 0, done.err
+    assert "GDI of nine angles" in done.out
     session = json.loads(out.read_text())["session"]
     assert session["gdi"]["norm"] == "gillette-166-nine-angles"
     assert session["profile_deg"]["gps"] > 0
     assert session["step_time_s"]["asymmetry_percent"] is not None
-    with pytest.raises(PblError, match="NORM_INVALID"):
-        CliRunner().invoke(
-            command, [str(walk), "--out", str(out), "--norm", "gillette-166-three-angles"], catch_exceptions=False
-        )
+    assert pbl("gait", walk, "--out", out, "--norm", "gillette-166-three-angles").error_code == "NORM_INVALID"
 
 
 def test_events_may_be_given(walk, tmp_path):
@@ -135,14 +130,12 @@ def test_events_may_be_given(walk, tmp_path):
 def test_events_of_a_recording_by_command(walk, tmp_path):
     """From its markers, whatever its labels say; then given back to `pbl gait`."""
     csv, out = tmp_path / "events.csv", tmp_path / "metrics.json"
-    run = CliRunner().invoke(events_command, [str(walk), "--out", str(csv)], catch_exceptions=False)
-    assert run.exit_code == 0
+    assert pbl("events", walk, "--out", csv).code == 0
     trial = read_lab_trial(walk)
     found, labels = load_events(csv), trial.events.events
     for label in labels:
         assert min(abs(e.time_s - label.time_s) for e in found if (e.side, e.event) == (label.side, label.event)) < 0.05
-    run = CliRunner().invoke(command, [str(walk), "--events", str(csv), "--out", str(out)], catch_exceptions=False)
-    assert run.exit_code == 0
+    assert pbl("gait", walk, "--events", csv, "--out", out).code == 0
     assert json.loads(out.read_text())["session"]["stride_time_s"]["mean"] == pytest.approx(
         gait_metrics([trial]).to_dict()["session"]["stride_time_s"]["mean"], abs=0.02
     )
@@ -180,9 +173,7 @@ def test_without_labels_the_method_finds_the_events(walk, tmp_path):
     path = write_c3d(tmp_path / "own.c3d", points, names)
     for method in ("phase-transformer", "zeni-2008"):
         assert read_lab_trial(path, method=method).events.method == method
-        out = tmp_path / f"{method}.json"
-        words = [str(path), "--method", method, "--out", str(out)]
-        assert CliRunner().invoke(command, words, catch_exceptions=False).exit_code == 0
+        assert pbl("gait", path, "--method", method, "--out", tmp_path / f"{method}.json").code == 0
     early, late = (
         json.loads((tmp_path / f"{m}.json").read_text())["session"]["double_support_percent"]["mean"]
         for m in ("phase-transformer", "zeni-2008")
@@ -212,7 +203,13 @@ def normal_walk(n: int = 300, factor: float = 1.0) -> tuple[np.ndarray, list[str
 def test_a_file_of_ones_own(tmp_path):
     points, names = normal_walk()
     path = write_c3d(tmp_path / "own.c3d", points, names)
-    rows = [f"{t:.2f},{side},{event},1.0" for t, side, event in _events()]
+    steps = (
+        (0.0, "left", "foot_down"),
+        (0.1, "right", "foot_up"),
+        (0.5, "right", "foot_down"),
+        (0.6, "left", "foot_up"),
+    )
+    rows = [f"{k + t:.2f},{side},{event},1.0" for k in range(3) for t, side, event in steps]
     (tmp_path / "events.csv").write_text("\n".join(["time_s,side,event,probability", *rows]) + "\n")
     trial = read_lab_trial(path, tmp_path / "events.csv")
     metrics = gait_metrics([trial])
@@ -225,14 +222,6 @@ def test_a_file_of_ones_own(tmp_path):
     assert "positions" in metrics.spatiotemporal.reasons["speed_m_per_s"]
     with pytest.raises(PblError, match="GAIT_INPUT"):
         read_lab_trial(path)
-
-
-def _events() -> list[tuple[float, str, str]]:
-    out = []
-    for k in range(3):
-        out += [(k, "left", "foot_down"), (k + 0.1, "right", "foot_up")]
-        out += [(k + 0.5, "right", "foot_down"), (k + 0.6, "left", "foot_up")]
-    return [e for e in out if e[0] < 2.99]
 
 
 def test_bad_files(tmp_path, walk):
@@ -263,5 +252,4 @@ def test_bad_files(tmp_path, walk):
     ],
 )
 def test_wrong_calls(tmp_path, words, code):
-    with pytest.raises(PblError, match=f"^{code}: "):
-        CliRunner().invoke(command, [*words, "--out", str(tmp_path / "m.json")], catch_exceptions=False)
+    assert pbl("gait", *words, "--out", tmp_path / "m.json").error_code == code

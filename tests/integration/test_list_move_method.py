@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -14,11 +15,11 @@ from schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
 from schemas.intake.move import carry_out, plan_move
 from schemas.method_names import keys_named, with_keys
 from tests.command import pbl
-from tests.rows import everything, register
-from workers import incoming
+from tests.rows import everything, outcomes, register
 from workers.populate import populate
 
 from . import chain, test_rigs
+from .drop import twice, upload
 
 
 def visits_of_fits() -> dict[str, int]:
@@ -30,9 +31,13 @@ def visits_of_fits() -> dict[str, int]:
 
 
 @pytest.fixture
-def walks(tables: None, tmp_path: Path) -> dict[str, int]:
+def walks(tables: None, fill: Callable) -> dict[str, int]:
+    return fill(_walks)
+
+
+def _walks(folder: Path) -> dict[str, int]:
     """Two videos of one visit of P001 and one of P002, through the chain."""
-    paths = [chain.small_video(tmp_path, name, n=240 + i) for i, name in enumerate(("one", "two", "three"))]
+    paths = [chain.small_video(folder, name, n=240 + i) for i, name in enumerate(("one", "two", "three"))]
     one, two = register(*paths[:2], session_label="2026-03-01", project="spine", population="patient")
     (three,) = register(paths[2], subject="P002", session_label="2026-03-02", population="healthy")
     populate()
@@ -40,14 +45,7 @@ def walks(tables: None, tmp_path: Path) -> dict[str, int]:
 
 
 @pytest.mark.long
-def test_lists_then_moves(walks):
-    """One chain for both: the lists look at it before anything is moved."""
-    lists_have_a_row_for_each_with_counts_and_filters(walks)
-    a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks)
-    a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks)
-
-
-def lists_have_a_row_for_each_with_counts_and_filters(walks):
+def test_lists_have_a_row_for_each_with_counts_and_filters(walks):
     people = pd.read_csv(io.StringIO(pbl("list", "subjects", "--csv").out))
     assert people[["subject", "population", "visits", "videos"]].to_numpy().tolist() == [
         ["P001", "patient", 1, 2],
@@ -73,7 +71,8 @@ def lists_have_a_row_for_each_with_counts_and_filters(walks):
     assert pbl("list", "methods", "--stage", "feet").error_code == "SOLVER_UNKNOWN"
 
 
-def a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks):
+@pytest.mark.long
+def test_moved_videos_take_their_keypoints_and_plans_and_leave_the_fit(walks):
     assert visits_of_fits() == {"P001/2026-03-01": 2, "P002/2026-03-02": 1}
     made = keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist()
     before = everything()
@@ -89,9 +88,7 @@ def a_moved_video_takes_its_keypoints_and_leaves_the_fit(walks):
     populate()
     assert visits_of_fits() == {"P001/2026-03-01": 1, "P002/2026-03-02": 2}
     assert keypoints.Keypoints().to_arrays("keypoints_computed", order_by="KEY").tolist() == made
-
-
-def a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks):
+    # A visit that is new is made with the plans of the old.
     done = pbl("move", walks["one"], "--to", "P003/first", "--yes")
     assert "a new person" in done.out
     assert "P001/2026-03-01 keeps no video" in done.out
@@ -104,14 +101,11 @@ def a_visit_that_is_new_is_made_with_the_plans_of_the_old(walks):
         assert plans[0] == plans[1] != []
 
 
-@pytest.mark.parametrize(
-    ("target", "code"),
-    [("P001/2026-03-01", "USAGE"), ("Anna Meier/1", "USAGE"), ("P001/" + "x" * 65, "USAGE")],
-)
-def test_what_cannot_be_moved_is_refused_and_changes_nothing(tables, tmp_path, target, code):
+def test_what_cannot_be_moved_is_refused_and_changes_nothing(tables, tmp_path):
     (number,) = register(chain.small_video(tmp_path, "walk"), session_label="2026-03-01")
     before = everything()
-    assert pbl("move", number, "--to", target, "--yes").error_code == code
+    for target in ("P001/2026-03-01", "Anna Meier/1", "P001/" + "x" * 65):
+        assert pbl("move", number, "--to", target, "--yes").error_code == "USAGE"
     assert pbl("move", 999, "--to", "P002/1", "--yes").error_code == "DB_NOT_FOUND"
     assert pbl("move", number, "--to", "P002").code == 2
     assert everything() == before
@@ -142,24 +136,17 @@ def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     assert {int(v) for v in moved.to_arrays("video_id")} == numbers
 
 
-def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, tmp_path, monkeypatch):
-    archive = tmp_path / "archive"
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
-    path = drop / "P001" / "1" / "walk.mp4"
-    path.parent.mkdir(parents=True)
-    content = chain.small_video(tmp_path, "walk").read_bytes()
-    path.write_bytes(content)
-    for _ in range(2):
-        incoming.import_uploads(str(drop), archive, settled_s=0)
+def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, archive, monkeypatch):
+    content = upload(drop, "P001/1/walk.mp4").read_bytes()
+    twice(drop, archive)
     number, old = video.Video.fetch1("video_id", "video_path")
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")
-    monkeypatch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        carry_out(plan)
+    with monkeypatch.context() as patch:
+        patch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            carry_out(plan)
     assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)
-    monkeypatch.undo()
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
     carry_out(plan)
     (now,) = archive.rglob("*.mp4")
     assert now.is_relative_to(archive / "P002" / "2")
@@ -180,8 +167,7 @@ def test_a_method_from_a_file_is_registered_once_and_used_by_its_name(tables, tm
         file.write_text(json.dumps({"base": METHODS.default, "max_iterations": 8}), encoding="utf-8")
         assert "slow-v2: registered" in pbl("method", "add", file).out
         assert keys_named("fit_method", "slow") == ["slow-v2", "slow-v1"]
-        (result,) = ingest([path], VisitRecord("P002", "2026-03-02"), Methods(fit="slow-v1"))
-        assert result.status == "updated"
+        assert outcomes(ingest([path], VisitRecord("P002", "2026-03-02"), Methods(fit="slow-v1"))) == ["updated"]
         populate()
         assert {r["fit_method"] for r in fit.SessionFit().to_dicts()} > {"slow-v1"}
         # Short: the newest version that has results, which is not the newest one.

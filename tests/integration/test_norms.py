@@ -7,18 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
 from schemas import fit, gait, gdi, lab, load_visit, norms, session
-from schemas.cli.norm import norm as command
 from schemas.intake import Methods, VisitRecord, ingest
 from schemas.reading import frames
 from tests import not_none
 from tests.command import pbl
-from tests.rows import remove_all
+from tests.rows import outcomes, remove_all
 from workers.populate import populate
 
 from . import chain
@@ -47,7 +45,8 @@ def test_built_registered_and_used(walkers: Path):
     assert {r["norm_name"] for r in before} == set(pbl_pipeline.gait.norm_names())
     built = norms.build_norm("our-lab")
     assert (built.norm, built.new, built.n_people) == ("our-lab-v1", True, 4)
-    used = sum(int(n) for n in (gait.GaitCycle & (fit.FitSet & _of("healthy"))).to_arrays("n_cycles_used"))
+    healthy = session.Session & (lab.Subject & {"population": "healthy"})
+    used = sum(int(n) for n in (gait.GaitCycle & (fit.FitSet & healthy)).to_arrays("n_cycles_used"))
     assert built.n_cycles == used >= 30
     row = (gdi.NormativeSet & {"norm": "our-lab-v1"}).to_dicts()[0]
     assert (row["norm_n"], row["norm_angle_model"], row["norm_name"]) == (used, "pbl_body", "our-lab")
@@ -66,24 +65,15 @@ def test_built_registered_and_used(walkers: Path):
     assert shipped() == before
     pooled = norms.build_norm("our-lab", pooled_populations=("patient",))
     assert (pooled.norm, pooled.n_people, pooled.n_cycles) == ("our-lab-v3", 4, used)
-    _used_by_a_session(walkers, built.set)
-
-
-def _of(population: str):
-    return session.Session & (lab.Subject & {"population": population})
-
-
-def _used_by_a_session(walkers: Path, expected) -> None:
-    """A visit that is planned with the built set is scored with it, and its old result stays."""
+    # A visit that is planned with the built set is scored with it, and its old result stays.
     old = (gdi.SessionGdi & _sets("P01")).fetch1("session_gdi", "norm")
-    (result,) = ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))
-    assert result.status == "updated"
+    assert outcomes(ingest([walkers / "walk4.mp4"], VisitRecord("P01"), Methods(norm="our-lab-v1"))) == ["updated"]
     populate()
     rows = {r["norm"]: r for r in (gdi.SessionGdi & _sets("P01")).to_dicts()}
     assert set(rows) == {old[1], "our-lab-v1"}
     assert rows[old[1]]["session_gdi"] == pytest.approx(old[0])
     cycles = metrics_of({"subject": "P01", "norm": "our-lab-v1"}).trials[0].cycles
-    scored = pbl_pipeline.gait.score_gdi(cycles, expected)
+    scored = pbl_pipeline.gait.score_gdi(cycles, built.set)
     assert rows["our-lab-v1"]["session_gdi"] == pytest.approx(scored.mean, abs=1e-3)
     checks = gdi.SessionGdi.Check & _sets("P01") & {"norm": "our-lab-v1", "gdi_check": "norm_convention"}
     assert checks.fetch1("gdi_check_outcome") == "PASS"
@@ -104,8 +94,7 @@ def _sets(subject: str):
 
 
 def test_nine_angles_in_the_tables(walkers: Path):
-    (result,) = ingest([walkers / "walk0.mp4"], VisitRecord("C01"), Methods(gdi="gillette-2008"))
-    assert result.status == "updated"
+    assert outcomes(ingest([walkers / "walk0.mp4"], VisitRecord("C01"), Methods(gdi="gillette-2008"))) == ["updated"]
     populate()
     found = (gdi.SessionGdi & _sets("C01") & {"gdi_method": "gillette-2008-v1"}).to_dicts()[0]
     assert found["norm"] == "gillette-166-nine-angles-v1"
@@ -152,17 +141,15 @@ def test_curves_beside_the_bands(walkers: Path):
 
 
 def test_the_command(walkers: Path, tmp_path: Path):
-    run = CliRunner().invoke
-    out = run(command, ["build", "clinic", "--population", "healthy", "--source", "four walkers"])
-    assert out.exit_code == 0, out.output
-    assert "clinic-v1: registered" in out.output
-    assert "WARN norm_people" in out.output
-    assert "known already" in run(command, ["build", "clinic", "--source", "four walkers"]).output
-    listed = run(command, ["list"]).output
+    built = pbl("norm", "build", "clinic", "--population", "healthy", "--source", "four walkers")
+    assert built.code == 0, built.err
+    assert "clinic-v1: registered" in built.out
+    assert "WARN norm_people" in built.out
+    assert "known already" in pbl("norm", "build", "clinic", "--source", "four walkers").out
+    listed = pbl("norm", "list").out
     assert "clinic-v1" in listed
     assert "gillette-166-nine-angles-v1" in listed
     path = tmp_path / "clinic.json"
-    shown = run(command, ["show", "clinic", "--out", str(path)])
-    assert "four walkers" in shown.output
+    assert "four walkers" in pbl("norm", "show", "clinic", "--out", path).out
     assert json.loads(path.read_text())["name"] == "clinic"
     assert pbl_pipeline.gait.load_norm(str(path)).sha256 == norms.load_norm("clinic").sha256

@@ -16,7 +16,7 @@ from schemas.method_rows import insert_methods
 from schemas.reading import frames
 from schemas.reading.shown import shown_visit
 from tests.command import pbl
-from tests.rows import register
+from tests.rows import outcomes, register
 from workers.populate import populate
 
 from . import chain
@@ -38,7 +38,7 @@ def test_only_walking_at_one_pace_is_pooled(tables: None, tmp_path: Path):
     at_fast = {"family": GDI_METHODS.find().name, **GDI_METHODS.find().paramset.params, "pace": "fast"}
     insert_methods(gdi.GdiModel, [GDI_METHODS.of(Paramset("gdi", "fast-walk", 1, at_fast))])
     try:
-        assert ingest([slow], VisitRecord("P001"), Methods(gdi="fast-walk"))[0].status == "updated"
+        assert outcomes(ingest([slow], VisitRecord("P001"), Methods(gdi="fast-walk"))) == ["updated"]
         populate()
         used = {r["video_id"]: int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
         plain = GDI_METHODS.find().key

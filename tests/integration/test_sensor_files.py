@@ -16,7 +16,7 @@ from tests.integration import chain
 from tests.integration.test_tables import errors
 from tests.phone_film import as_zip, film, sensor_logger
 from tests.quicktime import insert, meta
-from tests.rows import register
+from tests.rows import outcomes, register
 from workers.populate import populate
 
 pytestmark = pytest.mark.usefixtures("tables")
@@ -67,8 +67,7 @@ def test_the_log_reaches_keypoints_and_fit(capture, monkeypatch: pytest.MonkeyPa
     np.testing.assert_array_equal(times, kept.phone_time_s)
     assert motions == ["handheld"]
     # The same log again, as a zip of the same files too, changes nothing.
-    (again,) = ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])
-    assert again.status == "known"
+    assert outcomes(ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])) == ["known"]
     assert len(fit.SessionFit()) == 1
 
 
@@ -99,15 +98,13 @@ def test_a_log_of_another_time_is_an_error_of_its_video_only(capture, tmp_path: 
     path, _ = capture
     other = film(tmp_path / "other.mov", 60.0, SECONDS)
     short = sensor_logger(tmp_path / "short", 4.0)
-    results = ingest(
-        [path, other], VisitRecord("P001"), files=[Sensors(attitude=Path("none")), Sensors(attitude=short)]
-    )
-    assert [r.status for r in results] == ["registered", "registered"]
+    none = Sensors(attitude=Path("none"))
+    results = ingest([path, other], VisitRecord("P001"), files=[none, Sensors(attitude=short)])
+    assert outcomes(results) == ["registered", "registered"]
     assert errors(populate()) == {"Keypoints": {"PHONE_LOG": 1}}
     # The other recording of the visit is measured all the same.
     assert len(fit.SessionFit()) == 1
-    (gone,) = ingest([other], VisitRecord("P001"), files=[Sensors(attitude=Path("none"))])
-    assert gone.status == "updated"
+    assert outcomes(ingest([other], VisitRecord("P001"), files=[none])) == ["updated"]
     assert not errors(populate(SEEN))
     assert len(keypoints.Keypoints()) == 2
 
@@ -175,6 +172,5 @@ def test_the_uncertainty_of_a_calibration_is_stored(tmp_path: Path):
     assert row["focal_rel_sd"] == pytest.approx(0.005)
     assert row["camera_source"].startswith("measured: camera.json")
     # The same file again is the same calibration.
-    (again,) = ingest([path], VisitRecord("P001", camera_file=camera))
-    assert again.status == "known"
+    assert outcomes(ingest([path], VisitRecord("P001", camera_file=camera))) == ["known"]
     assert len(lab.CameraCalibration()) == 1

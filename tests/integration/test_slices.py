@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study, write_study
 from pbl_pipeline.study_report import all_tables, plan, study_results
 from schemas import fit, gait, gdi, session, study, video
-from schemas.cli.study import export, slice_
 from schemas.intake import VisitRecord, ingest
 from schemas.intake.records import set_condition
 from schemas.reading import frames
@@ -116,8 +114,9 @@ def test_a_slice_and_its_folder_make_the_same_report(cohort: Path, tmp_path: Pat
     assert not [m for m in of_tables.plan.measures if m.startswith(("gdi ", "gdi_"))]
     assert of_tables.table["gdi"].to_list() == found.visits.loc[found.visits["included"], "gdi"].to_list()
     assert of_folder.plan == of_tables.plan
+    again = all_tables(found, of_folder)
     for name, table in all_tables(found, of_tables).items():
-        assert table.body.equals(all_tables(found, of_folder)[name].body)
+        assert table.body.equals(again[name].body)
 
 
 def test_the_same_frames_again_until_a_row_changes(cohort: Path):
@@ -176,29 +175,22 @@ def test_the_views_of_a_study(cohort: Path):
     cycles: Any = frames.cycle_frame({"subject": "P001", "session_label": "pre"})
     assert {"fast", "unknown"} <= set(cycles["pace"])
     assert set(cycles["activity"]) == {"walking"}
-    assert len(cycles) == sum(
-        (gait.GaitCycle & (fit.FitSelection & {"fit_current": True}).proj() & video_ids()).to_arrays("n_cycles_used")
-    )
-
-
-def video_ids() -> list[dict]:
     own = session.Session & {"subject": "P001", "session_label": "pre"}
-    return list((video.Video & own.proj()).proj().to_dicts())
+    videos = (video.Video & own.proj()).proj().to_dicts()
+    current = (fit.FitSelection & {"fit_current": True}).proj()
+    assert len(cycles) == sum((gait.GaitCycle & current & videos).to_arrays("n_cycles_used"))
 
 
 @pytest.mark.long
 def test_the_commands(cohort: Path, tmp_path: Path):
-    run = CliRunner()
-    made = run.invoke(slice_, ["from-shell", "--cohort", "dcm", "--role", "pre", "--role", "6_weeks"])
-    assert made.exit_code == 0, made.output
-    assert "3 visits, 2 count" in made.output
-    shown = run.invoke(slice_, ["from-shell"])
-    assert "as it was frozen" in shown.output
-    listed = run.invoke(slice_, [])
-    assert "from-shell" in listed.output
+    made = pbl("study", "slice", "from-shell", "--cohort", "dcm", "--role", "pre", "--role", "6_weeks")
+    assert made.code == 0, made.err
+    assert "3 visits, 2 count" in made.out
+    assert "as it was frozen" in pbl("study", "slice", "from-shell").out
+    assert "from-shell" in pbl("study", "slice").out
     out = tmp_path / "study"
-    done = run.invoke(export, ["--slice", "from-shell", "--out", str(out), "--keep-codes"])
-    assert done.exit_code == 0, done.output
+    done = pbl("study", "export", "--slice", "from-shell", "--out", out, "--keep-codes")
+    assert done.code == 0, done.err
     again: Any = read_study(out)
     assert (again.n_visits, again.description.name) == (3, "from-shell")
     assert set(again.visits["subject"]) == {"P001", "P002"}
@@ -207,14 +199,11 @@ def test_the_commands(cohort: Path, tmp_path: Path):
     assert "from-shell" in (tmp_path / "report" / "report.html").read_text()
     assert pbl("study", "report", "--out", tmp_path / "report").code == 2
     assert pbl("study", "report", "--slice", "absent", "--out", tmp_path / "report").error_code == "DB_NOT_FOUND"
-    coded = tmp_path / "coded"
-    assert (
-        run.invoke(export, ["--slice", "from-shell", "--out", str(coded), "--key", str(tmp_path / "key.csv")]).exit_code
-        == 0
-    )
+    coded, key = tmp_path / "coded", tmp_path / "key.csv"
+    assert pbl("study", "export", "--slice", "from-shell", "--out", coded, "--key", key).code == 0
     text = "".join(p.read_text() for p in coded.glob("*.csv"))
     assert "C001" not in text
-    assert (tmp_path / "key.csv").stat().st_mode & 0o077 == 0
+    assert key.stat().st_mode & 0o077 == 0
 
 
 def test_the_visits_of_a_slice_are_exported(cohort: Path, tmp_path: Path):

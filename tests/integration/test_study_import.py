@@ -5,15 +5,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from openpyxl import Workbook
 
 import schemas
 from pbl_pipeline.errors import PblError
 from schemas import lab, session, study, video
-from schemas.cli.study import import_
 from schemas.intake import sheets
 from schemas.studies import study_sheets
+from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 
 from . import chain
@@ -41,7 +40,7 @@ def sheet(folder: Path, text: str, name: str = "visits.csv") -> Path:
     return path
 
 
-def run(*paths: Path, **options: bool) -> study_sheets.Imported:
+def run(*paths: Path, **options: bool) -> sheets.Imported:
     return study_sheets.import_sheets(paths, **options)
 
 
@@ -193,19 +192,15 @@ def test_a_workbook(empty: None, tmp_path: Path):
     }
 
 
-def _merge(_: Workbook, page) -> None:
-    page.merge_cells("A2:A3")
-
-
-def _formula(_: Workbook, page) -> None:
-    page["E2"] = "=6*2"
-
-
-def _error(_: Workbook, page) -> None:
-    page["E2"] = "#N/A"
-
-
-@pytest.mark.parametrize(("change", "words"), [(_merge, "A2:A3"), (_formula, "cell E2"), (_error, "#N/A")])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda _, page: page.merge_cells("A2:A3"), "A2:A3"),
+        (lambda _, page: page.cell(2, 5, "=6*2"), "cell E2"),
+        (lambda _, page: page.cell(2, 5, "#N/A"), "#N/A"),
+    ],
+    ids=["merged", "formula", "error"],
+)
 def test_workbooks_that_hide_values(tmp_path: Path, change, words: str):
     with pytest.raises(PblError, match="SHEET_FORMAT") as error:
         sheets.read_sheets(book(tmp_path / "study.xlsx", change))
@@ -314,24 +309,21 @@ def test_scores_that_contradict_each_other(empty: None, tmp_path: Path, scores: 
 def test_the_template_is_a_sheet(empty: None, tmp_path: Path):
     for name in ("new.csv", "new.xlsx"):
         path = tmp_path / name
-        assert CliRunner().invoke(import_, ["--template", str(path)]).exit_code == 0
+        assert pbl("study", "import", "--template", path).code == 0
         (made,) = sheets.read_sheets(path)
         assert set(made.columns) == {*study_sheets.COLUMNS, *study.ClinicalInstrument().to_arrays("instrument")}
         assert run(path).done
-        again = CliRunner().invoke(import_, ["--template", str(path)])
-        assert isinstance(again.exception, PblError)
-        assert again.exception.code == "FILE_UNWRITABLE"
-    assert CliRunner().invoke(import_, []).exit_code == 2
+        assert pbl("study", "import", "--template", path).error_code == "FILE_UNWRITABLE"
+    assert pbl("study", "import").code == 2
 
 
 def test_the_command_says_row_by_row(empty: None, tmp_path: Path):
-    visits = str(sheet(tmp_path, VISITS))
-    dry = CliRunner().invoke(import_, [visits, "--dry-run"])
-    assert (dry.exit_code, len(lab.Subject())) == (0, 0)
-    assert "visits.csv, row 4: new person C001" in dry.output
-    assert "4 rows would be imported, 0 unchanged, 0 refused" in dry.output
-    assert "4 rows imported" in CliRunner().invoke(import_, [visits]).output
-    wrong = CliRunner().invoke(import_, [str(sheet(tmp_path, VISITS.replace(",11\n", ",44\n")))])
-    assert wrong.exit_code == 1
-    assert "SCORE_RANGE" in wrong.output
-    assert "0 rows not imported, 3 unchanged, 1 refused" in wrong.output
+    visits = sheet(tmp_path, VISITS)
+    dry = pbl("study", "import", visits, "--dry-run")
+    assert (dry.code, len(lab.Subject())) == (0, 0)
+    assert "visits.csv, row 4: new person C001" in dry.out
+    assert "4 rows would be imported, 0 unchanged, 0 refused" in dry.out
+    assert "4 rows imported" in pbl("study", "import", visits).out
+    wrong = pbl("study", "import", sheet(tmp_path, VISITS.replace(",11\n", ",44\n")))
+    assert (wrong.code, wrong.error_code) == (1, "SCORE_RANGE")
+    assert "0 rows not imported, 3 unchanged, 1 refused" in wrong.out

@@ -130,6 +130,11 @@ def test_every_command_has_help_with_an_example():
         assert "Example:" in command.get_help(click.Context(command)), entry.name
 
 
+@pytest.mark.parametrize("group", ["pbl.bench", "pbl.study", "pbl.study_data"])
+def test_what_the_tables_and_workers_add_to_commands_is_there(group: str):
+    assert all(callable(entry.load()) for entry in entry_points(group=group))
+
+
 def test_the_help_lists_every_command_under_one_task():
     listed = [name for names in TASKS.values() for name in names]
     assert sorted(listed) == sorted(entry.name for entry in entry_points(group="pbl.commands"))

@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
-from pbl_pipeline.cli.study import study as command
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import (
     CURVE_POINTS,
@@ -25,6 +23,7 @@ from pbl_pipeline.study import (
     read_study,
     write_study,
 )
+from tests.command import pbl
 
 
 def small_study() -> StudyData:
@@ -225,6 +224,6 @@ def test_classes():
 
 def test_the_command_says_what_is_in_a_folder(tmp_path):
     write_study(small_study(), tmp_path)
-    done = CliRunner().invoke(command, ["check", str(tmp_path)], catch_exceptions=False)
-    assert "3 persons, 6 visits; 3 persons and 5 visits count" in done.output
-    assert content_hash(small_study()) in done.output
+    done = pbl("study", "check", tmp_path)
+    assert "3 persons, 6 visits; 3 persons and 5 visits count" in done.out
+    assert content_hash(small_study()) in done.out
