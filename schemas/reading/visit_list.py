@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -77,6 +78,11 @@ class Result:
     worst: tuple[str, ...]
     corrected: bool = False
     filming: Filming | None = None  # how it was filmed; None if it was not looked up
+
+    @property
+    def chain(self) -> tuple[str, ...]:
+        """Kind of recordings and methods."""
+        return self.kind, *self.methods
 
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
@@ -219,13 +225,19 @@ def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
     found = []
     if any(r.outcome == "FAIL" or DOUBTS.intersection(r.worst) for r in (result, before)):
         found.append(Difference("checks"))
-    if (result.kind, result.methods) != (before.kind, before.methods):
+    if result.chain != before.chain:
         found.append(Difference("methods"))
     if result.corrected != before.corrected:
         found.append(Difference("corrected"))
     if result.filming is not None and before.filming is not None:
         found += differences(result.filming, before.filming)
     return tuple(found)
+
+
+def usual_chain(results: Mapping[int, Sequence[Result]]) -> tuple[str, ...] | None:
+    """Return `Result.chain` of most of the results, the first of several; None without any."""
+    counts = Counter(r.chain for found in results.values() for r in found)
+    return max(counts, key=lambda chain: counts[chain], default=None)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
@@ -523,7 +535,7 @@ def _trend(
         if before >= day:
             continue
         for other in results[session_id]:
-            if (other.kind, other.methods) == (result.kind, result.methods):
+            if other.chain == result.chain:
                 change = change_since(result, other)
                 if change is not None:
                     return Trend(session_id, before, change.by, change.sure, change.least, change.differs)
