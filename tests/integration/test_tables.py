@@ -16,7 +16,9 @@ import pymysql
 import pytest
 from click.testing import CliRunner
 
+import pbl_pipeline.fit
 import pbl_pipeline.gait
+import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
