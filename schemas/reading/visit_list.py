@@ -261,7 +261,6 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     found: dict[int, list[Result]] = {i: [] for i in ids}
     if not ids:
         return found
-    order = {fit.SINGLE: 0, fit.RIG: 1, fit.MARKERS: 2}
     open_checks = _open_checks(ids)
     rows = _ask(
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
@@ -298,7 +297,7 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
                 filming,
             )
         )
-    return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
+    return {i: sorted(r, key=lambda one: fit.KINDS.index(one.kind)) for i, r in found.items()}
 
 
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:

@@ -16,7 +16,6 @@ import pymysql
 import pytest
 from click.testing import CliRunner
 
-import pbl_pipeline.fit
 import pbl_pipeline.gait
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
@@ -25,7 +24,7 @@ import schemas
 import workers.populate
 from docs_site import table_map
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
@@ -145,11 +144,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
 
 
 def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def standing(trials, names, paramset=None, camera_motion="static"):
-        result = chain.fit_session(trials, names, paramset)
-        return dataclasses.replace(result, trials=tuple(map(still, result.trials)))
-
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", standing)
+    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, trials=tuple(map(still, fits.trials))))
     register(chain.small_video(tmp_path, "stands"), chain.small_video(tmp_path, "empty", people="nobody"))
     run = populate()
     assert not errors(run)
@@ -172,12 +167,11 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
 def test_one_recording_without_gait_does_not_empty_the_visit(
     tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def one_stands(trials, names, paramset=None, camera_motion="static"):
-        result = chain.fit_session(trials, names, paramset)
-        walks, other = result.trials
-        return dataclasses.replace(result, trials=(walks, still(other)))
+    def one_stands(fits: SessionFit) -> SessionFit:
+        walks, other = fits.trials
+        return dataclasses.replace(fits, trials=(walks, still(other)))
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", one_stands)
+    chain.change_fits(monkeypatch, one_stands)
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "stands", n=210))
     populate()
     assert gdi.SessionGdi.fetch1("session_status") == "PASS"
@@ -189,11 +183,8 @@ def test_one_recording_without_gait_does_not_empty_the_visit(
 def test_a_failed_fit_gives_no_measures_in_tables_and_files(
     tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def fails(trials, names, paramset=None, camera_motion="static"):
-        bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
-        return dataclasses.replace(chain.fit_session(trials, names, paramset), qc=(bad,))
-
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fails)
+    bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
+    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, qc=(bad,)))
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210))
     assert not errors(populate())
     why = "the fit failed its check residual_3d_cm"
