@@ -45,6 +45,11 @@ def at_once(job: queue.Claim) -> None:
     video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
 
 
+def counts() -> dict[str, int]:
+    """How many rows the computed tables have."""
+    return {t.__name__: len(t()) for t in schemas.computed_tables()}
+
+
 def jobs_left() -> dict[str, dict[str, int]]:
     """How many rows the queues have, by table and status."""
     left = {t: {s: n for s, n in c.items() if n} for t, c in queue_counts(video.Video.connection).items()}

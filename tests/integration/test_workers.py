@@ -41,15 +41,11 @@ from workers.recover import CRASHES
 from workers.supervisor import BATCH_NICE, Supervisor
 
 from . import chain, worker_target
-from .jobs import beat, first_job, hold, jobs_left, queued, work
+from .jobs import beat, counts, first_job, hold, jobs_left, queued, work
 
 
 def videos(folder: Path, *names: str) -> list[Path]:
     return [chain.small_video(folder, name) for name in names]
-
-
-def counts() -> dict[str, int]:
-    return {t.__name__: len(t()) for t in schemas.computed_tables()}
 
 
 # ------------------------------------------------------------------------------------------------------ the whole chain
