@@ -9,7 +9,7 @@ from unittest import mock
 
 from pbl_pipeline.cli import main
 
-#: `pbl` in a process of its own.
+#: `pbl` in a separate process.
 PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
 
 

@@ -2,11 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
-
-from pymysql.cursors import Cursor
 
 from pbl_pipeline import settings
 from schemas import connection
@@ -19,13 +16,6 @@ def register(*paths: Path, **visit) -> list[int]:
     results = ingest(paths, VisitRecord(subject=visit.pop("subject", "P001"), **visit))
     assert [r.status for r in results] == ["registered"] * len(paths), results
     return [r.video_id or 0 for r in results]
-
-
-@contextmanager
-def cursor() -> Iterator[Cursor]:
-    """A cursor of a connection beside the tables' own."""
-    with closing(connection.plain_connection()) as server, server.cursor() as found:
-        yield found
 
 
 def everything() -> dict[str, list[tuple]]:
@@ -62,9 +52,9 @@ class Saved:
 
     def put_back(self) -> None:
         """Insert the rows into tables that have none."""
-        with cursor() as beside:
+        with closing(connection.plain_connection()) as server, server.cursor() as cursor:
             for statement in (*backup_files.HEADER, "START TRANSACTION", *self.statements, "COMMIT"):
-                beside.execute(statement)
+                cursor.execute(statement)
         shutil.rmtree(self.folder)
         shutil.copytree(self.copy / "videos", self.folder)
         shutil.copytree(self.copy / "store", _store(), copy_function=_link, dirs_exist_ok=True)

@@ -156,7 +156,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
 
 
 def change_fits(patch: pytest.MonkeyPatch, change: Callable[[SessionFit], SessionFit]) -> None:
-    """Put in place of the library's fit what `change` makes of the stand-in's."""
+    """Let the library fit what `change` makes of the fits of the stand-in."""
     patch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **named: change(fit_session(*given, **named)))
 
 

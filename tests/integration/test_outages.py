@@ -1,5 +1,6 @@
 """A full database, a full store, a clock that goes back, workers that die: nothing is lost, nothing is left behind."""
 
+import contextlib
 import errno
 import os
 import shutil
@@ -22,7 +23,7 @@ from schemas.operations.orphans import orphans
 from schemas.reading.status import pipeline_status
 from schemas.store import store_error
 from schemas.stored_files import remove_left_over
-from tests.rows import cursor, register
+from tests.rows import register
 from workers import queue, recover, refresh, run_job
 from workers.heartbeat import Heartbeat
 
@@ -315,9 +316,9 @@ def test_every_row_has_the_time_of_the_servers_clock(tmp_path: Path):
 
 def test_no_hour_comes_twice_in_autumn():
     """The server counts in the zone of its machine; every connection of ours in UTC."""
-    with cursor() as beside:
-        beside.execute("SELECT CURRENT_TIMESTAMP = UTC_TIMESTAMP")
-        assert beside.fetchone() == (1,)
+    with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SELECT CURRENT_TIMESTAMP = UTC_TIMESTAMP")
+        assert cursor.fetchone() == (1,)
     assert connection.connect().query("SELECT CURRENT_TIMESTAMP = UTC_TIMESTAMP").fetchone() == (1,)
     assert connection.connect().query("SELECT @@session.time_zone").fetchone() == ("+00:00",)
 

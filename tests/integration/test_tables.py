@@ -63,7 +63,7 @@ def done(run) -> dict[str, int]:
 
 
 def still(trial: TrialFit) -> TrialFit:
-    """As long a trial of somebody who stands."""
+    """Return a trial as long as this one, of a person who stands."""
     return walking_fit(trial.joint_names, trial.body_sha256, name=trial.name, n_frames=len(trial.time_s), walks=False)
 
 
