@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import CODES, PblError
@@ -17,6 +17,7 @@ _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive thresho
 _CODE = re.compile(r"(?:\w+: )?([A-Z_0-9]+):")
 #: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
 _LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}
+_REPORT = "report this with the error stack that `pbl status --json` prints"
 
 
 def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
@@ -80,7 +81,7 @@ def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblErr
         "INTERNAL",
         found=_cut(f"{type(error).__name__}: {error}", _LIMITS["found"]),
         expected="a result or a coded error",
-        next_step="report this with the error stack that `pbl status --json` prints",
+        next_step=_REPORT,
         key=_cut(about, _LIMITS["key"]),
     )
 
@@ -104,15 +105,14 @@ def error_code(message: str) -> str:
 def error_next_step(message: str) -> str:
     """The next step an error row's message states, or how to report it. The last one: names stand before it, and the
     name of a file may hold a line that looks like one."""
-    for line in reversed(message.splitlines()):
-        if line.strip().startswith("next:"):
-            return line.strip().removeprefix("next:").strip()
-    return "report this with the error stack that `pbl status --json` prints"
+    return _stated("next:", reversed(message.splitlines()), _REPORT)
 
 
 def error_found(message: str) -> str:
     """Return what an error row's message states as found; the message itself when it is not a coded one."""
-    for line in message.splitlines():
-        if line.strip().startswith("found:"):
-            return line.strip().removeprefix("found:").strip()
-    return message.strip()
+    return _stated("found:", message.splitlines(), message.strip())
+
+
+def _stated(word: str, lines: Iterable[str], otherwise: str) -> str:
+    stated = (line.strip().removeprefix(word).strip() for line in lines if line.strip().startswith(word))
+    return next(stated, otherwise)

@@ -77,14 +77,12 @@ class Keypoints(dj.Computed):
     @property
     def key_source(self) -> Any:
         """Only where a person is chosen: a video that waits for a choice has no row and no error."""
-        chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
-        return chosen.proj() * KeypointSelection.proj() - video.NotUsable
+        return tracking.chosen().proj() * KeypointSelection.proj() - video.NotUsable
 
     def make_fetch(self, key: dict) -> tuple:
         probed = one(video.Video * video.VideoInfo & key)
         times = file_ref(probed.pop("frame_time"))
-        chosen = tracking.SubjectChoice & [{"choice_status": s} for s in tracking.CHOSEN]
-        person = one(chosen & key, "chosen_person_id")
+        person = one(tracking.chosen() & key, "chosen_person_id")
         tracks, detector, model = one(tracking.Tracking & key, "tracks", "detector", "tracking_model_sha256")
         camera = video.camera_of(probed)
         log = (video.PhoneAttitude & key).to_dicts()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from . import fit, gait, gdi, keypoints, kinetics, tracking
-from .method_rows import stored_key
+from .method_rows import stored_keys
 
 #: Column of a method -> table of the methods, table of the results.
 _RESULTS = {
@@ -38,9 +38,4 @@ def with_keys(restriction: Mapping[str, Any]) -> dict[str, Any]:
 def keys_named(column: str, name: str) -> list[str]:
     """Keys of the methods (column `fit_method`, ...) or normative sets (`norm`) that a key or a short name means, the
     newest version first. Raises `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
-    if column == "norm":
-        return gdi.norm_keys(name)
-    table = _RESULTS[column][0]
-    rows = table.proj(f"{column}_name", f"{column}_version").to_dicts(order_by=f"{column}_version DESC")
-    found = [row[column] for row in rows if name in (row[column], row[f"{column}_name"])]
-    return found or [stored_key(table, name)]  # raises, and names the known ones
+    return gdi.norm_keys(name) if column == "norm" else stored_keys(_RESULTS[column][0], name)

@@ -60,18 +60,18 @@ def resolve_method(table: Any, name: str) -> str:
     Raises `PblError` SOLVER_UNKNOWN; for a registered model MODEL_INVALID, MARKER_SET_UNKNOWN.
     """
     offered = methods.of_stage(table.stage).offered(name)
-    return stored_key(table, name) if offered is None else register(table, offered)[0]
+    return stored_keys(table, name)[0] if offered is None else register(table, offered)[0]
 
 
-def stored_key(table: Any, name: str) -> str:
-    """Return what `resolve_method` does, from the rows alone."""
+def stored_keys(table: Any, name: str) -> list[str]:
+    """Return the keys of the rows with this key or name, the newest version first. Raises `PblError` SOLVER_UNKNOWN if
+    there is none."""
     prefix = _prefix(table)
     rows = table.proj(f"{prefix}_method_name", f"{prefix}_method_version").to_dicts(
         order_by=[f"{prefix}_method_version DESC", f"{prefix}_method"]
     )
-    for row in rows:
-        if name in (row[f"{prefix}_method"], row[f"{prefix}_method_name"]):
-            return row[f"{prefix}_method"]
+    if found := [r[f"{prefix}_method"] for r in rows if name in (r[f"{prefix}_method"], r[f"{prefix}_method_name"])]:
+        return found
     raise PblError(
         "SOLVER_UNKNOWN",
         found=f"no {prefix} method {name!r}",

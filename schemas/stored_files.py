@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import glob
 import zipfile
 import zlib
@@ -16,6 +17,12 @@ from pbl_pipeline.temporary import new_folder
 
 from . import connection
 from .datajoint_setup import backend_of, build_object_path, full_path
+
+_unusable = functools.partial(
+    PblError,
+    "FILE_FORMAT",
+    next_step="restore the object store from the backup, or delete the row so that it is computed again",
+)
 
 
 @contextmanager
@@ -92,19 +99,8 @@ def file_ref(value: Any) -> dict[str, Any]:
 
 
 def _damaged(ref: Mapping[str, Any], found: str) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=found,
-        expected="the file that was stored",
-        next_step="restore the object store from the backup, or delete the row so that it is computed again",
-        key=f"{ref['path']} in the object store",
-    )
+    return _unusable(found, "the file that was stored", key=f"{ref['path']} in the object store")
 
 
 def _lost(ref: Mapping[str, Any]) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=f"the object store has no {ref['path']}",
-        expected="every file that a row of the database names",
-        next_step="restore the object store from the backup, or delete the row so that it is computed again",
-    )
+    return _unusable(f"the object store has no {ref['path']}", "every file that a row of the database names")

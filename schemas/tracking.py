@@ -217,6 +217,11 @@ class SubjectChoice(dj.Computed):
             )
 
 
+def chosen() -> Any:
+    """Rows of `SubjectChoice` that name a person."""
+    return SubjectChoice & [{"choice_status": s} for s in CHOSEN]
+
+
 def _decided_elsewhere(key: Mapping[str, Any]) -> tuple | None:
     """Return the last decision about another tracking of this video: its tracks, detector and model, the person's
     number there, the method; None without one."""

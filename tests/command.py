@@ -9,6 +9,9 @@ from unittest import mock
 
 from pbl_pipeline.cli import main
 
+#: `pbl` in a separate process.
+PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Done:

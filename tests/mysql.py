@@ -54,13 +54,8 @@ def chosen() -> bool:
 
 
 def programs() -> Path:
-    """Return the root of the unpacked server, fetched into the user's cache where it is absent (50 MB).
-
-    Raises
-    ------
-    NoMySQL
-        It cannot be fetched.
-    """
+    """Return the root of the unpacked server, fetched into the user's cache where it is absent (50 MB). Raises
+    `NoMySQL` if it cannot be fetched."""
     if named := os.environ.get(ROOT):
         if not (Path(named) / "usr" / "sbin" / "mysqld").is_file():
             raise NoMySQL(f"{ROOT}={named} holds no usr/sbin/mysqld")
@@ -116,12 +111,7 @@ class Server:
     @property
     def environment(self) -> dict[str, str]:
         """The variables with which `pbl` uses it, as root."""
-        return {
-            "DJ_HOST": "127.0.0.1",
-            "DJ_PORT": str(self.port),
-            "DJ_USER": "root",
-            "DJ_PASS": self.password,
-        }
+        return {"DJ_HOST": "127.0.0.1", "DJ_PORT": str(self.port), "DJ_USER": "root", "DJ_PASS": self.password}
 
     def start(self) -> None:
         """Start it where it does not run, also after `kill`, and wait until it answers."""
@@ -168,13 +158,8 @@ class Server:
 
 
 def start(folder: Path) -> Server:
-    """Make a database in a folder and start a server on it, with a random password of root.
-
-    Raises
-    ------
-    NoMySQL
-        It cannot be fetched or does not start.
-    """
+    """Make a database in a folder and start a server on it, with a random password of root. Raises `NoMySQL` if it
+    cannot be fetched or does not start."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "data").mkdir()
     server = Server(folder, free_port(), secrets.token_hex(16))

@@ -66,14 +66,7 @@ def stage_of(table: Any) -> Stage:
 
 
 def tables_of(resource: str) -> list[Any]:
-    """The computed tables that a resource class or group serves, in the order of the chain. Raises USAGE."""
-    if resource not in GROUPS:
-        raise PblError(
-            "USAGE",
-            found=f"resource {resource!r}",
-            expected="one of " + ", ".join(GROUPS),
-            next_step="name one of these with --resource",
-        )
+    """The computed tables that a resource class or group serves, in the order of the chain."""
     return [t for t in computed_tables() if stage_of(t).resource in GROUPS[resource]]
 
 

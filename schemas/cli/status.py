@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,7 @@ def status(exact: bool, as_json: bool) -> None:
     schemas.activate(methods=False)
     state = pipeline_status(exact or None)
     if as_json:
-        click.echo(json.dumps(state.to_dict(), indent=2))
+        click.echo(json.dumps(dataclasses.asdict(state), indent=2))
         return
     for line in lines(state):
         click.echo(line)

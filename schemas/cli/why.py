@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ def why(video_id: int, as_json: bool) -> None:
     schemas.activate(methods=False)
     found = look(video_id)
     if as_json:
-        click.echo(json.dumps(found.to_dict(), indent=2, default=str))
+        click.echo(json.dumps(dataclasses.asdict(found), indent=2, default=str))
         return
     click.echo(f"video {found.video_id}  {found.name}  session {found.session_id}\n{found.path}\n")
     for step in found.steps:

@@ -10,7 +10,7 @@ from typing import Any
 from pbl_pipeline.errors import PblError
 
 from .. import tracking, video
-from ..method_rows import stored_key
+from ..method_rows import stored_keys
 from ..reading.objects import load_tracking
 from ..stored_files import file_ref, stored_file
 
@@ -108,7 +108,7 @@ def _key(video_id: int, tracking_method: str | None) -> dict[str, Any]:
     video.registered_video(video_id)  # raises for an unknown one
     key: dict[str, Any] = {"video_id": video_id}
     if tracking_method is not None:
-        key["tracking_method"] = stored_key(tracking.TrackingMethod, tracking_method)
+        key["tracking_method"] = stored_keys(tracking.TrackingMethod, tracking_method)[0]
     return key
 
 

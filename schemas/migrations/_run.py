@@ -32,8 +32,7 @@ class Difference:
     what: str
     known: bool = True
 
-    def text(self) -> str:
-        """Return it as one line."""
+    def __str__(self) -> str:
         return f"{self.table}: {self.what}"
 
 
@@ -112,7 +111,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
         created = _bind(create=True)
         steps = _apply(cursor, say)
     _reread()  # also where nothing was left to do: an earlier run may have ended before it came to this
-    if left := [d.text() for d in differences()]:
+    if left := list(map(str, differences())):
         raise _differs(left)
     declare_all()
     return Outcome(steps, created, [])
@@ -151,7 +150,7 @@ def _plan() -> Outcome:
     steps = [(m.title, m.statements(conn)) for m in available() if m.number not in done]
     planned = " ".join(s for _, statements in steps for s in statements)
     # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
-    left = [d.text() for d in differences() if d.table not in planned and (d.known or not created)]
+    left = [str(d) for d in differences() if d.table not in planned and (d.known or not created)]
     return Outcome(steps, created, left)
 
 

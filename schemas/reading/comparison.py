@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from .. import connection, fit, gait, gdi, study, video
 from . import frames
 from .frames import current_sets, frame_of
 from .shown import ShownVisit, shown_visit
-from .visit_list import Change, change_since, judged, not_alike, results_of
+from .visit_list import Change, change_since, judged, not_alike, results_of, usual_chain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -143,7 +142,7 @@ class Comparison:
     @property
     def same_methods(self) -> bool:
         """True if one chain of methods made all results."""
-        return len({(r.kind, r.methods) for c in self.compared if (r := c.about.result) is not None}) <= 1
+        return len({r.chain for c in self.compared if (r := c.about.result) is not None}) <= 1
 
 
 def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int | None] | None = None) -> Comparison:
@@ -163,13 +162,12 @@ def compare(chosen: Sequence[tuple[int, int | None]], reference: tuple[int, int 
             next_step="tick them in the list of a person's visits, on the page of any of them",
         )
     results = results_of({i for i, _ in chosen})
-    counts = Counter((r.kind, r.methods) for found in results.values() for r in found)
-    usual = max(counts, key=lambda chain: counts[chain], default=None)
+    usual = usual_chain(results)
     pages: list[tuple[tuple[int, int | None], ShownVisit]] = []
     for one in chosen:
         session_id, number = one
-        chains = [(r.kind, r.methods) for r in results[session_id]]
         if number is None:
+            chains = [r.chain for r in results[session_id]]
             number = chains.index(usual) if usual in chains else 0
         page = shown_visit(session_id, number)
         if all((p.row.session_id, p.shown) != (session_id, page.shown) for _, p in pages):

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
+from pymysql.converters import escape_string
+
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
 from ..stored_files import file_ref, stored_file
@@ -98,13 +100,9 @@ def score_frame(restriction: Any = True) -> pd.DataFrame:
         scores = scores & (_sessions() * study.Visit & restriction).proj()
     names = sorted((dj.U("instrument") & scores).to_arrays("instrument"))
     # DataJoint's names have no capitals and begin with a letter: numbers there, the instruments' names here.
-    wide = {f"score_{i}": f"max(if(instrument = {_literal(n)}, score_value, null))" for i, n in enumerate(names)}
+    wide = {f"score_{i}": f"max(if(instrument = '{escape_string(n)}', score_value, null))" for i, n in enumerate(names)}
     found = frame_of(dj.U("session_id").aggr(scores, **wide)) if names else frame_of(scores.proj())
     return found.rename(columns={f"score_{i}": n for i, n in enumerate(names)})[["session_id", *names]]
-
-
-def _literal(text: str) -> str:
-    return "'" + text.replace("\\", "\\\\").replace("'", "''") + "'"
 
 
 def frame_of(query: Any) -> Any:

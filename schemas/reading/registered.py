@@ -53,13 +53,12 @@ def changes(restriction: Any = True) -> pd.DataFrame:
         rows = [r for r in own.to_dict("records") if results[r["session_id"]]]
         for before, now in itertools.pairwise(rows):
             for result in results[now["session_id"]]:
-                chain = result.kind, *result.methods
-                same = [r for r in results[before["session_id"]] if (r.kind, *r.methods) == chain]
+                same = [r for r in results[before["session_id"]] if r.chain == result.chain]
                 if not same:
                     continue
-                differs, other = not_alike(result, same[0]), measures.get((before["session_id"], *chain), {})
+                differs, other = not_alike(result, same[0]), measures.get((before["session_id"], *result.chain), {})
                 judgements = {"gdi": change_since(result, same[0])}
-                for name, mine in measures.get((now["session_id"], *chain), {}).items():
+                for name, mine in measures.get((now["session_id"], *result.chain), {}).items():
                     if (old := other.get(name)) is not None:
                         errors = [(m.error_sd, m.minimal_change) for m in (mine, old)]
                         judgements[name] = judged(mine.mean - old.mean, errors, differs)

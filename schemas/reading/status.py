@@ -126,10 +126,6 @@ class Status:
     cameras: dict[str, int] = dataclasses.field(default_factory=dict)
     not_usable: list[LeftOut] = dataclasses.field(default_factory=list)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return dataclasses.asdict(self)
-
 
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     """Query the state of all computed tables. `schemas.activate()` must have been called.
@@ -165,7 +161,7 @@ def _table_status(
         remaining, _ = table().progress()
         pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
     done, empty, waiting = rows
-    oldest, reason = _oldest(table, table.connection) if counts["pending"] else (None, "")
+    oldest, reason = _oldest(table) if counts["pending"] else (None, "")
     per_hour = rates.get(name, 0.0)
     left = 3600.0 * pending / per_hour if per_hour and pending else None
     return TableStatus(
@@ -267,9 +263,9 @@ def span(seconds: float | None) -> str:
     return f"{seconds:.0f} s"
 
 
-def _oldest(table: Any, server: Any) -> tuple[float | None, str]:
+def _oldest(table: Any) -> tuple[float | None, str]:
     """Return the age (s) of the oldest pending job, and the reason for which jobs were put back."""
-    jobs = quote(*queue_name(table))
+    jobs, server = quote(*queue_name(table)), table.connection
     age = server.query(
         f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
     ).fetchone()[0]

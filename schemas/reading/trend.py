@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections import Counter
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import MEASURES
 
 from .. import session, video
 from .shown import shown_visit
-from .visit_list import Change, Result, change_since, judged, not_alike, results_of, visits_of
+from .visit_list import Change, Result, change_since, judged, not_alike, results_of, usual_chain, visits_of
 
 #: Name of the index among the measures.
 INDEX = "gdi"
@@ -74,13 +73,12 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
         )
     rows = sorted(visits_of(subject), key=lambda v: (v.day or datetime.date.min, v.session_id))
     results = results_of(v.session_id for v in rows)
-    chains = Counter((r.kind, r.methods) for found in results.values() for r in found)
-    usual = max(chains, key=lambda chain: chains[chain], default=None)
+    usual = usual_chain(results)
     points: list[Point] = []
     with_value: list[tuple[Point, Result]] = []
     left_out: list[str] = []
     for v in rows:
-        at = next((i for i, r in enumerate(results[v.session_id]) if (r.kind, r.methods) == usual), None)
+        at = next((i for i, r in enumerate(results[v.session_id]) if r.chain == usual), None)
         if at is None:
             left_out.append(v.label)
             continue
@@ -93,8 +91,7 @@ def trend_of(session_id: int, measure: str = INDEX) -> Trend:
                 point = dataclasses.replace(point, before=since[0], first=since[1])
             with_value.append((point, result))
         points.append(point)
-    methods = () if usual is None else (usual[0], *usual[1])
-    return Trend(subject, measure, known, methods, tuple(points), tuple(left_out))
+    return Trend(subject, measure, known, usual or (), tuple(points), tuple(left_out))
 
 
 def _value(session_id: int, at: int, result: Result, measure: str) -> dict:

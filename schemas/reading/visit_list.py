@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -77,6 +78,11 @@ class Result:
     worst: tuple[str, ...]
     corrected: bool = False
     filming: Filming | None = None  # how it was filmed; None if it was not looked up
+
+    @property
+    def chain(self) -> tuple[str, ...]:
+        """Kind of recordings and methods."""
+        return self.kind, *self.methods
 
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
@@ -219,13 +225,19 @@ def not_alike(result: Result, before: Result) -> tuple[Difference, ...]:
     found = []
     if any(r.outcome == "FAIL" or DOUBTS.intersection(r.worst) for r in (result, before)):
         found.append(Difference("checks"))
-    if (result.kind, result.methods) != (before.kind, before.methods):
+    if result.chain != before.chain:
         found.append(Difference("methods"))
     if result.corrected != before.corrected:
         found.append(Difference("corrected"))
     if result.filming is not None and before.filming is not None:
         found += differences(result.filming, before.filming)
     return tuple(found)
+
+
+def usual_chain(results: Mapping[int, Sequence[Result]]) -> tuple[str, ...] | None:
+    """Return `Result.chain` of most of the results, the first of several; None without any."""
+    counts = Counter(r.chain for found in results.values() for r in found)
+    return max(counts, key=lambda chain: counts[chain], default=None)
 
 
 def visits_of(subject: str) -> tuple[VisitRow, ...]:
@@ -249,7 +261,6 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
     found: dict[int, list[Result]] = {i: [] for i in ids}
     if not ids:
         return found
-    order = {fit.SINGLE: 0, fit.RIG: 1, fit.MARKERS: 2}
     open_checks = _open_checks(ids)
     rows = _ask(
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
@@ -286,7 +297,7 @@ def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
                 filming,
             )
         )
-    return {i: sorted(r, key=lambda one: order.get(one.kind, 9)) for i, r in found.items()}
+    return {i: sorted(r, key=lambda one: fit.KINDS.index(one.kind)) for i, r in found.items()}
 
 
 def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
@@ -523,7 +534,7 @@ def _trend(
         if before >= day:
             continue
         for other in results[session_id]:
-            if (other.kind, other.methods) == (result.kind, result.methods):
+            if other.chain == result.chain:
                 change = change_since(result, other)
                 if change is not None:
                     return Trend(session_id, before, change.by, change.sure, change.least, change.differs)

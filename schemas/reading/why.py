@@ -49,10 +49,6 @@ class Why:
         stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or bool(unusable([self.video_id]))
         return bool(left) and not stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return dataclasses.asdict(self)
-
 
 def why(video_id: int) -> Why:
     """Return the state of a registered video in every table. `schemas.activate()` must have been called. Raises

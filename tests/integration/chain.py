@@ -155,6 +155,11 @@ def install(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
 
 
+def change_fits(patch: pytest.MonkeyPatch, change: Callable[[SessionFit], SessionFit]) -> None:
+    """Let the library fit what `change` makes of the fits of the stand-in."""
+    patch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **named: change(fit_session(*given, **named)))
+
+
 def computed_once(build: Callable[[Path], Any]) -> Any:
     """A fixture of this name: empty tables, filled by `build(folder)` as `fill` does it."""
 

@@ -5,7 +5,6 @@ import gzip
 import json
 import shutil
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +20,7 @@ from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, backup_files, embedded
 from schemas.operations.declare import declare_all
 from schemas.reading import frames
-from tests.command import pbl
+from tests.command import PBL, pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes
 from workers import backups
@@ -269,10 +268,7 @@ def test_regular_backups_hold_recordings_once_and_the_oldest_go(
     for name in ("notes", "2026-01-01T000000Z"):  # somebody's, and an interrupted one
         (root / name).mkdir(parents=True)
     # As cron starts it: in a process that knows no table yet.
-    script = "from pbl_pipeline.cli import main; main()"
-    alone = subprocess.run(
-        [sys.executable, "-c", script, "cron", "backup"], capture_output=True, text=True, check=False
-    )
+    alone = subprocess.run([*PBL, "cron", "backup"], capture_output=True, text=True, check=False)
     assert alone.returncode == 0, alone.stderr
     for second in (1, 2):
         monkeypatch.setattr(backups, "_NAME", f"2099-01-01T00000{second}Z")

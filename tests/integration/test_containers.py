@@ -19,13 +19,11 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 from schemas.operations import embedded
-from schemas.operations.embedded import process
 from tests import image
-from tests.database import new_home, remove_home
 from tests.slurm import until
 
 from . import chain
-from .test_secrets import make_certificates
+from .test_secrets import encrypted_server
 
 pytestmark = [
     pytest.mark.machine,
@@ -57,7 +55,8 @@ def compose(made: image.Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         for folder in folders.values():
             folder.mkdir(mode=0o700)
             shutil.chown(folder, UID, GID)
-        server = stack.enter_context(encrypted_database())
+        home, _ = stack.enter_context(encrypted_server("db"))
+        server = embedded.Folder(home / "db")
         subprocess.run(["sh", image.DOCKERFILE.parent / "make-secrets.sh", tmp_path / "secrets"], check=True)
         (tmp_path / "secrets" / "mysql_root").write_text(server.credentials().admin_password)
         for file in (tmp_path / "secrets").iterdir():
@@ -78,23 +77,6 @@ def compose(made: image.Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             return image.Container(made, found, tmp_path / "secrets", volumes, changes | admin)
 
         yield service
-
-
-@contextlib.contextmanager
-def encrypted_database() -> Iterator[embedded.Folder]:
-    """A server that speaks TLS."""
-    home = new_home()
-    files = make_certificates(home, "db")
-    for file in files.values():
-        file.chmod(0o644)
-    with pytest.MonkeyPatch.context() as patch:
-        tls = (f"--ssl-cert={files['server']}", f"--ssl-key={files['server-key']}")
-        patch.setattr(process, "OPTIONS", (*process.OPTIONS, *tls))
-        embedded.start(folder=embedded.Folder(home / "db"))
-    try:
-        yield embedded.Folder(home / "db")
-    finally:
-        remove_home(home)
 
 
 @contextlib.contextmanager

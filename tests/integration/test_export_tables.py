@@ -7,10 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import pbl_pipeline.fit
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import SessionFit
 from schemas import fit, gait, gdi, session
 from schemas.intake import Methods, Sensors, VisitRecord, ingest
 from schemas.reading import fitted_visit, list_fitted, load_visits
@@ -22,14 +20,9 @@ from workers.populate import populate
 from . import chain
 
 
-def fit_with_markers(trials, names, paramset=None, camera_motion="static") -> SessionFit:
-    """The stand-in's fit with the markers of its set."""
-    return chain.with_all_markers(chain.fit_session(trials, names, paramset, camera_motion))
-
-
 def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ezc3d = pytest.importorskip("ezc3d")
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_with_markers)
+    chain.change_fits(monkeypatch, chain.with_all_markers)
     time = np.arange(-0.5, 9.0, 0.02)
     log = {"time_s": time, "qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5, "ax": 0.0, "ay": 9.81, "az": time}
     pd.DataFrame(log).to_csv(tmp_path / "log.csv", index=False)
@@ -69,7 +62,7 @@ def _files(folder: Path) -> dict[str, bytes]:
 
 
 def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_with_markers)
+    chain.change_fits(monkeypatch, chain.with_all_markers)
     visits = [("P001", "2026-03-01"), ("P001", "nach OP é"), ("P002", "2026-03-01"), ("P003", "2026-03-01")]
     for i, (subject, label) in enumerate(visits):
         register(chain.small_video(tmp_path, f"walk{i}"), subject=subject, session_label=label)

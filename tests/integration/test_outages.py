@@ -1,7 +1,6 @@
 """A full database, a full store, a clock that goes back, workers that die: nothing is lost, nothing is left behind."""
 
 import contextlib
-import datetime
 import errno
 import os
 import shutil
@@ -15,38 +14,23 @@ import pymysql
 import pytest
 
 import pbl_pipeline.video
-import schemas
 from schemas import connection, fit, lab, review, session, tracking, video, worker
 from schemas.decisions import review_decisions
 from schemas.job_errors import error_code, of_server
 from schemas.jobs import jobs_of
 from schemas.operations import catalog
 from schemas.operations.orphans import orphans
+from schemas.reading.status import pipeline_status
 from schemas.store import store_error
 from schemas.stored_files import remove_left_over
 from tests.rows import register
 from workers import queue, recover, refresh, run_job
-from workers.heartbeat import Heartbeat, Silent
-from workers.loop import Worker
+from workers.heartbeat import Heartbeat
 
 from . import chain
+from .jobs import at_once, first_job, jobs_left, queued, work
 
 FULL = pymysql.err.OperationalError(1114, "The table '__video_info' is full")
-
-
-def work(*tables: Any) -> Worker:
-    """One worker until nothing is left that can be taken now."""
-    one = Worker(tables or schemas.computed_tables(), Silent())
-    one.run(once=True)
-    return one
-
-
-def first_job(folder: Path, name: str = "walk") -> queue.Claim:
-    """The reserved job of a new video."""
-    register(chain.small_video(folder, name), session_label=name)
-    refresh.refresh()
-    (job,) = queue.claim(video.VideoInfo, 1)
-    return job
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, *errors: Exception) -> list[Any]:
@@ -164,8 +148,7 @@ def test_only_a_database_that_is_away_is_an_outage(error: Exception, code: str):
 
 
 def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, monkeypatch):
-    register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
+    queued(tmp_path, video.VideoInfo)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
     tried = failing(monkeypatch, type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
     assert queue.sweep(video.VideoInfo) == 0  # the one job is still wanted
@@ -226,12 +209,18 @@ def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
     assert left_in_the_store(video.VideoInfo) == []
 
 
-def test_a_full_disk_while_a_job_computes_puts_it_back_too(tmp_path: Path, monkeypatch):
+@pytest.mark.parametrize("where", [(video.VideoInfo, "make_insert"), (pbl_pipeline.video, "probe")])
+def test_a_full_store_delays_the_job_and_says_why(tmp_path: Path, monkeypatch, where: tuple[Any, str]):
     job = first_job(tmp_path)
-    failing(monkeypatch, pbl_pipeline.video, "probe", OSError(errno.ENOSPC, "No space left on device"))
+    failing(monkeypatch, *where, OSError(errno.ENOSPC, "No space left on device"))
     outcome = run_job.run(job)
     assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
-    assert video.VideoInfo.jobs.fetch1("status") == "pending"
+    assert jobs_left() == {"VideoInfo": {"pending": 1}}
+    assert queue.claim(video.VideoInfo, 1) == []  # not before a minute is over
+    state = next(t for t in pipeline_status().tables if t.table == "VideoInfo")
+    assert "No space left on device" in state.delayed
+    at_once(job)
+    assert work(video.VideoInfo).done == 1
 
 
 def test_a_bucket_without_room_has_its_code():
@@ -263,10 +252,7 @@ def run_and_die(job: queue.Claim, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("table", [tracking.Tracking, fit.SessionFit])
 def test_who_does_the_job_of_a_dead_process_removes_its_files(tmp_path: Path, monkeypatch, table: Any):
     """Also those of its parts."""
-    register(chain.small_video(tmp_path, "walk"))
-    computed = schemas.computed_tables()
-    work(*computed[: computed.index(table)])
-    refresh.refresh()
+    queued(tmp_path, table)
     run_and_die(queue.claim(table, 1)[0], monkeypatch)
     left = left_in_the_store(table)
     assert left
@@ -337,26 +323,13 @@ def test_no_hour_comes_twice_in_autumn():
     assert connection.connect().query("SELECT @@session.time_zone").fetchone() == ("+00:00",)
 
 
-def test_a_worker_whose_heart_beats_in_the_future_is_dead(tmp_path: Path):
-    """It beat for the last time before the clock was set back."""
-    (number,) = register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
-    now = connection.connect().query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
-    row = {"worker": "w", "worker_host": "there", "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
-    seen = now + datetime.timedelta(hours=1)
-    worker.Worker.insert1({**row, "worker_started": now, "worker_seen": seen, "worker_doing": ""})
-    held = {"video_id": number, "status": "reserved", "host": "there", "pid": 1, "reserved_time": now}
-    video.VideoInfo.jobs.update1(held)
-    assert recover.free_dead(video.VideoInfo) == 1
-
-
 # -------------------------------------------------------------------------------------------------------------- crashes
 def test_crashes_do_not_outlive_success(tmp_path: Path):
     job = first_job(tmp_path)
     recover.crashed(job, "signal SIGKILL")
     assert video.VideoInfo.jobs.fetch1("attempts") == 1
     assert "SIGKILL" in video.VideoInfo.jobs.fetch1("error_message")
-    video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
+    at_once(job)
     assert work(video.VideoInfo).done == 1
     video.VideoInfo.delete(prompt=False)
     refresh.refresh()
@@ -365,7 +338,7 @@ def test_crashes_do_not_outlive_success(tmp_path: Path):
     for _ in range(recover.CRASHES - 1):
         assert recover.crashed(again, "signal SIGKILL")
         assert video.VideoInfo.jobs.fetch1("status") == "pending"
-        video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
+        at_once(job)
         (again,) = queue.claim(video.VideoInfo, 1)
     assert recover.crashed(again, "signal SIGKILL")
     assert error_code(video.VideoInfo.jobs.errors.fetch1("error_message")) == "WORKER_CRASH"

@@ -8,30 +8,13 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.video
-import schemas
-from pbl_pipeline.paramset import Paramset
 from schemas import connection, fit, gait, keypoints, tracking, video
 from schemas.job_errors import error_code, error_found
 from schemas.jobs import jobs_of
 from tests.rows import register
-from workers import queue, refresh, requeue, run_job
-from workers.heartbeat import Silent
-from workers.loop import Worker
+from workers import queue, requeue, run_job
 
-from . import chain
-
-
-def work(*tables: Any) -> Worker:
-    """One worker until nothing is left that can be taken now."""
-    one = Worker(tables or schemas.computed_tables(), Silent())
-    one.run(once=True)
-    return one
-
-
-def above(table: Any) -> list[Any]:
-    """The computed tables before this one."""
-    found = schemas.computed_tables()
-    return found[: found.index(table)]
+from .jobs import queued, work
 
 
 def claimed(table: Any) -> queue.Claim:
@@ -59,8 +42,7 @@ def test_a_file_whose_name_is_a_word_of_datajoint_is_one_error(tables: None, tmp
 
 
 def test_a_video_that_was_deleted_while_its_job_was_queued_is_not_tried(tables: None, tmp_path: Path, monkeypatch):
-    (number,) = register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
+    number = queued(tmp_path, video.VideoInfo)
     video.Video.delete(prompt=False)
     monkeypatch.setattr(pbl_pipeline.video, "probe", lambda path: pytest.fail("tried"))
     outcome = run_job.run(claimed(video.VideoInfo))
@@ -69,8 +51,7 @@ def test_a_video_that_was_deleted_while_its_job_was_queued_is_not_tried(tables: 
 
 
 def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: None, tmp_path: Path, monkeypatch):
-    register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
+    queued(tmp_path, video.VideoInfo)
     real = pbl_pipeline.video.probe
 
     def probe(path):
@@ -83,9 +64,7 @@ def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: No
 
 
 def test_a_selection_that_was_withdrawn_is_not_tried(tables: None, tmp_path: Path):
-    register(chain.small_video(tmp_path, "walk"))
-    work(*above(fit.SessionFit))
-    refresh.refresh()
+    queued(tmp_path, fit.SessionFit)
     (key,) = fit.FitSelection.keys()
     fit.FitSelection.update1({**key, "fit_current": False})
     assert run_job.run(claimed(fit.SessionFit)).what == run_job.VANISHED
@@ -93,9 +72,7 @@ def test_a_selection_that_was_withdrawn_is_not_tried(tables: None, tmp_path: Pat
 
 
 def test_a_row_that_a_result_needs_is_gone_for_good(tables: None, tmp_path: Path):
-    register(chain.small_video(tmp_path, "walk"))
-    work(*above(fit.SessionFit))
-    refresh.refresh()
+    queued(tmp_path, fit.SessionFit)
     body = fit.BodyModel.to_dicts()
     fit.BodyModel.delete(prompt=False)
     try:
@@ -121,8 +98,7 @@ def test_a_row_that_a_result_needs_is_gone_for_good(tables: None, tmp_path: Path
 
 
 def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Path, monkeypatch):
-    (number,) = register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
+    number = queued(tmp_path, video.VideoInfo)
     real, names = pbl_pipeline.video.probe, iter("abc")
 
     def probe(path):
@@ -138,24 +114,6 @@ def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Pa
     assert error(video.VideoInfo)[0] == "INPUT_CHANGED"
 
 
-def test_a_method_of_another_version_of_the_code_is_an_error_at_once(tables: None, tmp_path: Path):
-    later = Paramset("tracking", "later", 1, {"a_parameter_of_later": 3})
-    row = {"tracking_method": "later-v1", "tracking_method_name": "later", "tracking_method_version": 1}
-    tracking.TrackingMethod.insert1({**row, "tracking_params": dict(later.params), "tracking_method_sha": later.hash})
-    (number,) = register(chain.small_video(tmp_path, "walk"))
-    key = tracking.TrackingSelection.fetch1()
-    tracking.TrackingSelection.delete(prompt=False)
-    tracking.TrackingSelection.insert1({**key, "tracking_method": "later-v1"})
-    try:
-        work()
-        assert error(tracking.Tracking)[0] == "SOLVER_UNKNOWN"
-        assert jobs_of(tracking.Tracking).fetch1("video_id") == number
-    finally:
-        tracking.TrackingSelection.delete(prompt=False)
-        (tracking.TrackingMethod & {"tracking_method": "later-v1"}).delete(prompt=False)
-
-
-@pytest.mark.parametrize("damage", ["cut off", "other bytes", "gone"])
 @pytest.mark.parametrize(
     ("table", "column", "reader"),
     [
@@ -166,29 +124,27 @@ def test_a_method_of_another_version_of_the_code_is_an_error_at_once(tables: Non
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
-def test_a_damaged_file_of_the_store_is_an_error_that_names_it(tables, tmp_path: Path, table, column, reader, damage):
-    register(chain.small_video(tmp_path, "walk"))
-    work(*above(reader))
-    refresh.refresh()
+def test_a_damaged_file_of_the_store_is_an_error_that_names_it(tables, tmp_path: Path, table, column, reader):
+    queued(tmp_path, reader)
     stored = table.fetch1(column).path
     file = Path(connection.store_backend().spec["location"]) / stored
     content = file.read_bytes()
-    if damage == "gone":
-        file.unlink()
-    else:
-        half = len(content) // 2
-        # A zip whose size is right and whose content is not has its own check sums.
-        file.write_bytes(content[:half] if damage == "cut off" else b"\x93NUMPY" + os.urandom(len(content) - 6))
-    assert work(reader).failed == 1
-    code, found = error(reader)
-    assert code == "FILE_FORMAT", found
-    assert stored in jobs_of(reader).errors.fetch1("error_message")
-    assert work(reader).failed == 0
+    # A zip whose size is right and whose content is not has its own check sums.
+    for damaged in (content[: len(content) // 2], b"\x93NUMPY" + os.urandom(len(content) - 6), None):
+        if damaged is None:
+            file.unlink()
+        else:
+            file.write_bytes(damaged)
+        assert work(reader).failed == 1
+        code, found = error(reader)
+        assert code == "FILE_FORMAT", found
+        assert stored in jobs_of(reader).errors.fetch1("error_message")
+        assert work(reader).failed == 0
+        assert requeue.retry(table=reader.__name__) == {reader.__name__: 1}
 
 
 def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, monkeypatch):
-    register(chain.small_video(tmp_path, "walk"))
-    refresh.refresh()
+    queued(tmp_path, video.VideoInfo)
 
     def insert(self, key, info, origin):
         raise np.linalg.LinAlgError("Singular matrix")
@@ -202,9 +158,7 @@ def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None,
 
 def test_plain_populate_reports_a_missing_row_with_its_code(tables: None, tmp_path: Path):
     """DataJoint writes the name of the exception before its text."""
-    register(chain.small_video(tmp_path, "walk"))
-    work(*above(fit.SessionFit))
-    refresh.refresh()
+    queued(tmp_path, fit.SessionFit)
     body = fit.BodyModel.to_dicts()
     fit.BodyModel.delete(prompt=False)
     try:

@@ -15,20 +15,17 @@ from tests.rows import register
 from workers.populate import populate
 
 from . import chain
+from .jobs import counts
 
 
 def _chain() -> list[str]:
     return [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
 
-def _counts() -> dict[str, int]:
-    return {name: len(table()) for name in _chain() for table in schemas.computed_tables() if table.__name__ == name}
-
-
 def test_video_info_again_deletes_what_was_computed_from_it(tables: None, tmp_path: Path):
     one, dark = register(chain.small_video(tmp_path, "walk"), chain.small_video(tmp_path, "dark"))
     populate(_chain())
-    before = _counts()
+    before = counts()
     assert before["Tracking"] == 2
     review_decisions.mark_not_usable(dark, "other", "dark", by="A. First")
     assert len(tracking.Tracking & {"video_id": dark}) == 1  # marking deletes nothing
@@ -36,15 +33,15 @@ def test_video_info_again_deletes_what_was_computed_from_it(tables: None, tmp_pa
     assert "2 rows of VideoInfo would be deleted" in dry.out
     assert "1 of them only when they are asked for again" in dry.out
     assert pbl("reprocess", "--table", "VideoInfo", "--yes").code == 0
-    assert set(_counts().values()) == {0}
+    assert set(counts().values()) == {0}
     assert not {t.table: t.errors for t in populate(_chain()).tables if t.errors}
     assert {int(v) for v in video.VideoInfo.to_arrays("video_id")} == {one}
     assert len(tracking.Tracking - video.VideoInfo) == 0
-    assert _counts()["SessionGdi"] == 1
+    assert counts()["SessionGdi"] == 1
     review_decisions.take_back(dark, by="A. First")
     populate(_chain())
     of_videos = ("VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput")
-    assert {n: _counts()[n] for n in of_videos} == {n: before[n] for n in of_videos}
+    assert {n: counts()[n] for n in of_videos} == {n: before[n] for n in of_videos}
 
 
 def test_every_table_has_a_foreign_key_to_each_result_that_it_reads(

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pymysql
@@ -19,11 +19,11 @@ from pbl_pipeline.errors import PblError
 from schemas import connection
 from schemas.operations import embedded
 from schemas.operations.embedded import Folder, process
+from tests.command import PBL
 from tests.database import new_home, remove_home
 
 pytestmark = pytest.mark.database
 
-PBL = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()"]
 WRONG = "wrong-password-5d1e"
 
 Use = Callable[..., None]
@@ -57,19 +57,27 @@ def make_certificates(folder: Path, name: str) -> dict[str, Path]:
     return files
 
 
-@pytest.fixture(scope="module")
-def encrypted() -> Iterator[tuple[Path, dict[str, Path]]]:
-    """A server with a certificate for `localhost`; its home and the files."""
+@contextmanager
+def encrypted_server(name: str) -> Iterator[tuple[Path, dict[str, Path]]]:
+    """A server with a certificate for this name; its home and the files."""
     home = new_home()
-    files = make_certificates(home, "localhost")
+    files = make_certificates(home, name)
     for file in files.values():
         file.chmod(0o644)  # the server's account reads them; they are worth nothing after the test
     options = (*process.OPTIONS, f"--ssl-cert={files['server']}", f"--ssl-key={files['server-key']}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "OPTIONS", options)
         embedded.start(folder=Folder(home / "db"))
-    yield home, files
-    remove_home(home)
+    try:
+        yield home, files
+    finally:
+        remove_home(home)
+
+
+@pytest.fixture(scope="module")
+def encrypted() -> Iterator[tuple[Path, dict[str, Path]]]:
+    with encrypted_server("localhost") as server:
+        yield server
 
 
 @pytest.fixture
@@ -196,9 +204,14 @@ def test_a_refused_login_names_no_password(database: Path, use: Use, monkeypatch
     with pytest.raises(PblError) as error:
         connection.plain_connection()
     assert error.value.code == "DB_REFUSED"
+    assert "DJ_PASS" in str(error.value)
     assert WRONG not in str(error.value)
     assert isinstance(error.value.__cause__, pymysql.err.OperationalError)
     assert WRONG not in str(error.value.__cause__)
+    assert "DB_REFUSED" in in_new_process(SHOW).stderr
+    monkeypatch.delenv("DJ_PASS")
+    with pytest.raises(PblError, match=r"^DB_REFUSED: "):
+        connection.plain_connection()
 
 
 @pytest.mark.parametrize(

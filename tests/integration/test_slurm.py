@@ -17,11 +17,11 @@ from pbl_pipeline.bench.detect import numbered
 from schemas import tracking, video
 from schemas.operations import embedded
 from schemas.operations.orphans import orphans
-from schemas.reading.status import queue_counts
 from tests import slurm
 from tests.rows import register
 
 from . import chain
+from .jobs import jobs_left
 
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = ROOT / "workers" / "deploy" / "slurm" / "worker.sbatch"
@@ -102,13 +102,13 @@ def test_an_array_of_workers_does_every_job_once(
     slurm.until(lambda: not cluster.tasks("R,CG,PD"), 60)
 
     states = Counter(job["JobState"] for job in cluster.accounting())
-    summary = f"{time.monotonic() - began:.0f} s; elements that ended: {dict(states)}; jobs left: {left()}\n"
+    summary = f"{time.monotonic() - began:.0f} s; elements that ended: {dict(states)}; jobs left: {jobs_left()}\n"
     sys.stdout.write(cluster.run("sacct", "--completion") + summary)
     times = done_by(tmp_path)
     assert set(times.values()) == {1}
     assert len(times) >= 3 * VIDEOS - 4  # a worker that is killed may not have reported what it inserted
     assert [len(t()) for t in (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice)] == [VIDEOS] * 3
-    assert left() == {}
+    assert jobs_left() == {}
     assert orphans().lost == []
 
 
@@ -125,9 +125,3 @@ def test_a_worker_ends_by_itself_before_its_time_limit(settings: None, cluster: 
 def options(folder: Path) -> tuple[str, ...]:
     """For a small node: one processor a worker."""
     return ("--cpus-per-task=1", f"--output={folder}/%A_%a.log")
-
-
-def left() -> dict[str, dict[str, int]]:
-    """Rows of the queues."""
-    counts = queue_counts(video.Video.connection).items()
-    return {table: found for table, rows in counts if (found := {s: n for s, n in rows.items() if n})}

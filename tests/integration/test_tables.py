@@ -7,6 +7,7 @@ import platform
 import re
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -16,12 +17,14 @@ import pytest
 from click.testing import CliRunner
 
 import pbl_pipeline.gait
+import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 import pbl_pipeline.video
 import schemas
 import workers.populate
 from docs_site import table_map
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
@@ -36,10 +39,12 @@ from schemas.reading.status import pipeline_status
 from tests import not_none
 from tests.command import pbl
 from tests.database import embedded_only
-from tests.rows import register
+from tests.rows import register, remove_all
+from tests.walking_fit import walking_fit
 from workers.populate import populate
 
 from . import chain
+from .jobs import hold, jobs_left
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -55,6 +60,31 @@ def camera_of(number: int) -> Camera:
 
 def done(run) -> dict[str, int]:
     return {t.table: t.done for t in run.tables}
+
+
+def still(trial: TrialFit) -> TrialFit:
+    """Return a trial as long as this one, of a person who stands."""
+    return walking_fit(trial.joint_names, trial.body_sha256, name=trial.name, n_frames=len(trial.time_s), walks=False)
+
+
+@pytest.fixture
+def select_tracking(tables: None) -> Iterator[Callable[..., None]]:
+    """A call that also selects another tracking method for the only video: its name, and what it has other."""
+    names: list[dict[str, str]] = []
+    (method,) = tracking.TrackingMethod.to_dicts(limit=1)
+
+    def select(name: str, **other: int) -> None:
+        params = {**method["tracking_params"], **other}
+        row = {"tracking_method_name": name, "tracking_method_version": 1, "tracking_params": params}
+        sha = Paramset("tracking", name, 1, params).hash
+        tracking.TrackingMethod.insert1({"tracking_method": f"{name}-v1", **row, "tracking_method_sha": sha})
+        (selection,) = tracking.TrackingSelection.to_dicts(limit=1)
+        tracking.TrackingSelection.insert1({**selection, "tracking_method": f"{name}-v1"})
+        names.append({"tracking_method_name": name})
+
+    yield select
+    remove_all()
+    (tracking.TrackingMethod & names).delete(prompt=False)
 
 
 # ------------------------------------------------------------------------------------------------ the whole chain
@@ -88,6 +118,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
     assert (row.table, row.code, row.about) == ("VideoInfo", "VIDEO_NOT_A_VIDEO", "notes.mp4")
     assert row.next_step
     assert "Traceback" in row.stack
+    assert jobs_left() == {"VideoInfo": {"error": 1}}
     # What was stored is what the library made: test_visit_contract.py compares all but these.
     walk = load_visit({"subject": "P001"}).fitted[0]
     tracked = reading.load_tracking({"video_id": walk.number})
@@ -113,15 +144,7 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
 
 
 def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def standing(trials, names, paramset=None, camera_motion="static"):
-        result = chain.fit_session(trials, names, paramset)
-        still = tuple(
-            chain.walking_fit(t.joint_names, t.body_sha256, name=t.name, n_frames=len(t.time_s), walks=False)
-            for t in result.trials
-        )
-        return chain.dataclasses.replace(result, trials=still)
-
-    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", standing)
+    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, trials=tuple(map(still, fits.trials))))
     register(chain.small_video(tmp_path, "stands"), chain.small_video(tmp_path, "empty", people="nobody"))
     run = populate()
     assert not errors(run)
@@ -144,15 +167,11 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
 def test_one_recording_without_gait_does_not_empty_the_visit(
     tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def one_stands(trials, names, paramset=None, camera_motion="static"):
-        result = chain.fit_session(trials, names, paramset)
-        walks, other = result.trials
-        still = chain.walking_fit(
-            other.joint_names, other.body_sha256, name=other.name, n_frames=len(other.time_s), walks=False
-        )
-        return chain.dataclasses.replace(result, trials=(walks, still))
+    def one_stands(fits: SessionFit) -> SessionFit:
+        walks, other = fits.trials
+        return dataclasses.replace(fits, trials=(walks, still(other)))
 
-    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", one_stands)
+    chain.change_fits(monkeypatch, one_stands)
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "stands", n=210))
     populate()
     assert gdi.SessionGdi.fetch1("session_status") == "PASS"
@@ -164,11 +183,8 @@ def test_one_recording_without_gait_does_not_empty_the_visit(
 def test_a_failed_fit_gives_no_measures_in_tables_and_files(
     tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    def fails(trials, names, paramset=None, camera_motion="static"):
-        bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
-        return chain.dataclasses.replace(chain.fit_session(trials, names, paramset), qc=(bad,))
-
-    monkeypatch.setattr(chain.pbl_pipeline.fit, "fit_session", fails)
+    bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
+    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, qc=(bad,)))
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210))
     assert not errors(populate())
     why = "the fit failed its check residual_3d_cm"
@@ -266,7 +282,7 @@ def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, m
 
     def odd(path):
         fields = ("container", "codec", "pixel_format", "recorded_utc", "make", "model")
-        return chain.dataclasses.replace(original(path), **dict.fromkeys(fields, "\U0001f4f1" * 300))
+        return dataclasses.replace(original(path), **dict.fromkeys(fields, "\U0001f4f1" * 300))
 
     monkeypatch.setattr(pbl_pipeline.video, "probe", odd)
     register(chain.small_video(tmp_path, "walk"))
@@ -445,16 +461,11 @@ def test_a_decision_wins_and_recomputes_what_was_another_persons(tables: None, t
     assert tracking.SubjectChoice.fetch1("choice_status", "chosen_person_id") == ("CHOSEN", 1)
 
 
-def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path: Path):
+def test_of_two_trackings_the_one_that_is_meant_is_named(select_tracking: Callable[..., None], tmp_path: Path):
     """Each numbers the people anew: number 2 of one may be number 1 of the other."""
     (number,) = register(chain.small_video(tmp_path, "both", people="two alike"))
-    (method,) = tracking.TrackingMethod.to_dicts()[:1]
-    params = {**method["tracking_params"], "min_hits": 4}
-    other = Paramset("tracking", "other", 1, params)
-    row = {"tracking_method_name": "other", "tracking_method_version": 1, "tracking_params": params}
-    tracking.TrackingMethod.insert1({"tracking_method": "other-v1", **row, "tracking_method_sha": other.hash})
     selection = tracking.TrackingSelection.fetch1()
-    tracking.TrackingSelection.insert1({**selection, "tracking_method": "other-v1"})
+    select_tracking("other", min_hits=4)
     populate(["VideoInfo", "Tracking", "SubjectChoice"])
     with pytest.raises(PblError, match="USAGE") as caught:
         decide_person(number, 2)
@@ -470,14 +481,12 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(tables: None, tmp_path:
     assert tracking.SubjectOverride.fetch1("tracking_method", "override_person_id") == ("other-v1", 2)
     (waiting,) = pipeline_status().waiting
     assert selection["tracking_method"] in waiting.next_step
-    (tracking.TrackingSelection & {"tracking_method": "other-v1"}).delete(prompt=False, part_integrity="cascade")
-    (tracking.TrackingMethod & {"tracking_method": "other-v1"}).delete(prompt=False)
     with pytest.raises(PblError, match="SOLVER_UNKNOWN"):
-        decide_person(number, 2, "other-v1")
+        decide_person(number, 2, "another-v1")
 
 
 def test_a_decision_is_carried_to_a_tracking_that_comes_later(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    select_tracking: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The other method numbers the people the other way round; then it does not find the one who was chosen."""
     (number,) = register(chain.small_video(tmp_path, "walk"))
@@ -491,14 +500,9 @@ def test_a_decision_is_carried_to_a_tracking_that_comes_later(
         "turned": (dataclasses.replace(stands, person_id=1), dataclasses.replace(walks, person_id=2)),
         "without": (walks,),
     }
-    (method,) = tracking.TrackingMethod.to_dicts()[:1]
     first = tracking.TrackingSelection.fetch1()
     for hits, (name, persons) in enumerate(later.items(), 4):
-        params = {**method["tracking_params"], "min_hits": hits}
-        row = {"tracking_method_name": name, "tracking_method_version": 1, "tracking_params": params}
-        sha = Paramset("tracking", name, 1, params).hash
-        tracking.TrackingMethod.insert1({"tracking_method": f"{name}-v1", **row, "tracking_method_sha": sha})
-        tracking.TrackingSelection.insert1({**first, "tracking_method": f"{name}-v1"})
+        select_tracking(name, min_hits=hits)
         now = dataclasses.replace(found, persons=persons)
         monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *a, _now=now, **k: _now)
         assert not errors(populate(["Tracking", "SubjectChoice"]))
@@ -508,9 +512,6 @@ def test_a_decision_is_carried_to_a_tracking_that_comes_later(
     assert (rows["without-v1"]["choice_status"], rows["without-v1"]["chosen_person_id"]) == ("NEEDS_CHOICE", None)
     assert rows["without-v1"]["contact_sheet"] is not None
     assert not populate(["Tracking", "SubjectChoice"]).did_something
-    others = "tracking_method in ('turned-v1', 'without-v1')"
-    (tracking.TrackingSelection & others).delete(prompt=False, part_integrity="cascade")
-    (tracking.TrackingMethod & others).delete(prompt=False)
 
 
 def test_confirming_the_automatic_choice_deletes_nothing(tables: None, tmp_path: Path):
@@ -548,9 +549,9 @@ def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(
         found = chain.detect_keypoints(video_path, tracking, person_id, camera)
         if "cut" not in Path(video_path).stem:
             return found
-        return chain.dataclasses.replace(found, confidence=np.zeros_like(found.confidence))
+        return dataclasses.replace(found, confidence=np.zeros_like(found.confidence))
 
-    monkeypatch.setattr(chain.pbl_pipeline.keypoints, "detect_keypoints", half_seen)
+    monkeypatch.setattr(pbl_pipeline.keypoints, "detect_keypoints", half_seen)
     _, good = register(chain.small_video(tmp_path, "cut"), chain.small_video(tmp_path, "whole"))
     run = populate()
     assert errors(run) == {"TrialInput": {"FIT_INPUT": 1}}
@@ -686,21 +687,17 @@ def test_reservations_of_dead_processes_are_freed_and_others_are_kept(tables: No
     register(*(chain.small_video(tmp_path, f"walk{i}") for i in range(4)))
     jobs = video.VideoInfo.jobs
     jobs.refresh(delay=-1)
-    dead, own, alive, elsewhere = jobs.keys(order_by="video_id")
-    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
-    here = platform.node()
-    pids = {"dead": 2**22 - 3, "own": os.getpid(), "alive": os.getppid()}
-    for key, host, pid in (
-        (dead, here, pids["dead"]),
-        (own, here, pids["own"]),
-        (alive, here, pids["alive"]),
-        (elsewhere, "another-host", pids["dead"]),
+    dead, own, alive, elsewhere = jobs.to_arrays("video_id", order_by="video_id").tolist()
+    here, gone = platform.node(), 2**22 - 3
+    for number, host, pid in (
+        *((dead, here, gone), (own, here, os.getpid()), (alive, here, os.getppid())),
+        (elsewhere, "another-host", gone),
     ):
-        jobs.update1({**key, "status": "reserved", "host": host, "pid": pid, "reserved_time": now})
+        hold(number, host, pid)
     run = populate(["VideoInfo"])
     assert (run.freed, done(run)) == (2, {"VideoInfo": 2})
     left = jobs.reserved.to_arrays("video_id", order_by="video_id")
-    assert left.tolist() == [alive["video_id"], elsewhere["video_id"]]
+    assert left.tolist() == [alive, elsewhere]
 
 
 def test_only_errors_that_say_nothing_about_the_video_are_tried_again(tables: None, tmp_path: Path):
@@ -816,39 +813,29 @@ def test_the_demo_stops_when_it_is_interrupted(tables: None, tmp_path: Path, mon
 
 
 def test_the_commands_from_file_to_summary(tables: None, tmp_path: Path):
-    from schemas.cli.choose import choose
-    from schemas.cli.ingest import ingest as ingest_command
-    from schemas.cli.status import status
-    from workers.cli.populate import populate as populate_command
-
-    runner = CliRunner()
     path = chain.small_video(tmp_path, "both", people="two alike")
     (tmp_path / "notes.mp4").write_text("not a video")
-    first = runner.invoke(ingest_command, [str(path), str(tmp_path / "notes.mp4"), "--subject", "P001"])
-    assert first.exit_code == 0, first.output
-    number = int(re.findall(r"video_id (\d+): both_alike.mp4 registered", first.output)[0])
-    again = runner.invoke(ingest_command, [str(path), "--subject", "P001", "--person", "2"])
-    assert (again.exit_code, f"pbl choose {number} 2" in again.output) == (0, True)
-    absent = runner.invoke(ingest_command, [str(tmp_path / "absent.mp4"), "--subject", "P001"])
-    assert absent.exit_code == 1
-    run = runner.invoke(populate_command, [])
-    assert run.exit_code == 0, run.output
-    assert "VIDEO_NOT_A_VIDEO" in run.output
-    assert "pbl choose" in run.output
-    shown = runner.invoke(status, [])
-    assert "VIDEO_NOT_A_VIDEO" in shown.output
-    assert f"pbl choose {number} 1|2" in shown.output
-    assert f"pbl choose {number} --sheet persons_{number}.jpg" in shown.output
-    look = runner.invoke(choose, [str(number), "--sheet", str(tmp_path / "people.jpg")])
-    assert (look.exit_code, (tmp_path / "people.jpg").is_file()) == (0, True), look.output
-    assert "person 1: score" in look.output
-    assert "NEEDS_CHOICE" in look.output
-    assert "deleted" not in look.output
-    chosen = runner.invoke(choose, [str(number), "2"])
-    assert "deleted 1 rows of" in chosen.output
-    run = runner.invoke(populate_command, [])
-    assert re.search(r"SessionQc +1", run.output)
-    assert "nothing to do" in runner.invoke(populate_command, []).output
-    as_json = runner.invoke(status, ["--json"])
-    assert '"code": "VIDEO_NOT_A_VIDEO"' in as_json.output
+    first = pbl("ingest", path, tmp_path / "notes.mp4", "--subject", "P001")
+    assert first.code == 0, first.err
+    number = int(re.findall(r"video_id (\d+): both_alike.mp4 registered", first.out)[0])
+    again = pbl("ingest", path, "--subject", "P001", "--person", "2")
+    assert (again.code, f"pbl choose {number} 2" in again.out) == (0, True)
+    assert pbl("ingest", tmp_path / "absent.mp4", "--subject", "P001").code == 1
+    run = pbl("populate")
+    assert run.code == 0, run.err
+    assert "VIDEO_NOT_A_VIDEO" in run.out
+    assert "pbl choose" in run.out
+    shown = pbl("status").out
+    assert "VIDEO_NOT_A_VIDEO" in shown
+    assert f"pbl choose {number} 1|2" in shown
+    assert f"pbl choose {number} --sheet persons_{number}.jpg" in shown
+    look = pbl("choose", number, "--sheet", tmp_path / "people.jpg")
+    assert (look.code, (tmp_path / "people.jpg").is_file()) == (0, True), look.err
+    assert "person 1: score" in look.out
+    assert "NEEDS_CHOICE" in look.out
+    assert "deleted" not in look.out
+    assert "deleted 1 rows of" in pbl("choose", number, 2).out
+    assert re.search(r"SessionQc +1", pbl("populate").out)
+    assert "nothing to do" in pbl("populate").out
+    assert '"code": "VIDEO_NOT_A_VIDEO"' in pbl("status", "--json").out
     assert len(session.Session()) == 1

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import datetime
-import errno
+import functools
 import json
 import os
 import platform
@@ -11,6 +11,7 @@ import signal
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pymysql
@@ -27,8 +28,9 @@ from schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, vi
 from schemas.chain import ON_REQUEST
 from schemas.cli.why import why as why_command
 from schemas.operations import embedded
-from schemas.reading.status import live_workers, pipeline_status, queue_counts
+from schemas.reading.status import live_workers, pipeline_status
 from schemas.reading.why import why
+from schemas.rows import utc_now
 from tests.rows import register
 from tests.slurm import until
 from workers import queue, recover, refresh, registry, requeue, run_job
@@ -39,26 +41,11 @@ from workers.recover import CRASHES
 from workers.supervisor import BATCH_NICE, Supervisor
 
 from . import chain, worker_target
-
-
-def work(**options) -> Worker:
-    """One worker in this process until nothing is left."""
-    one = Worker(schemas.computed_tables(), Silent(), **options)
-    one.run(once=True)
-    return one
+from .jobs import beat, counts, first_job, hold, jobs_left, queued, work
 
 
 def videos(folder: Path, *names: str) -> list[Path]:
     return [chain.small_video(folder, name) for name in names]
-
-
-def counts() -> dict[str, int]:
-    return {t.__name__: len(t()) for t in schemas.computed_tables()}
-
-
-def jobs_left() -> dict[str, dict[str, int]]:
-    left = {t: {s: n for s, n in c.items() if n} for t, c in queue_counts(video.Video.connection).items()}
-    return {t: c for t, c in left.items() if c}
 
 
 # ------------------------------------------------------------------------------------------------------ the whole chain
@@ -80,15 +67,6 @@ def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: N
     assert set(qc.SessionQc.Check.to_arrays("qc_stage")) >= {"keypoints", "fit", "gait", "gdi"}
 
 
-def test_the_last_trial_of_a_session_may_fail(tables: None, tmp_path: Path):
-    (tmp_path / "bad.mp4").write_text("not a video")
-    register(*videos(tmp_path, "walk1"), tmp_path / "bad.mp4")
-    done = work()
-    assert done.failed == 1
-    assert len(fit.SessionFit()) == 1
-    assert jobs_left() == {"VideoInfo": {"error": 1}}
-
-
 def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch):
     batches = []
 
@@ -100,11 +78,7 @@ def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkey
     for i in range(5):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
     monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)
-    one = Worker(
-        [t for t in schemas.computed_tables() if t.__name__ not in ("SessionFit",)],
-        Silent(),
-    )
-    one.run(once=True)
+    work(*(t for t in schemas.computed_tables() if t is not fit.SessionFit))
     assert jobs_left() == {"SessionFit": {"pending": 5}}
     work(batch=2)
     assert batches == [2, 2, 1]
@@ -135,15 +109,8 @@ def test_a_job_asks_the_database_for_rows_only_and_for_few(tables: None, tmp_pat
 
 
 # ------------------------------------------------------------------------------------------------- one job, one result
-def first_job() -> queue.Claim:
-    refresh.refresh()
-    (job,) = queue.claim(video.VideoInfo, 1)
-    return job
-
-
 def test_two_processes_with_the_same_job_leave_one_row(tables: None, tmp_path: Path):
-    register(*videos(tmp_path, "walk"))
-    job = first_job()
+    job = first_job(tmp_path)
     # Somebody took us for dead and gave the job to another process.
     video.VideoInfo.jobs.update1({**job.key, "host": "another-host", "pid": 7, "connection_id": 99})
     outcome = run_job.run(job)
@@ -157,8 +124,7 @@ def test_two_processes_with_the_same_job_leave_one_row(tables: None, tmp_path: P
 
 
 def test_nobody_takes_a_job_over_while_its_result_is_inserted(tables: None, tmp_path: Path):
-    register(*videos(tmp_path, "walk"))
-    job, jobs = first_job(), video.VideoInfo.jobs
+    job, jobs = first_job(tmp_path), video.VideoInfo.jobs
     with contextlib.closing(connection.plain_connection()) as other, other.cursor() as cursor:
         cursor.execute("SET SESSION innodb_lock_wait_timeout = 1")
         take = f"UPDATE {jobs.full_table_name} SET host = 'another-host'"
@@ -174,16 +140,14 @@ def test_nobody_takes_a_job_over_while_its_result_is_inserted(tables: None, tmp_
     "end", [queue.finish, queue.put_back, lambda job: queue.fail(job, "PblError: VIDEO_DAMAGED: x")]
 )
 def test_who_lost_a_job_cannot_end_it_for_its_new_holder(tables: None, tmp_path: Path, end):
-    register(*videos(tmp_path, "walk"))
-    job, jobs = first_job(), video.VideoInfo.jobs
+    job, jobs = first_job(tmp_path), video.VideoInfo.jobs
     jobs.update1({**job.key, "host": "another-host", "pid": 7, "connection_id": 99})
     end(job)
     assert jobs.fetch1("status", "host", "pid") == ("reserved", "another-host", 7)
 
 
 def test_a_job_that_is_done_already_is_ended(tables: None, tmp_path: Path):
-    register(*videos(tmp_path, "walk"))
-    job = first_job()
+    job = first_job(tmp_path)
     video.VideoInfo.populate(job.key)
     assert run_job.run(job).what == run_job.ALREADY
     assert (len(video.VideoInfo()), jobs_left()) == (1, {})
@@ -204,6 +168,23 @@ def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
     for job in first + second:
         queue.put_back(job)
     assert jobs_left() == {"VideoInfo": {"pending": 6}}
+
+
+def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
+    """Run a supervisor while a thread does this, which stops it then; the exit code."""
+
+    def do() -> None:
+        try:
+            done()
+        finally:
+            boss.stop()
+
+    beside = threading.Thread(target=do)
+    beside.start()
+    try:
+        return boss.run()
+    finally:
+        beside.join()
 
 
 @pytest.fixture
@@ -249,29 +230,23 @@ def test_long_recordings_never_hold_all_processes_of_a_worker(of_lengths: dict[s
 
 
 def test_nothing_waits_behind_a_long_recording_for_a_lone_process(of_lengths: dict[str, int], tmp_path: Path):
-    Worker(registry.tables_of("decode"), Silent()).run(once=True)
+    work(*registry.tables_of("decode"))
     boss = Supervisor(Options("cpu", selftest=False, grace_s=0.0), target=worker_target.work)
     of_hours = tracking.Tracking.jobs & [{"video_id": of_lengths[name]} for name in ("hour", "hour_filmed")]
     seen: list[int] = []
 
     def come() -> None:
-        try:
-            until(lambda: len(keypoints.Keypoints()) == 3 and len(of_hours & "status = 'reserved'") == 1, 120)
-            register(*videos(tmp_path, "late"), session_label="late")
-            refresh.refresh()
-            until(lambda: len(keypoints.Keypoints()) == 4, 120)
-            seen.extend([len(of_hours), len(live_workers())])
-            for name in ("hour", "hour_filmed"):
-                (tmp_path / f"{name}.mp4.go").touch()
-            until(lambda: jobs_left() == {"SessionFit": {"pending": 2}} and len(live_workers()) == 1, 120)
-            seen.append(len(keypoints.Keypoints()))
-        finally:
-            boss.stop()
+        until(lambda: len(keypoints.Keypoints()) == 3 and len(of_hours & "status = 'reserved'") == 1, 120)
+        register(*videos(tmp_path, "late"), session_label="late")
+        refresh.refresh()
+        until(lambda: len(keypoints.Keypoints()) == 4, 120)
+        seen.extend([len(of_hours), len(live_workers())])
+        for name in ("hour", "hour_filmed"):
+            (tmp_path / f"{name}.mp4.go").touch()
+        until(lambda: jobs_left() == {"SessionFit": {"pending": 2}} and len(live_workers()) == 1, 120)
+        seen.append(len(keypoints.Keypoints()))
 
-    coming = threading.Thread(target=come)
-    coming.start()
-    assert boss.run() == 0
-    coming.join()
+    assert run_until(boss, come) == 0
     assert seen == [2, 2, 6]  # neither long one was done; their process ended after them
 
 
@@ -294,32 +269,11 @@ def test_one_process_takes_recordings_of_phones_alone_and_the_others_leave_them_
     assert jobs_left() == {"VideoInfo": {"pending": 3}, "Tracking": {"pending": 1}}
 
 
-def test_a_full_store_delays_the_job_and_says_why(tables: None, tmp_path: Path, monkeypatch):
-    register(*videos(tmp_path, "walk"))
-    job = first_job()
-    real = video.VideoInfo.make_insert
-
-    def full(self, *args):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(video.VideoInfo, "make_insert", full)
-    assert run_job.run(job).what == run_job.LATER
-    assert jobs_left() == {"VideoInfo": {"pending": 1}}
-    assert queue.claim(video.VideoInfo, 1) == []  # not before a minute is over
-    state = next(t for t in pipeline_status().tables if t.table == "VideoInfo")
-    assert "No space left on device" in state.delayed
-    monkeypatch.setattr(video.VideoInfo, "make_insert", real)
-    video.VideoInfo.jobs.update1({**job.key, "scheduled_time": datetime.datetime(2020, 1, 1)})
-    work()
-    assert len(video.VideoInfo()) == 1
-
-
 @pytest.mark.parametrize("when", ["while it is computed", "before its insert", "after its insert"])
 def test_the_result_survives_a_database_that_goes_away(
     tables: None, tmp_path: Path, monkeypatch, database: Path, when: str
 ):
-    register(*videos(tmp_path, "walk"))
-    job = first_job()
+    job = first_job(tmp_path)
     real, insert, computed, inserted, ends = pbl_pipeline.video.probe, video.VideoInfo.make_insert, [], [], [when]
     server = embedded.Folder(database / "db")
 
@@ -352,12 +306,11 @@ def test_the_result_survives_a_database_that_goes_away(
 
 
 def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Path, monkeypatch):
-    (number,) = register(*videos(tmp_path, "walk"))
-    job = first_job()
+    job = first_job(tmp_path)
     real = pbl_pipeline.video.probe
 
     def probe(path):
-        video.Video.update1({"video_id": number, "video_path": str(tmp_path / "elsewhere.mp4")})
+        video.Video.update1({**job.key, "video_path": str(tmp_path / "elsewhere.mp4")})
         return real(path)
 
     with monkeypatch.context() as patch:
@@ -369,9 +322,8 @@ def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Pa
 
 def test_a_result_of_other_inputs_is_not_used(tables: None, tmp_path: Path):
     """As of a batch that was computed before its inputs changed."""
-    register(*videos(tmp_path, "walk"))
     stale = run_job.Computed(("the inputs of then",), ("their result",))
-    assert run_job.run(first_job(), stale).what == run_job.DONE
+    assert run_job.run(first_job(tmp_path), stale).what == run_job.DONE
     assert video.VideoInfo.fetch1("n_frames") == chain.N_FRAMES
 
 
@@ -386,7 +338,7 @@ def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp
         "fit_sessions",
         lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions],
     )
-    Worker([t for t in schemas.computed_tables() if t is not table], Silent()).run(once=True)
+    work(*(t for t in schemas.computed_tables() if t is not table))
     refresh.refresh()
 
     def ends(*_: object) -> None:
@@ -442,11 +394,8 @@ def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path
         (path,) = videos(tmp_path, f"slow{int(grace_s)}")
         register(path, session_label=path.stem)
         boss = Supervisor(Options(resource="decode", selftest=False, grace_s=grace_s), target=worker_target.work)
-        timer = threading.Thread(target=_stop_when_begun, args=(boss, Path(f"{path}.begun")))
-        timer.start()
         start = time.monotonic()
-        assert boss.run() == 0
-        timer.join()
+        assert run_until(boss, functools.partial(until, Path(f"{path}.begun").exists, 1200)) == 0
         assert len(video.VideoInfo()) == done
         assert time.monotonic() - start < 120.0
         if done:
@@ -462,20 +411,14 @@ def test_a_phone_does_not_wait_for_the_job_in_hand(tables: None, tmp_path: Path,
     seen: dict[str, int] = {}
 
     def film() -> None:
-        try:
-            until(lambda: bool(len(video.VideoInfo.jobs.reserved)) and len(live_workers()) == 2, 120)
-            (filmed,) = register(*videos(tmp_path, "filmed"), session_label="filmed")
-            queue.fill(video.VideoInfo, [{"video_id": filmed}], registry.FIRST)
-            until(lambda: len(video.VideoInfo()) == 1, 120)
-            until(lambda: any(w["worker_doing"].startswith("waits") for w in live_workers()), 120)
-            seen.update({w["worker_doing"]: os.getpriority(os.PRIO_PROCESS, w["worker_pid"]) for w in live_workers()})
-        finally:
-            boss.stop()
+        until(lambda: bool(len(video.VideoInfo.jobs.reserved)) and len(live_workers()) == 2, 120)
+        (filmed,) = register(*videos(tmp_path, "filmed"), session_label="filmed")
+        queue.fill(video.VideoInfo, [{"video_id": filmed}], registry.FIRST)
+        until(lambda: len(video.VideoInfo()) == 1, 120)
+        until(lambda: any(w["worker_doing"].startswith("waits") for w in live_workers()), 120)
+        seen.update({w["worker_doing"]: os.getpriority(os.PRIO_PROCESS, w["worker_pid"]) for w in live_workers()})
 
-    filming = threading.Thread(target=film)
-    filming.start()
-    assert boss.run() == 0
-    filming.join()
+    assert run_until(boss, film) == 0
     assert len(seen) == 2
     phone = seen.pop("waits for a recording of a phone")
     assert phone == os.getpriority(os.PRIO_PROCESS, 0)
@@ -489,30 +432,24 @@ def test_the_process_for_phones_ends_with_the_others(tables: None, tmp_path: Pat
     assert len(worker.Worker & "worker_stopped IS NOT NULL") == 2
 
 
-def _stop_when_begun(boss: Supervisor, begun: Path) -> None:
-    while not begun.exists():
-        time.sleep(0.05)
-    boss.stop()
-
-
-def test_a_worker_elsewhere_is_dead_when_its_heart_stops(tables: None, tmp_path: Path):
-    ids = register(*videos(tmp_path, "walk1", "walk2", "walk3"))
+def test_jobs_of_dead_workers_elsewhere_are_freed(tables: None, tmp_path: Path):
+    """One whose heart stopped, or beat for the last time before the clock was set back, or that said goodbye. A
+    populate by hand has no heart: only the time limit of its table ends its reservation."""
+    ages = {"alive": 10.0, "dead": recover.DEAD_AFTER_S + 10, "ahead": -3600.0, "hand": None}
+    ids = register(*videos(tmp_path, *ages))
     refresh.refresh()
-    jobs = video.VideoInfo.jobs
-    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
-    ago = {"alive": 10, "dead": recover.DEAD_AFTER_S + 10}
-    for number, (name, seconds) in zip(ids, ago.items(), strict=False):
-        seen = now - datetime.timedelta(seconds=seconds)
-        row = {"worker": name, "worker_host": name, "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
-        worker.Worker.insert1({**row, "worker_started": seen, "worker_seen": seen, "worker_doing": ""})
-        jobs.update1({"video_id": number, "status": "reserved", "host": name, "pid": 1, "reserved_time": now})
-    # A populate by hand on another machine has no heart: only the time limit of its table ends the reservation.
-    jobs.update1({"video_id": ids[2], "status": "reserved", "host": "hand", "pid": 1, "reserved_time": now})
+    for number, (host, age) in zip(ids, ages.items(), strict=True):
+        hold(number, host)
+        if age is not None:
+            beat(host, age)
+    alive, dead, ahead, hand = ids
+    assert recover.free_dead(video.VideoInfo) == 2
+    assert {*video.VideoInfo.jobs.pending.to_arrays("video_id")} == {dead, ahead}
+    hold(hand, "hand", seconds_ago=3600.0)
     assert recover.free_dead(video.VideoInfo) == 1
-    assert jobs.pending.to_arrays("video_id").tolist() == [ids[1]]
-    jobs.update1({"video_id": ids[2], "reserved_time": now - datetime.timedelta(hours=1)})
+    assert video.VideoInfo.jobs.reserved.to_arrays("video_id").tolist() == [alive]
+    worker.Worker.update1({"worker": "alive", "worker_stopped": utc_now()})
     assert recover.free_dead(video.VideoInfo) == 1
-    assert jobs.reserved.to_arrays("video_id").tolist() == [ids[0]]
 
 
 def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
@@ -520,40 +457,19 @@ def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
-        until = time.monotonic() + 120
-        while not (alive := [w["worker_doing"] for w in live_workers()])[0] and time.monotonic() < until:
-            time.sleep(0.05)
-        assert alive == ["VideoInfo video_id=3"]
+        until(lambda: [w["worker_doing"] for w in live_workers()] == ["VideoInfo video_id=3"], 120)
         assert [w["worker_pid"] for w in live_workers()] == [os.getpid()]
     assert live_workers() == []
     rows = worker.Throughput.to_dicts()
     assert (sum(r["n_done"] for r in rows), sum(r["n_failed"] for r in rows)) == (2, 1)
 
 
-def test_a_worker_that_said_goodbye_holds_nothing(tables: None, tmp_path: Path):
-    (number,) = register(*videos(tmp_path, "walk"))
-    refresh.refresh()
-    jobs = video.VideoInfo.jobs
-    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
-    row = {"worker": "w", "worker_host": "there", "worker_pid": 1, "worker_resource": "all", "worker_version": "0"}
-    row |= {"worker_started": now, "worker_seen": now, "worker_doing": ""}
-    worker.Worker.insert1(row)
-    jobs.update1({"video_id": number, "status": "reserved", "host": "there", "pid": 1, "reserved_time": now})
-    assert recover.free_dead(video.VideoInfo) == 0
-    worker.Worker.update1({"worker": "w", "worker_stopped": now})
-    assert recover.free_dead(video.VideoInfo) == 1
-
-
 def test_a_number_that_a_younger_process_has_by_now_is_a_dead_ones(tables: None, tmp_path: Path):
-    (number,) = register(*videos(tmp_path, "walk"))
-    refresh.refresh()
-    jobs = video.VideoInfo.jobs
-    now = jobs.connection.query("SELECT CURRENT_TIMESTAMP(3)").fetchone()[0]
+    number = queued(tmp_path, video.VideoInfo)
+    freed = []
     with subprocess.Popen(["sleep", "600"]) as young:
-        row = {"video_id": number, "status": "reserved", "host": platform.node(), "pid": young.pid}
-        freed = []
         for reserved_s in (0, 3600):
-            jobs.update1({**row, "reserved_time": now - datetime.timedelta(seconds=reserved_s)})
+            hold(number, platform.node(), young.pid, reserved_s)
             freed.append(recover.free_dead(video.VideoInfo))
         young.kill()
     assert freed == [0, 1]

@@ -38,6 +38,11 @@ def documents(path: Path) -> list[dict[str, Any]]:
     return [item for d in found for item in (d["items"] if d["kind"] == "List" else [d])]
 
 
+def workloads() -> list[dict[str, Any]]:
+    """The objects of Kubernetes that run containers."""
+    return [d for path in KUBERNETES for d in documents(path) if d["kind"] in ("Deployment", "CronJob", "Job")]
+
+
 # ------------------------------------------------------------------------------------------------------------- compose
 def test_the_compose_file_is_what_its_specification_allows():
     check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
@@ -86,11 +91,9 @@ def test_registered_models_proofs_and_backups_outlive_a_container():
             assert "home:/var/lib/pbl" in service["volumes"], name
             assert not [entry for entry in service["tmpfs"] if "/var/lib" in entry], name
     assert any(entry.endswith(":/var/backups/pbl") for entry in compose()["services"]["cron"]["volumes"])
-    for path in KUBERNETES:
-        for document in documents(path):
-            if document["kind"] in ("Deployment", "CronJob", "Job"):
-                (home,) = (v for v in pod(document)["volumes"] if v["name"] == "home")
-                assert home["persistentVolumeClaim"] == {"claimName": "home"}, document["metadata"]["name"]
+    for document in workloads():
+        (home,) = (v for v in pod(document)["volumes"] if v["name"] == "home")
+        assert home["persistentVolumeClaim"] == {"claimName": "home"}, document["metadata"]["name"]
 
 
 def test_the_builder_gets_what_the_image_takes_and_every_package_has_a_hash():
@@ -274,26 +277,21 @@ def pod(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_pods_run_as_nobody_special_and_read_secrets_from_files():
-    pods = 0
-    for path in KUBERNETES:
-        for document in documents(path):
-            if document["kind"] not in ("Deployment", "CronJob", "Job"):
-                continue
-            pods += 1
-            spec = pod(document)
-            assert spec["securityContext"]["runAsNonRoot"] is True
-            assert spec["automountServiceAccountToken"] is False
-            (container,) = spec["containers"]
-            assert container["securityContext"]["readOnlyRootFilesystem"] is True
-            assert {"requests", "limits"} <= container["resources"].keys()
-            assert {m["name"] for m in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
-            wanted = {e["value"] for e in container.get("env", []) if e["name"].endswith("_FILE")}
-            secret = next(v["secret"] for v in spec["volumes"] if v["name"] == "secrets")
-            mounted = {f"/run/secrets/pbl/{item['path']}" for item in secret["items"]}
-            assert wanted <= mounted
-            if document["kind"] != "Job":
-                assert not any("owner" in m for m in mounted)
-    assert pods == 10
+    for document in workloads():
+        spec = pod(document)
+        assert spec["securityContext"]["runAsNonRoot"] is True
+        assert spec["automountServiceAccountToken"] is False
+        (container,) = spec["containers"]
+        assert container["securityContext"]["readOnlyRootFilesystem"] is True
+        assert {"requests", "limits"} <= container["resources"].keys()
+        assert {m["name"] for m in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
+        wanted = {e["value"] for e in container.get("env", []) if e["name"].endswith("_FILE")}
+        secret = next(v["secret"] for v in spec["volumes"] if v["name"] == "secrets")
+        mounted = {f"/run/secrets/pbl/{item['path']}" for item in secret["items"]}
+        assert wanted <= mounted
+        if document["kind"] != "Job":
+            assert not any("owner" in m for m in mounted)
+    assert len(workloads()) == 10
     assert not [d for p in KUBERNETES for d in documents(p) if d["kind"] == "Secret"]
     kustomization = documents(DEPLOY / "kubernetes" / "kustomization.yaml")[0]
     assert {p.name for p in KUBERNETES} == {"kustomization.yaml", *kustomization["resources"]}

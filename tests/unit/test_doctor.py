@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 from pbl_pipeline import assets
 from pbl_pipeline.cli import doctor as module
 from pbl_pipeline.errors import PblError
+from tests.command import PBL, program
 
 # `from pbl_pipeline.cli import doctor` is the module; the command inside has the same name.
 command = module.doctor
@@ -26,8 +27,7 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
     programs = tmp_path / "bin"
     programs.mkdir()
-    (programs / "mariadbd").write_text("#!/bin/sh\n")
-    (programs / "mariadbd").chmod(0o755)
+    program(programs, "mariadbd", "")
     monkeypatch.setenv("PATH", str(programs))
     monkeypatch.setattr(module, "_SERVER_PLACES", ())
     return tmp_path
@@ -46,8 +46,7 @@ def test_the_installed_command(tmp_path):
     """As a user starts it, in a process of its own: the table on stdout, code 1 because the assets are absent."""
     env = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     env |= {"PBL_CACHE": str(tmp_path / "cache"), "PBL_HOME": str(tmp_path / "home"), "PBL_OFFLINE": "1"}
-    start = [sys.executable, "-c", "from pbl_pipeline.cli import main; main()", "doctor"]
-    done = subprocess.run(start, env=env, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run([*PBL, "doctor"], env=env, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 1, done.stderr
     assert f"on: {tmp_path / 'cache' / 'jax'}" in done.stdout
     assert "Traceback" not in done.stderr
@@ -104,8 +103,7 @@ def test_no_database(machine, monkeypatch):
     finding = module._database()
     assert (finding.what, finding.state) == ("database", module.MISSING)
     assert "no MariaDB" in finding.detail
-    (machine / "bin" / "mysqld").write_text("#!/bin/sh\n")
-    (machine / "bin" / "mysqld").chmod(0o755)
+    program(machine / "bin", "mysqld", "")
     assert "is MySQL" in module._database().detail
     monkeypatch.setenv("DJ_HOST", "db.example.org")
     finding = module._database()
@@ -115,10 +113,9 @@ def test_no_database(machine, monkeypatch):
 
 def test_a_server_unpacked_into_home_counts(machine):
     (machine / "bin" / "mariadbd").unlink()
-    server = machine / "home" / "server" / "usr" / "sbin" / "mariadbd"
-    server.parent.mkdir(parents=True)
-    server.write_text("#!/bin/sh\n")
-    server.chmod(0o755)
+    folder = machine / "home" / "server" / "usr" / "sbin"
+    folder.mkdir(parents=True)
+    server = program(folder, "mariadbd", "")
     assert module._database().state == module.OK
     assert str(server) in module._database().detail
 

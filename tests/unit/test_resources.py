@@ -102,27 +102,26 @@ def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, mo
     assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
 
 
+def worker_options(patch: pytest.MonkeyPatch, gpus: tuple[str, ...], *asked: str) -> Options:
+    """The options of `pbl worker --processes auto` on a machine with these GPUs."""
+    found: list[Options] = []
+    patch.setattr("schemas.activate", lambda **_: None)
+    patch.setattr("workers.process.given_gpus", lambda: gpus)
+    patch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+    assert pbl("worker", "--processes", "auto", *asked).code == 0
+    return found[0]
+
+
 def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatch):
     groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(13 * GB)})
-    monkeypatch.setattr("schemas.activate", lambda **_: None)
-    monkeypatch.setattr("workers.process.given_gpus", tuple)
-    found: list[Options] = []
-    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
-    assert pbl("worker", "--processes", "auto").code == 0
-    assert [o.processes for o in found] == [3]
+    assert worker_options(monkeypatch, ()).processes == 3
     assert pbl("worker", "--processes", "many").code == 2
 
 
 def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch):
     """A process for each core, of which one for each GPU fits; for the fit alone one for each GPU."""
     groups(tmp_path, monkeypatch, "0::/", {})
-    monkeypatch.setattr("schemas.activate", lambda **_: None)
-    monkeypatch.setattr("workers.process.given_gpus", lambda: ("0", "1"))
-    found: list[Options] = []
-    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
-    for asked in ((), ("--resource", "gpu")):
-        assert pbl("worker", "--processes", "auto", *asked).code == 0
-    whole, fit = found
+    whole, fit = (worker_options(monkeypatch, ("0", "1"), *asked) for asked in ((), ("--resource", "gpu")))
     each = [whole.of_process(n) for n in range(whole.processes)]
     assert [(o.resource, o.gpus) for o in each] == [("all" if n < 2 else "cpu", (str(n % 2),)) for n in range(16)]
     assert {o.processes for o in each} == {8}

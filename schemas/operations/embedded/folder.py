@@ -306,8 +306,3 @@ def _write(path: Path, content: dict[str, Any], mode: int) -> None:
         write_json(path, content, mode)
     except OSError as error:
         raise folder_error(path.parent, error) from error
-
-
-def indent(text: str) -> str:
-    """Return the lines indented, for display below the line that introduces them."""
-    return "\n".join(f"      {line}" for line in text.splitlines())

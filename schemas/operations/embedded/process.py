@@ -6,6 +6,7 @@ import re
 import subprocess
 import time
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import pymysql
@@ -14,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import memory_bytes
 
 from .binaries import Binaries
-from .folder import ADMIN_USER, HOST, Account, Folder, folder_error, free_port, indent, port_free
+from .folder import ADMIN_USER, HOST, Account, Folder, folder_error, free_port, port_free
 
 START_TIMEOUT_S = 60.0
 LOG_SIZE = "--innodb-log-file-size=256M"
@@ -114,7 +115,7 @@ def wait_until_answers(folder: Folder) -> None:
             raise PblError(
                 "DB_UNAVAILABLE",
                 key=folder.path,
-                found=f"the server {what}; its last lines:\n{indent(folder.log_tail())}",
+                found=f"the server {what}; its last lines:\n{indent(folder.log_tail(), 6 * ' ')}",
                 expected="a server that answers within seconds",
                 next_step=next_step,
             ) from error

@@ -11,13 +11,14 @@ import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 
 import pymysql
 
 from pbl_pipeline.errors import PblError
 
 from .binaries import Binaries, Say, check_obtainable, get_server, silent
-from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, free_port, indent, server_account
+from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, free_port, server_account
 from .process import LOG_SIZE, admin, alive, launch, running_pid, wait_until_answers
 
 SETUP_TIMEOUT_S = 300.0
@@ -113,7 +114,7 @@ def _run(command: list[str], stdin: str, folder: Folder, binaries: Binaries, acc
     raise PblError(
         "DB_UNAVAILABLE",
         key=folder.path,
-        found=f"{Path(command[0]).name} failed (code {code}):\n" + indent("\n".join(lines[-8:])),
+        found=f"{Path(command[0]).name} failed (code {code}):\n" + indent("\n".join(lines[-8:]), 6 * " "),
         expected="an empty database",
         next_step="free some space if the disk is full, see that the folder is on a local disk, then: pbl db start",
     )
