@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pbl_pipeline import words
+
 from .events import LEFT, RIGHT
 from .ground import is_metric
 from .motion import BodyPoses
@@ -56,22 +58,7 @@ def mostly(names: np.ndarray) -> str:
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
 #: Measures in the order of metrics.json; the unit is in the name.
-MEASURES: tuple[str, ...] = (
-    "cadence_steps_per_min",
-    "stride_time_s",
-    "step_time_s",
-    "stance_time_s",
-    "swing_time_s",
-    "stance_percent",
-    "swing_percent",
-    "single_support_percent",
-    "double_support_percent",
-    "double_support_time_s",
-    "speed_m_per_s",
-    "stride_length_m",
-    "step_length_m",
-    "step_width_m",
-)
+MEASURES = tuple(words.MEASURES)
 #: Measures that need the positions of the feet on the floor.
 LENGTHS = ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m")
 #: Measures of one leg, which have an asymmetry.

@@ -16,7 +16,7 @@ from pbl_pipeline.study import StudyData
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS
 
 from .results import ALPHA, StudyResults, reason
-from .visit_values import INDEX, score_column
+from .visit_values import INDEX, of_scores
 
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
@@ -112,10 +112,7 @@ def unit_of(study: StudyData, name: str) -> str:
         rows: Any = frame[frame[column] == name]
         if len(rows):
             return str(rows["unit"].iloc[0])
-    for instrument, unit in zip(study.instruments["instrument"], study.instruments["unit"], strict=True):
-        if score_column(study, instrument) == name:
-            return unit
-    return ""
+    return of_scores(study, "unit").get(name, "")
 
 
 def number(value: float, digits: int) -> str:
@@ -253,30 +250,27 @@ def srm_table(study: StudyData, results: StudyResults) -> PageTable:
 
 def by_visit(study: StudyData, results: StudyResults) -> PageTable:
     """Mean, interval and spread by visit."""
-    rows = []
     frame: Any = results.by_visit
-    for name in dict.fromkeys(frame["name"]):
-        own = frame[frame["name"] == name]
-        digits = digits_of(own["mean"])
-        for i, r in enumerate(own.to_dict("records")):
-            limits = f"{number(r['low'], digits)} to {number(r['high'], digits)}"
-            interval = limits if math.isfinite(r["low"]) else "one person: none"
-            rows.append(
-                {
-                    "Measure": "" if i else title_of(study, name),
-                    "Group": r["group"],
-                    "Visit": r["role"],
-                    "n": str(r["n"]),
-                    "Mean": number(r["mean"], digits),
-                    "95 % interval": interval,
-                    "SD": number(r["sd"], digits),
-                    "Median": number(r["median"], digits),
-                    "nIQR": number(r["niqr"], digits),
-                }
-            )
-    columns = ["Measure", "Group", "Visit", "n", "Mean", "95 % interval", "SD", "Median", "nIQR"]
+    digits = {name: digits_of(own["mean"]) for name, own in frame.groupby("name")}
+
+    def interval(r: dict[Any, Any]) -> str:
+        limits = (number(r[k], digits[r["name"]]) for k in ("low", "high"))
+        return " to ".join(limits) if math.isfinite(r["low"]) else "one person: none"
+
+    columns: _Columns = {
+        "Measure": lambda r: title_of(study, r["name"]) if r["first"] else "",
+        "Group": lambda r: r["group"],
+        "Visit": lambda r: r["role"],
+        "n": lambda r: str(r["n"]),
+        "Mean": lambda r: number(r["mean"], digits[r["name"]]),
+        "95 % interval": interval,
+        "SD": lambda r: number(r["sd"], digits[r["name"]]),
+        "Median": lambda r: number(r["median"], digits[r["name"]]),
+        "nIQR": lambda r: number(r["niqr"], digits[r["name"]]),
+    }
     note = "Student's interval of the mean; nIQR = IQR x 0.7413."
-    return PageTable("by_visit", "Measures by visit", note, pd.DataFrame(rows, columns=columns))
+    rows = frame.assign(first=~frame["name"].duplicated())
+    return _table("by_visit", "Measures by visit", note, rows, columns, _Marks())
 
 
 def repeatability(study: StudyData, results: StudyResults) -> PageTable:

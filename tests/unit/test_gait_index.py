@@ -10,6 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     BODY_ANGLES,
     GDI_METHODS,
+    GDI_MODEL,
     GILLETTE_MODEL,
     NINE_ANGLES,
     PAPER_INDEX,
@@ -242,15 +243,14 @@ def test_the_papers_index_is_the_mean_over_all_steps_with_nothing_taken_back():
 
 def test_paramsets():
     assert {name: p.version for name, p in GDI_METHODS.items()} == {
-        "pbl-2025-three-angles": 6,
+        GDI_MODEL: 6,
         GILLETTE_MODEL: 1,
         PAPER_INDEX: 1,
     }
     # A row of version 1 is understood as it was.
-    old = score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles", 1)
-    assert (
-        old.params_hash != score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles").params_hash
-    )
+    first = GDI_METHODS.make(GDI_MODEL, 1, GdiParams())
+    old, new = (score_gdi([], "gillette-166-three-angles", GdiParams(), model) for model in (first, GDI_MODEL))
+    assert old.params_hash != new.params_hash
 
 
 # --- Normal curves at a person's speed.

@@ -156,19 +156,12 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
-    hip, knee, ankle, heel, toe = [], [], [], [], []
-    for side in "lr":
-        calcn = poses.index(f"calcn_{side}")
-        knee.append(poses.position_m[:, poses.index(f"tibia_{side}")])
-        ankle.append(poses.position_m[:, poses.index(f"talus_{side}")])
-        hip.append(poses.position_m[:, poses.index(f"femur_{side}")])
-        toe.append(poses.position_m[:, poses.index(f"toes_{side}")])
-        point = _HEEL_IN_CALCN_M * poses.scale_of(f"calcn_{side}", fit.scale)
-        heel.append(poses.position_m[:, calcn] + poses.rotation[:, calcn] @ point)
+    hips, knees, ankles, heels, toes = map(poses.of_sides, ("femur", "tibia", "talus", "calcn", "toes"))
+    for s, name in enumerate(("calcn_l", "calcn_r")):
+        heels[:, s] += poses.rotation[:, poses.index(name)] @ (_HEEL_IN_CALCN_M * poses.scale_of(name, fit.scale))
     confidence = np.full((len(fit.time_s), 2), np.nan)
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    hips, knees, ankles, heels, toes = (np.stack(part, axis=1) for part in (hip, knee, ankle, heel, toe))
     unseen = ~_feet_seen(fit)
     for joint in (knees, ankles, heels, toes):
         joint[unseen] = np.nan

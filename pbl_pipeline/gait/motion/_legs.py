@@ -34,6 +34,10 @@ class BodyPoses:
         """Index of a body in the second axis."""
         return self.body.body_names.index(name)
 
+    def of_sides(self, name: str) -> np.ndarray:
+        """Positions (T, 2, 3) of a body of the [left, right] side."""
+        return self.position_m[:, [self.index(f"{name}_{side}") for side in "lr"]]
+
     def scale_of(self, name: str, scale: np.ndarray) -> float:
         """The multiplier of a body's points."""
         return float(np.asarray(scale)[self.body.scale_index[self.index(name)]])
