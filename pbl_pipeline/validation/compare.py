@@ -47,10 +47,7 @@ def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 
     NaN without a value; the nIQR is NaN with one, because one value has no spread.
     """
-    v = _finite(values)
-    if v.size == 0:
-        return float("nan"), float("nan")
-    return float(np.median(v)), niqr(v)
+    return _median(values), niqr(values)
 
 
 def niqr(values: Sequence[float] | np.ndarray) -> float:
@@ -308,9 +305,9 @@ def _check_overlap(trial: str, time_s: np.ndarray, ours: np.ndarray, reference: 
         )
 
 
-def _median(values: np.ndarray) -> float:
-    finite = np.asarray(values, float)[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else float("nan")
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    v = _finite(values)
+    return float(np.median(v)) if v.size else float("nan")
 
 
 def _refused(key: str, found: str, expected: str) -> PblError:
