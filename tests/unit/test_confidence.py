@@ -1,4 +1,4 @@
-"""What a confidence is worth: curves, the truth that they are fitted to, the table and the page."""
+"""What a confidence is worth: the curves that ship."""
 
 import dataclasses
 
@@ -16,8 +16,6 @@ from pbl_pipeline.keypoints import (
 )
 from research.confidence import curve_params
 from tests.unit.test_shortcomings import person
-
-# --- curves that ship -------------------------------------------------------------------------------------------
 
 
 def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
@@ -64,12 +62,3 @@ def test_an_unknown_curve_is_refused_and_none_is_no_curve(tmp_path):
     assert probability[0, 0] == 0
     np.testing.assert_allclose(probability[1], confidence_curve("blazepose-v1")(np.full(33, 0.9)), atol=1e-5)
     assert "20% of the trunk's length (blazepose-v1)" in confidence_text(again)
-
-
-# --- fitting ----------------------------------------------------------------------------------------------------
-
-
-# --- truth ------------------------------------------------------------------------------------------------------
-
-
-# --- table, page, command ---------------------------------------------------------------------------------------

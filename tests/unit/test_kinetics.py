@@ -454,6 +454,10 @@ def steps(n: int = N) -> np.ndarray:
     return np.stack([both | left, both | ~left], axis=1)
 
 
+#: Force of the model's persons over such steps.
+USUAL = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
+
+
 def levels(sd: float) -> VerticalModel:
     """A model in which persons differ by a constant force alone."""
     ones = np.ones_like(SHIPPED.phase)
@@ -474,8 +478,7 @@ def test_the_posterior_of_a_constant_is_the_closed_form() -> None:
 
 
 def test_what_is_certain_stays() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    needed = usual + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
+    needed = USUAL + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
     found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0, 1e-3))
     np.testing.assert_allclose(found.mean[::3], needed[::3], atol=1e-3)
     assert np.sqrt(np.mean((found.mean - needed) ** 2)) < 0.02
@@ -511,22 +514,18 @@ def test_the_models_of_stored_methods_stay(name: str) -> None:
 def test_a_force_unlike_that_of_healthy_people_survives() -> None:
     """A person whose force hardly changes, as few at that speed, keeps most of that."""
     found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, NOISE)
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    assert np.std(found.mean) < 0.4 * np.std(usual)
+    assert np.std(found.mean) < 0.4 * np.std(USUAL)
 
 
 def test_a_push_off_unlike_that_of_the_persons_of_the_model_survives() -> None:
-    phase = support_phase(steps())
-    usual = np.interp(phase, SHIPPED.phase, SHIPPED.expected(SPEED))
-    lower = -0.2 * np.exp(-0.5 * ((phase - 1.85) / 0.12) ** 2)
-    smoothed = gaussian_filter1d(usual + lower - 1.0, 100 * NOISE.smoothing_s)
+    lower = -0.2 * np.exp(-0.5 * ((support_phase(steps()) - 1.85) / 0.12) ** 2)
+    smoothed = gaussian_filter1d(USUAL + lower - 1.0, 100 * NOISE.smoothing_s)
     found = vertical_force(1.0 + NOISE.gain * smoothed, steps(), SPEED, SHIPPED, NOISE)
-    assert np.sum(lower * (found.mean - usual)) > 0.7 * np.sum(lower**2)
+    assert np.sum(lower * (found.mean - USUAL)) > 0.7 * np.sum(lower**2)
 
 
 def test_the_smoothing_of_a_fit_is_undone() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    sharp = usual + 0.1 * np.sin(2 * np.pi * np.arange(N) / 20)  # 5 Hz
+    sharp = USUAL + 0.1 * np.sin(2 * np.pi * np.arange(N) / 20)  # 5 Hz
     known = Noise(3e-3, 0.9, 1.0, 0.03)
     needed = 1.0 + known.gain * gaussian_filter1d(sharp - 1.0, 100 * known.smoothing_s)
     found = vertical_force(needed, steps(), SPEED, SHIPPED, known)
@@ -534,10 +533,9 @@ def test_the_smoothing_of_a_fit_is_undone() -> None:
 
 
 def test_noise_is_weighed_against_people() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
     off = np.repeat(np.random.default_rng(1).normal(0.0, NOISE.sd, N // 6), 6)
-    found = vertical_force(1.0 + NOISE.gain * (usual - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
-    assert np.std(found.mean - usual) < 0.7 * np.std(off)
+    found = vertical_force(1.0 + NOISE.gain * (USUAL - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
+    assert np.std(found.mean - USUAL) < 0.7 * np.std(off)
 
 
 def test_the_benchmark_compares_only_times_that_the_phone_saw(walk: TrialFit) -> None:
