@@ -6,11 +6,12 @@ import dataclasses
 import functools
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
+
+from pbl_pipeline.shipped import shipped_text
 
 from .cycle_measures import Spatiotemporal
 from .events import SIDES
@@ -20,7 +21,6 @@ from .types import GaitCycle
 if TYPE_CHECKING:
     import pandas as pd
 
-_ADULTS = Path(__file__).parent / "normative" / "curves" / "adult_ranges.json"
 #: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat.
 _SOLE_M = 0.015
 
@@ -70,7 +70,7 @@ class AdultRanges:
 @functools.cache
 def adult_ranges() -> AdultRanges:
     """Return the ranges that ship with the package (`research/adult_ranges.py` writes them)."""
-    raw = json.loads(_ADULTS.read_text(encoding="utf-8"))
+    raw = json.loads(shipped_text("gait/normative/curves/adult_ranges.json"))
     ranges = {angle: (float(mean), float(sd)) for angle, (mean, sd) in raw["range_deg"].items()}
     return AdultRanges(raw["n"], tuple(raw["age"]), ranges, raw["source"], raw["licence"])
 

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline import words
 from pbl_pipeline.qc import Check, failed
 
-from .cycle_measures import MEASURES, Measure
+from .cycle_measures import MEASURES, Measure, measure_of
 from .motion import BodyPoses, trial_poses
 
 if TYPE_CHECKING:
@@ -305,6 +305,4 @@ def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def task_measure(values: Sequence[float]) -> Measure:
     """Return the measure of repetitions of a task."""
-    mean = float(np.mean(values))
-    sd = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return Measure(None, None, mean, sd, len(values), sd, None if sd is None or mean == 0 else 100.0 * sd / abs(mean))
+    return measure_of([("", value) for value in values])

@@ -12,6 +12,7 @@ import pandas as pd
 
 from pbl_pipeline import words
 from pbl_pipeline.latex import tex_escape
+from pbl_pipeline.stats import CurveTest
 from pbl_pipeline.study import StudyData
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS
 
@@ -169,7 +170,6 @@ def _table(name: str, title: str, note: str, frame: pd.DataFrame, columns: _Colu
 
 
 def flow(results: StudyResults) -> PageTable:
-    """Participant flow."""
     columns: _Columns = {
         "Group": lambda r: str(r["group"]),
         "Visit": lambda r: str(r["role"]),
@@ -274,7 +274,6 @@ def by_visit(study: StudyData, results: StudyResults) -> PageTable:
 
 
 def repeatability(study: StudyData, results: StudyResults) -> PageTable:
-    """ICC, SEM, MDC."""
     marks = _Marks()
     note = (
         "SEM and minimal detectable change in the unit of the measure; n persons with k cycles or visits (harmonic "
@@ -297,7 +296,6 @@ def repeatability(study: StudyData, results: StudyResults) -> PageTable:
 
 
 def validity(results: StudyResults) -> PageTable:
-    """Correlations."""
     marks = _Marks()
     note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
     columns: _Columns = {
@@ -314,7 +312,6 @@ def validity(results: StudyResults) -> PageTable:
 
 
 def groups(results: StudyResults) -> PageTable:
-    """Differences between groups."""
     marks = _Marks()
     note = (
         f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
@@ -337,15 +334,13 @@ def groups(results: StudyResults) -> PageTable:
 
 
 def phases(results: StudyResults) -> PageTable:
-    """Phases in which curves differ."""
     marks, rows = _Marks(), []
     for c in results.curves:
         row = {"Measure": short_of(c.angle), "Of": comparison_of(c)}
-        if not hasattr(c.test, "phases"):
-            error: Any = c.test
-            rows.append({**row, "Phase (% of cycle)": marks(reason(error))})
+        test = c.test
+        if not isinstance(test, CurveTest):
+            rows.append({**row, "Phase (% of cycle)": marks(reason(test))})
             continue
-        test: Any = c.test
         found = test.phases or (None,)
         for phase in found:
             inside = slice(None) if phase is None else (test.percent >= phase.first) & (test.percent <= phase.last)

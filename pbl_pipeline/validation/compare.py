@@ -110,10 +110,10 @@ class KinematicErrors:
     median_abs_deg: float
     rte_m: float  # mean distance of the pelvis path to the reference's, NaN where one is not known
     #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
-    view: Mapping[str, str]
+    view: Mapping[str, str] = dataclasses.field(default_factory=lambda: dict.fromkeys(("right", "left"), MIXED))
     #: Medians of the fit's residuals over frames and markers.
-    residual_2d_px: float
-    residual_3d_cm: float
+    residual_2d_px: float = float("nan")
+    residual_3d_cm: float = float("nan")
     #: Names of fit and reference, and of what kind the reference is.
     trial: str = ""
     reference: str = ""
@@ -224,9 +224,6 @@ def compare_angles(
         joints=joints,
         median_abs_deg=_median(np.abs(paper)),
         rte_m=_rte(time_s - lag, pelvis_m, reference, same_world),
-        view={"right": MIXED, "left": MIXED},
-        residual_2d_px=float("nan"),
-        residual_3d_cm=float("nan"),
     )
 
 

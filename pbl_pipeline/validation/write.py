@@ -61,12 +61,10 @@ class Table:
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """Names of the rows, in order."""
         return tuple(dict.fromkeys(row for row, _ in self.cells))
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns, in order."""
         return tuple(dict.fromkeys(column for _, column in self.cells))
 
     @property

@@ -15,6 +15,7 @@ from pbl_pipeline.keypoints import (
     probability_within,
 )
 from research.confidence import curve_params
+from tests import not_none
 from tests.unit.test_shortcomings import person
 
 
@@ -57,8 +58,7 @@ def test_an_unknown_curve_is_refused_and_none_is_no_curve(tmp_path):
     known.confidence[0, 0] = 0.0
     known.save(tmp_path / "k.npz")
     again = Keypoints.load(tmp_path / "k.npz")
-    probability = probability_within(again)
-    assert probability is not None
+    probability = not_none(probability_within(again))
     assert probability[0, 0] == 0
     np.testing.assert_allclose(probability[1], confidence_curve("blazepose-v1")(np.full(33, 0.9)), atol=1e-5)
     assert "20% of the trunk's length (blazepose-v1)" in confidence_text(again)

@@ -230,9 +230,14 @@ def test_a_bend_ends_a_slow_walk_and_not_a_fast_one():
 # --- network
 
 
+@pytest.fixture(scope="module")
+def model() -> PhaseTransformer:
+    """A small network with random weights."""
+    return eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+
+
 @pytest.mark.slow
-def test_the_network_is_saved_and_read_again(tmp_path):
-    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+def test_the_network_is_saved_and_read_again(model, tmp_path):
     save_model(tmp_path / "m.npz", model, {"seed": 3})
     again, about = load_model(tmp_path / "m.npz")
     assert about["seed"] == 3
@@ -244,9 +249,8 @@ def test_the_network_is_saved_and_read_again(tmp_path):
         load_model(tmp_path / "other.npz")
 
 
-def test_frames_that_are_not_seen_do_not_change_the_others_much():
+def test_frames_that_are_not_seen_do_not_change_the_others_much(model):
     """Attention leaves them out; only the convolution of the frames beside them sees their zeros."""
-    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
     x = jax.random.normal(jax.random.key(0), (80, N_FEATURES))
     seen = jnp.arange(80) < 50
     run = eqx.filter_jit(lambda x, seen: model(x, seen))

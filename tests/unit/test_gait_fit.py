@@ -276,8 +276,7 @@ def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
         assert (part["gdi"]["mean"], part["reasons"]["gdi"]) == (None, why)
     (check,) = [c for c in metrics.checks if c.check == "cadence_plausible"]
     assert (check.outcome, check.threshold, metrics.outcome) == ("FAIL", 150.0, "FAIL")
-    assert check.value is not None
-    assert check.value > 150.0
+    assert not_none(check.value) > 150.0
     with_another = gait_metrics([usual, hasty])
     assert not_none(with_another.spatiotemporal["cadence_steps_per_min"]).mean < 150.0
     assert (with_another.gdi.mean is None, with_another.outcome) == (False, "FAIL")
@@ -482,12 +481,11 @@ def test_a_foot_out_of_sight_for_a_moment_is_bridged_and_for_longer_is_not():
     short = feet_from_fit(fit_with_points(time, (time > 4) & (time < 4.45)))
     np.testing.assert_array_equal(not_none(short.legs_m), not_none(whole.legs_m))
     long = feet_from_fit(fit_with_points(time, (time > 3) & (time < 5)))
-    assert long.legs_m is not None
-    hidden = (time > 3.3) & (time < 4.7)
-    assert np.isnan(long.legs_m[hidden, 1:, 0]).all()
+    legs, hidden = not_none(long.legs_m), (time > 3.3) & (time < 4.7)
+    assert np.isnan(legs[hidden, 1:, 0]).all()
     assert np.isnan(long.heel_m[hidden, 0]).all()
-    assert np.isfinite(long.legs_m[:, :, 1]).all()
-    assert np.isfinite(long.legs_m[(time < 3.2) | (time > 4.8)]).all()
+    assert np.isfinite(legs[:, :, 1]).all()
+    assert np.isfinite(legs[(time < 3.2) | (time > 4.8)]).all()
 
 
 def test_the_checks_of_the_fit_lie_beside_it(tmp_path):

@@ -32,6 +32,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 from pbl_pipeline.synthetic.physique import leg_length_m as by_mujoco
+from tests import not_none
 from tests.unit.test_gait_gdi import ABOUT, PERCENT, cycle, toy_vectors
 
 NINE = "gillette-166-nine-angles"
@@ -127,15 +128,13 @@ def test_profile_stands_beside_the_index():
         nine_cycle(norm.mean_deg + 2.0),
         nine_cycle(norm.mean_deg + 5.0, "right"),
     ]
-    result = score_gdi(cycles, norm)
-    assert result.profile is not None
-    assert result.profile.left["knee_flexion"] == pytest.approx(3.0)
-    assert (result.profile.gps_left, result.profile.gps_right) == pytest.approx((3.0, 5.0))
+    profile = not_none(score_gdi(cycles, norm).profile)
+    assert profile.left["knee_flexion"] == pytest.approx(3.0)
+    assert (profile.gps_left, profile.gps_right) == pytest.approx((3.0, 5.0))
     assert score_gdi(cycles[:2], norm).profile is None
-    three = score_gdi([dataclasses.replace(c, angle_model=BODY_ANGLES) for c in cycles])
-    assert three.profile is not None
-    assert set(three.profile.left) == set(THREE_ANGLES)
-    assert three.profile.gps is None
+    three = not_none(score_gdi([dataclasses.replace(c, angle_model=BODY_ANGLES) for c in cycles]).profile)
+    assert set(three.left) == set(THREE_ANGLES)
+    assert three.gps is None
 
 
 def test_radians_are_refused():

@@ -166,6 +166,17 @@ def test_a_gap_splits_the_motion_and_a_short_one_is_none() -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- ground
+#: Frames of standing on the right foot.
+ON_RIGHT = np.tile([0.0, 1.0], (50, 1))
+
+
+def right_both_left() -> np.ndarray:
+    """Contact (60, 2) of 20 frames each on the right foot, on both and on the left."""
+    contact = np.ones((60, 2))
+    contact[:20, 0] = contact[40:, 1] = 0
+    return contact
+
+
 def event(time_s: float, side: str, kind: str) -> GaitEvent:
     return GaitEvent(time_s, side, f"foot_{kind}", 1.0)
 
@@ -186,9 +197,7 @@ def test_contact_follows_the_events_and_is_unknown_elsewhere() -> None:
 
 
 def test_on_one_foot_that_foot_carries_everything() -> None:
-    motion = still(n=50)
-    d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=50)), ON_RIGHT)
     assert ground.force_n[:, 1, 2] == pytest.approx(np.full(50, GRAVITY))
     assert not ground.force_n[:, 0].any()
     assert np.isnan(ground.centre_m[:, 0]).all()
@@ -196,12 +205,8 @@ def test_on_one_foot_that_foot_carries_everything() -> None:
 
 
 def test_on_both_feet_the_forces_add_up_and_change_over() -> None:
-    n = 60
-    contact = np.ones((n, 2))
-    contact[:20, 0] = 0  # right alone, both, left alone
-    contact[40:, 1] = 0
-    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=n)), contact)
-    assert ground.force_n[:, :, 2].sum(axis=1) == pytest.approx(np.full(n, GRAVITY), abs=1e-9)
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=60)), right_both_left())
+    assert ground.force_n[:, :, 2].sum(axis=1) == pytest.approx(np.full(60, GRAVITY), abs=1e-9)
     behind = ground.force_n[20:40, 1, 2]
     assert (np.diff(behind) < 0).all()
     assert behind[0] > 0.8 * GRAVITY > 0.1 * GRAVITY > behind[-1]
@@ -218,10 +223,8 @@ def test_unknown_contact_has_no_force() -> None:
 
 def test_the_centre_of_pressure_stays_under_the_sole() -> None:
     n = 100
-    contact = np.zeros((n, 2))
-    contact[:, 0] = 1
-    contact[[0, -1], 0] = 0
-    contact[[0, -1], 1] = 1
+    contact = np.tile([1.0, 0.0], (n, 1))
+    contact[[0, -1]] = [0.0, 1.0]
     d = dynamics_of(still(n=n))
     ground = ground_reaction(BODY, ONE, d, contact)
     heel = d.xpos[50, BODY.body_names.index("calcn_l")]
@@ -241,21 +244,17 @@ def test_what_is_added_as_feet_land_takes_no_weight() -> None:
 
 
 def test_a_foot_that_lands_does_not_push_backwards_at_once() -> None:
-    motion = still(n=60, hip_flexion_l=0.4, hip_flexion_r=-0.4)
-    contact = np.ones((60, 2))
-    contact[:20, 0] = 0  # right alone and behind, both, left alone
-    contact[40:, 1] = 0
-    ground = ground_reaction(BODY, ONE, dynamics_of(motion), contact)
+    behind = still(n=60, hip_flexion_l=0.4, hip_flexion_r=-0.4)  # the right foot
+    ground = ground_reaction(BODY, ONE, dynamics_of(behind), right_both_left())
     landed = -ground.force_n[:, 0, 0] / ground.force_n[:, 0, 2].clip(1e-6)  # backwards, of the vertical force
     assert landed[21] < 0.6 * landed[39]
 
 
 # -------------------------------------------------------------------------------------------------------------- joints
 def test_moments_of_standing_on_one_leg_by_hand() -> None:
-    n = 50
-    motion = still(n=n)
+    motion = still(n=50)
     d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (n, 1)))
+    ground = ground_reaction(BODY, ONE, d, ON_RIGHT)
     moment, power = leg_moments(BODY, d, ground, motion)
     at = 25
     inertia = segment_inertia(BODY, ONE)
@@ -275,7 +274,7 @@ def test_the_knee_has_the_sign_of_flexion() -> None:
     # Crouching on one leg: the knee is held by its extensors, so its flexing moment is negative.
     motion = still(n=50, hip_flexion_r=0.9, knee_angle_r=-1.4, ankle_angle_r=0.4)
     d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    ground = ground_reaction(BODY, ONE, d, ON_RIGHT)
     moment, _ = leg_moments(BODY, d, ground, motion)
     assert MOMENTS[JOINTS.index("knee_angle")] == "knee_flexion"
     assert moment[25, 1, MOMENTS.index("knee_flexion")] < -0.2
@@ -306,8 +305,8 @@ def test_a_walk_has_measures_with_intervals(walk: TrialFit, found: Kinetics) -> 
     by_markers = kinetics_of(dataclasses.replace(walk, orientation_source="measured: calibration")).measures
     peak = by_markers["vertical_peak_loading_bw"]
     assert 0.9 < peak.mean < 1.6
-    assert peak.interval is not None
-    assert peak.interval[0] < peak.mean < peak.interval[1]
+    low, high = not_none(peak.interval)
+    assert low < peak.mean < high
     impulse = found.measures["vertical_impulse_bw_s"]
     # Over a stride both feet carry the weight: half a stride each.
     assert impulse.mean == pytest.approx(0.55, abs=0.05)
@@ -485,20 +484,16 @@ def test_what_is_certain_stays() -> None:
     assert np.abs(found.draw(np.random.default_rng(0)) - found.mean)[::3].max() < 0.001
 
 
-def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed() -> None:
-    method = METHODS.find()
-    fit = walking_fit(BODY.joint_names, BODY.sha256, n_frames=240, start_m=(6.0, -4.5, -0.2))
-    fit = dataclasses.replace(
-        fit, orientation_source="measured: phone", marker_set="blazepose_33", qpos_sd=np.full_like(fit.qpos, 0.01)
-    )
+def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed(walk: TrialFit) -> None:
+    params = METHODS.find().params
+    fit = dataclasses.replace(walk, marker_set="blazepose_33")
     events = gait_metrics([fit]).trials[0].events.events
 
     def vertical(**changes) -> np.ndarray:
         changed = dataclasses.replace(fit, **changes)
         inertia = segment_inertia(BODY, fit.scale)
-        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, method.params)
-        assert series is not None
-        return series.force_bw[:, :, 2].sum(axis=1)
+        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, params)
+        return not_none(series).force_bw[:, :, 2].sum(axis=1)
 
     needed = vertical(orientation_source="measured: calibration")
     assert np.nanmax(np.abs(vertical() - needed)) > 0.02
