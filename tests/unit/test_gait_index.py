@@ -143,7 +143,7 @@ def test_radians_are_refused():
         with pytest.raises(PblError, match="ANGLE_UNITS"):
             score_gdi([nine_cycle(norm.mean_deg * factor)], norm)
         with pytest.raises(PblError, match="ANGLE_UNITS"):
-            fit_norm(toy_vectors() * factor, variables=THREE_ANGLES, percent=PERCENT, **ABOUT)
+            make(toy_vectors() * factor)
 
 
 def test_index_and_norm_must_fit_together():
@@ -154,10 +154,12 @@ def test_index_and_norm_must_fit_together():
         score_gdi(cycles, model="gdi")
 
 
-def made(**changes) -> NormativeSet:
-    """A set of the body's angles."""
-    norm = fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, angle_model=BODY_ANGLES, **ABOUT)
-    return dataclasses.replace(norm, **changes)
+def make(vectors: np.ndarray, **changes) -> NormativeSet:
+    return fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT, **changes)
+
+
+#: A set of the body's angles.
+OWN = make(toy_vectors(), angle_model=BODY_ANGLES)
 
 
 @pytest.mark.parametrize(
@@ -168,10 +170,9 @@ def made(**changes) -> NormativeSet:
         ((BODY_ANGLES, BODY_ANGLES), "gillette-166-three-angles", "WARN"),
         ((BODY_ANGLES, BODY_ANGLES), "gillette-166-body-angles", "PASS"),  # the usual: described with the index
         ((PLUG_IN_GAIT, BODY_ANGLES), NINE, "WARN"),
-        ((BODY_ANGLES, BODY_ANGLES), made(mapped_from=PLUG_IN_GAIT), "WARN"),
-        ((BODY_ANGLES, BODY_ANGLES), made(), "PASS"),
+        ((BODY_ANGLES, BODY_ANGLES), dataclasses.replace(OWN, mapped_from=PLUG_IN_GAIT), "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), OWN, "PASS"),
     ],
-    ids=str,
 )
 def test_mixed_and_mapped_conventions_warn(models, norm, outcome):
     mean = load_norm(NINE).mean_deg
@@ -180,10 +181,6 @@ def test_mixed_and_mapped_conventions_warn(models, norm, outcome):
     assert check.outcome == outcome
     assert bool(check.advice) == (outcome == "WARN")
     assert ("mapped" in check.advice) == (isinstance(norm, NormativeSet) and bool(norm.mapped_from))
-
-
-def make(vectors: np.ndarray, **changes) -> NormativeSet:
-    return fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT, **changes)
 
 
 def test_no_more_components_than_cycles():
