@@ -1,4 +1,4 @@
-"""What a confidence is worth: the curves that ship."""
+"""Curves that turn a stated confidence into a probability."""
 
 import dataclasses
 

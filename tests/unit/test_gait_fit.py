@@ -77,7 +77,7 @@ def walk(seconds: float, *way: float, name: str = "walk") -> TrialFit:
 
 
 def still(seconds: float) -> TrialFit:
-    """Somebody who stands."""
+    """A person who stands."""
     return make_fit(np.arange(0, seconds, 1 / 30), {}, "standing")
 
 
