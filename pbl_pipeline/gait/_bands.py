@@ -6,10 +6,12 @@ import dataclasses
 import functools
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from pbl_pipeline.shipped import shipped_text
 
 from .cycle_measures import Spatiotemporal
 from .events import SIDES
@@ -19,7 +21,6 @@ from .types import GaitCycle
 if TYPE_CHECKING:
     import pandas as pd
 
-_ADULTS = Path(__file__).parent / "normative" / "curves" / "adult_ranges.json"
 #: Height (m, unscaled) of the calcaneus' origin above the floor with the foot flat.
 _SOLE_M = 0.015
 
@@ -69,7 +70,7 @@ class AdultRanges:
 @functools.cache
 def adult_ranges() -> AdultRanges:
     """Return the ranges that ship with the package (`research/adult_ranges.py` writes them)."""
-    raw = json.loads(_ADULTS.read_text(encoding="utf-8"))
+    raw = json.loads(shipped_text("gait/normative/curves/adult_ranges.json"))
     ranges = {angle: (float(mean), float(sd)) for angle, (mean, sd) in raw["range_deg"].items()}
     return AdultRanges(raw["n"], tuple(raw["age"]), ranges, raw["source"], raw["licence"])
 
@@ -108,7 +109,7 @@ def normal_bands(
         elif cadence is not None:
             steps = cadence.mean / 60.0 * float(np.sqrt(leg_m / GRAVITY))
             # Outside the groups the line goes on, so that the clipping below is seen.
-            wanted, matched = float(_extrapolated(steps, norm.cadence, norm.speed)), "cadence"
+            wanted, matched = float(make_interp_spline(norm.cadence, norm.speed, k=1)(steps)), "cadence"
     low, high = float(norm.speed[0]), float(norm.speed[-1])
     at = float(np.clip(wanted, low, high))
     percent = np.linspace(0.0, 100.0, 51)
@@ -121,14 +122,6 @@ def normal_bands(
         for angle in norm.angles
     }
     return NormalBands(percent, curves, at, matched, not low <= wanted <= high, norm.source, norm.licence)
-
-
-def _extrapolated(x: float, xs: np.ndarray, ys: np.ndarray) -> float:
-    if x < xs[0]:
-        return float(ys[0] + (x - xs[0]) * (ys[1] - ys[0]) / (xs[1] - xs[0]))
-    if x > xs[-1]:
-        return float(ys[-1] + (x - xs[-1]) * (ys[-1] - ys[-2]) / (xs[-1] - xs[-2]))
-    return float(np.interp(x, xs, ys))
 
 
 #: Columns of `curve_frame`; angles in degrees, `percent` of the cycle.

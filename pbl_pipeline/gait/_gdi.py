@@ -185,7 +185,6 @@ def score_gdi(
     norm: NormativeSet | str | None = None,
     params: GdiParams | None = None,
     model: Method[GdiParams] | str | None = None,
-    version: int | None = None,
 ) -> Gdi:
     """Gait Deviation Index over the used cycles of one or several trials.
 
@@ -213,9 +212,9 @@ def score_gdi(
         A set or its name; None for that of `params`.
     params
         None for those of `model`, or without one for those of the index with the norm's angles.
-    model, version
-        A method of `GDI_METHODS`, or its name, which decides the angles, and its version (None: the newest). Without it
-        the norm's angles decide; a norm of other angles than the two indices have makes an index with another name.
+    model
+        A method of `GDI_METHODS`, or its name, which decides the angles. Without it the norm's angles decide; a norm of
+        other angles than the two indices have makes an index with another name.
     """
     method = GDI_METHODS.find(model)
     basis = norm_of(norm, params or method.params)
@@ -223,7 +222,7 @@ def score_gdi(
     family = _model_of(basis, method.family.name if model else None)
     known = method if model else GDI_METHODS.get(family)
     model = method.name if model else family
-    version = version or (known.version if known else 1)
+    version = known.version if known else 1
     paramset = Paramset.of("gdi", model, version, dataclasses.replace(params, norm=basis.name))
     if model != family:  # a custom method names its family, as its row does
         paramset = dataclasses.replace(paramset, params={GDI_METHODS.kind: family, **paramset.params})

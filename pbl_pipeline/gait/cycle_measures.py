@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pbl_pipeline import words
+
 from .events import LEFT, RIGHT
 from .ground import is_metric
 from .motion import BodyPoses
@@ -56,22 +58,7 @@ def mostly(names: np.ndarray) -> str:
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
 #: Measures in the order of metrics.json; the unit is in the name.
-MEASURES: tuple[str, ...] = (
-    "cadence_steps_per_min",
-    "stride_time_s",
-    "step_time_s",
-    "stance_time_s",
-    "swing_time_s",
-    "stance_percent",
-    "swing_percent",
-    "single_support_percent",
-    "double_support_percent",
-    "double_support_time_s",
-    "speed_m_per_s",
-    "stride_length_m",
-    "step_length_m",
-    "step_width_m",
-)
+MEASURES = tuple(words.MEASURES)
 #: Measures that need the positions of the feet on the floor.
 LENGTHS = ("speed_m_per_s", "stride_length_m", "step_length_m", "step_width_m")
 #: Measures of one leg, which have an asymmetry.
@@ -200,7 +187,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
         steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
     by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
     alike = not far_leg_of(used)
-    measures.update({name: _measure(name, values, alike) for name, values in by_cycle.items() if values})
+    measures.update({n: measure_of(values, alike and n in SIDED) for n, values in by_cycle.items() if values})
     for name in LENGTHS:
         if measures[name] is None:
             reasons[name] = _no_length(name, used)
@@ -266,18 +253,19 @@ def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
     return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
 
 
-def _measure(name: str, values: Sequence[tuple[str, float]], alike: bool) -> Measure:
+def measure_of(values: Sequence[tuple[str, float]], compared: bool = False) -> Measure:
+    """Return the measure of values with their sides ("" for a measure without); `compared`: with its asymmetry."""
     numbers = np.array([v for _, v in values])
     by_side = {side: [v for s, v in values if s == side] for side in (LEFT, RIGHT)}
     left, right = (float(np.mean(by_side[s])) if by_side[s] else None for s in (LEFT, RIGHT))
     mean = float(numbers.mean())
     sd = float(np.std(numbers, ddof=1)) if len(numbers) > 1 else None
-    # A measure without sides (cadence) has one group.
+    # A measure without sides (cadence, tasks) has one group.
     groups = list(by_side.values()) if left is not None or right is not None else [list(numbers)]
     enough = all(len(g) > 1 for g in groups)
     within = float(np.sqrt(np.mean([np.var(g, ddof=1) for g in groups]))) if enough else None
     fraction = None if within is None or mean == 0 else 100.0 * within / abs(mean)
     asymmetry = None
-    if alike and name in SIDED and left is not None and right is not None and left + right != 0:
+    if compared and left is not None and right is not None and left + right != 0:
         asymmetry = 100.0 * (right - left) / (0.5 * (right + left))
     return Measure(left, right, mean, sd, len(numbers), within, fraction, asymmetry)

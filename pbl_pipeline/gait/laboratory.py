@@ -22,8 +22,7 @@ from ._angles import AngleSeries
 from .events import (
     FOOT_DOWN,
     FOOT_UP,
-    LEFT,
-    RIGHT,
+    SIDES,
     GaitEvent,
     GaitEvents,
     check_preconditions,
@@ -53,7 +52,6 @@ _FOOT_MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 #: Markers that the event model knows the legs by as well, where they are there.
 _LEG_MARKERS = ("LPSI", "RPSI", "SACR", "LKNE", "RKNE", "LANK", "RANK")
 _LABELS = {"Foot Strike": FOOT_DOWN, "Foot Off": FOOT_UP}
-_SIDES = {"left": LEFT, "right": RIGHT}
 _format_error = functools.partial(
     PblError,
     "FILE_FORMAT",
@@ -199,8 +197,8 @@ def _events(
         found = []
         words = (np.ravel(table.get(k).string_array) for k in ("CONTEXTS", "LABELS"))
         for context, label, time in zip(*words, table.get("TIMES").float_array, strict=False):
-            side, event = _SIDES.get(str(context).strip().lower()), _LABELS.get(str(label).strip())
-            if side and event:
+            side, event = str(context).strip().lower(), _LABELS.get(str(label).strip())
+            if side in SIDES and event:
                 # Minutes and seconds.
                 found.append(GaitEvent(float(time[0] * 60 + time[1]), side, event, 1.0))
         if found:

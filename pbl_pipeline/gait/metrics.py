@@ -216,10 +216,7 @@ def gait_metrics(
     index = {"norm": basis, "params": params.gdi, "model": model}
     given = [Condition()] * len(trials) if conditions is None else conditions
     done = tuple(
-        dataclasses.replace(
-            _trial(t, params.events, index, fit_checks, c, accept_cadence), pooled=c.pooled(params.gdi.pace)
-        )
-        for t, c in zip(trials, given, strict=True)
+        _trial(t, params.events, index, fit_checks, c, accept_cadence) for t, c in zip(trials, given, strict=True)
     )
     return GaitMetrics(**vars(pool_trials(done, basis, params, model, conditions=given)), trials=done)
 
@@ -318,6 +315,7 @@ def _trial(
         spatiotemporal=measures,
         gdi=gdi,
         qc=(*events.qc, *cycle_checks(measures, cycles), *gdi.qc),
+        pooled=condition.pooled(index["params"].pace),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,19 +145,9 @@ def _events(content: Mapping[str, Any], events: Sequence[GaitEvent], checks: Seq
     if told is None:  # version 0.1
         status = PASS if events else EMPTY
         return GaitEvents(status, tuple(events), "" if events else str(content["reason"]), "unknown", "", "fit")
-    bouts = tuple((float(a), float(b)) for a, b in told["walking_s"])
-    return GaitEvents(
-        status=str(told["status"]),
-        events=tuple(GaitEvent(e.time_s, e.side, e.event, e.probability, _bout(e.time_s, bouts)) for e in events),
-        reason=str(told["reason"]),
-        method=str(told["method"]),
-        params_hash=str(told["params_hash"]),
-        source=str(told["source"]),
-        walking_s=bouts,
-        n_candidates=int(told["n_candidates"]),
-        n_order_breaks=int(told["n_order_breaks"]),
-        qc=tuple(structured(c, Check) for c in told["qc"]),
-    )
+    found = structured({**told, "events": ()}, GaitEvents)
+    numbered = (dataclasses.replace(e, bout=_bout(e.time_s, found.walking_s)) for e in events)
+    return dataclasses.replace(found, events=tuple(numbered))
 
 
 def _bout(time_s: float, bouts: Sequence[tuple[float, float]]) -> int:

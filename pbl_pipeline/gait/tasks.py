@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from pbl_pipeline import words
 from pbl_pipeline.qc import Check, failed
 
-from .cycle_measures import MEASURES, Measure
+from .cycle_measures import MEASURES, Measure, measure_of
 from .motion import BodyPoses, trial_poses
 
 if TYPE_CHECKING:
@@ -39,22 +40,7 @@ TASK_MEASURES: dict[str, tuple[str, ...]] = {
     "squat": ("squat_count", "squat_time_s", "squat_knee_flexion_deg", "peak_trunk_lean_deg"),
 }
 #: Every measure of a trial in order.
-TRIAL_MEASURES = (
-    *MEASURES,
-    "five_rises_time_s",
-    "rise_count",
-    "tug_time_s",
-    "squat_count",
-    "rise_time_s",
-    "walk_out_time_s",
-    "turn_time_s",
-    "walk_back_time_s",
-    "turn_to_sit_time_s",
-    "sit_time_s",
-    "squat_time_s",
-    "squat_knee_flexion_deg",
-    "peak_trunk_lean_deg",
-)
+TRIAL_MEASURES = (*MEASURES, *words.TASKS)
 #: Lowering of the hips that separates sitting from standing, and least distance of the levels of the two, both as
 #: fractions of the leg's length.
 LOWERED, APART = 0.25, 0.2
@@ -117,11 +103,7 @@ class Move:
 def task_motion(fit: TrialFit, poses: BodyPoses | None = None) -> TaskMotion:
     """Return the motion of a fit; `poses` saves computing them again. Raises `PblError` GAIT_INPUT."""
     poses = poses or trial_poses(fit)
-    joints = (
-        np.stack([poses.position_m[:, poses.index(f"{body}_{side}")] for side in "lr"], axis=1)
-        for body in ("femur", "tibia", "talus", "humerus")
-    )
-    return TaskMotion.of_points(fit.time_s, *joints)
+    return TaskMotion.of_points(fit.time_s, *map(poses.of_sides, ("femur", "tibia", "talus", "humerus")))
 
 
 def task_measures(
@@ -323,6 +305,4 @@ def _between_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def task_measure(values: Sequence[float]) -> Measure:
     """Return the measure of repetitions of a task."""
-    mean = float(np.mean(values))
-    sd = float(np.std(values, ddof=1)) if len(values) > 1 else None
-    return Measure(None, None, mean, sd, len(values), sd, None if sd is None or mean == 0 else 100.0 * sd / abs(mean))
+    return measure_of([("", value) for value in values])

@@ -99,11 +99,9 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
 def _dynamic_model(body: Body, scale: np.ndarray, inertia: Inertia) -> mujoco.MjModel:
     """Return the scaled body with its inertia, free of contacts and joint limits."""
     model = scaled_model(body, scale)
-    model.body_mass[1:], model.body_ipos[1:], model.body_inertia[1:] = (
-        inertia.mass,
-        inertia.centre_m,
-        inertia.moment_m2,
-    )
+    model.body_mass[1:] = inertia.mass
+    model.body_ipos[1:] = inertia.centre_m
+    model.body_inertia[1:] = inertia.moment_m2
     model.body_iquat[1:] = (1.0, 0.0, 0.0, 0.0)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -181,6 +181,17 @@ def _transient(vertical: np.ndarray, stands: np.ndarray) -> np.ndarray:
     return out
 
 
+def phases(there: np.ndarray, known: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+    """Yield the rows of each run of `there` (N,) and the phase (0 to 1) in each. A run of which the frame before or
+    after it is not `known` (N,) is seen in part: it is taken to last as long as the others (the median)."""
+    seen = np.concatenate([[False], known, [False]])
+    found = [(run, run.stop - run.start, seen[run.start], seen[run.stop + 1]) for run in runs(there)]
+    whole = [n for _, n, began, ended in found if began and ended]
+    for run, n, began, ended in found:
+        full = n if (began and ended) or not whole else max(n, int(np.median(whole)))
+        yield run, (np.arange(n) + 0.5 + (0 if began else full - n)) / full
+
+
 def _phase(run: slice) -> np.ndarray:
     return (np.arange(run.stop - run.start) + 0.5) / (run.stop - run.start)
 
@@ -238,15 +249,8 @@ def _mean_shift(body: Body, d: Dynamics, level: np.ndarray, vertical: np.ndarray
 def _pressure(body: Body, scale: np.ndarray, d: Dynamics, contact: np.ndarray, k: int) -> np.ndarray:
     """Return the centre of pressure (N, 3) of foot `k` [left, right] by `PROGRESS`; NaN where it does not stand."""
     sole = _sole(body, scale, d, contact, "lr"[k])
-    # Each stance with its length, and whether its beginning and its end are seen.
-    known = np.concatenate([[False], np.isfinite(contact), [False]])
-    stances = [(r, r.stop - r.start, bool(known[r.start]), bool(known[r.stop + 1])) for r in runs(contact == 1)]
-    whole = [n for _, n, began, ended in stances if began and ended]
     place = np.full((len(contact), 2), np.nan)
-    for run, n, began, ended in stances:
-        # A stance that is seen in part is as long as the others.
-        full = n if (began and ended) or not whole else max(n, int(np.median(whole)))
-        phase = (np.arange(n) + 0.5 + (0 if began else full - n)) / full
+    for run, phase in phases(contact == 1, np.isfinite(contact)):
         for i in (0, 1):
             place[run, i] = np.interp(phase, PROGRESS[:, 0], PROGRESS[:, i + 1])
     forefoot = _FOREFOOT * np.clip(np.interp(sole.lifted / sole.length, _HEEL_OFF, (0.0, 1.0)), 0.0, 1.0)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pbl_pipeline import words
 from pbl_pipeline.gait import GaitCycle, GaitEvents
 from pbl_pipeline.qc import Check
 
@@ -23,20 +24,7 @@ CURVES = (
     *(f"{name}_power_w_per_kg" for name in ("hip_flexion", "knee_flexion", "ankle_angle")),
 )
 #: Measures of a cycle; the unit is in the name.
-MEASURES = (
-    "vertical_peak_loading_bw",
-    "vertical_peak_push_off_bw",
-    "vertical_impulse_bw_s",
-    "braking_impulse_bw_s",
-    "propulsion_impulse_bw_s",
-    "knee_extension_moment_peak_nm_per_kg",
-    "knee_adduction_moment_peak_nm_per_kg",
-    "ankle_push_off_power_w_per_kg",
-    "hip_work_j_per_kg",
-    "knee_work_j_per_kg",
-    "ankle_work_j_per_kg",
-    "centre_of_mass_excursion_m",
-)
+MEASURES = tuple(words.KINETICS)
 #: Half of a 90 % interval in standard deviations.
 WIDTH_SD = 1.645
 
@@ -72,8 +60,8 @@ class KineticMeasure:
 
     The error is that of the fit, by sampling, that of the method, by force plates, and of one camera what its fit loses
     in any walk, by synthetic walkers; `interval` is the 90 % interval of `mean`. `asymmetry_percent` is 100 (right -
-    left) / ((right + left) / 2), None for what is not a
-    measure of one leg and where its standard deviation is more than `compute.MAX_ASYMMETRY_SD`.
+    left) / ((right + left) / 2), None for what is not a measure of one leg and where its standard deviation is more
+    than `compute.MAX_ASYMMETRY_SD`.
     """
 
     left: float | None

@@ -25,6 +25,7 @@ from pbl_pipeline.runs import runs
 from pbl_pipeline.shipped import shipped_model
 
 from .dynamics import GRAVITY, GRID_HZ
+from .ground import phases
 
 #: Every third of the observed frames is used: 33 a second suffice for a low-passed motion.
 _EVERY = 3
@@ -138,19 +139,12 @@ def load_vertical_model(name: str) -> VerticalModel:
 
 def support_phase(stands: np.ndarray) -> Float[np.ndarray, " N"]:
     """Return the phase of support: 0 to 1 over double support, 1 to 2 over single support, NaN where no foot stands.
-    A support that is not seen from its first to its last moment is taken to last as long as the others (the median).
     `stands` (N, 2)."""
     feet = stands.sum(axis=1)
     out = np.full(len(feet), np.nan)
     for n, begin in ((2, 0.0), (1, 1.0)):
-        seen = [
-            (r, r.start > 0 and feet[r.start - 1] > 0, r.stop < len(feet) and feet[r.stop] > 0) for r in runs(feet == n)
-        ]
-        whole = [r.stop - r.start for r, began, ended in seen if began and ended]
-        for r, began, ended in seen:
-            length = r.stop - r.start
-            full = length if (began and ended) or not whole else max(length, int(np.median(whole)))
-            out[r] = begin + (np.arange(length) + 0.5 + (0 if began else full - length)) / full
+        for run, phase in phases(feet == n, feet > 0):
+            out[run] = begin + phase
     return out
 
 

@@ -28,10 +28,10 @@ from .figures import (
     draw_pairs,
     draw_scatter,
 )
-from .page_tables import PageTable, all_tables, number, p_text, short_of, title_of
+from .page_tables import all_tables, number, p_text, short_of, title_of
 from .results import StudyResults, reason, score_classes, study_results
 from .statement import statement
-from .visit_values import INDEX, pairs, plan, score_column
+from .visit_values import INDEX, of_scores, pairs, plan
 
 PAGE = "report.html"
 
@@ -64,7 +64,10 @@ def write_study_report(
     for sub in ("figures", "tables"):
         (folder / sub).mkdir(parents=True, exist_ok=True)
     paths = [folder / PAGE]
-    paths[0].write_text(_render(head, tables, sections, results, "SVG and PDF" if pdf else "SVG"), encoding="utf-8")
+    page = shipped_page("study_report/templates/report.html").render(
+        head=head, tables=tables, sections=sections, plan=results.plan, formats="SVG and PDF" if pdf else "SVG"
+    )
+    paths[0].write_text(page, encoding="utf-8")
     for figure in (f for figures in sections.values() for f in figures):
         paths.append(folder / "figures" / f"{figure.name}.svg")
         paths[-1].write_text(figure.svg(footer), encoding="utf-8")
@@ -102,22 +105,6 @@ def _counts(persons: int, visits: int) -> str:
     return f"{persons} person{'s' * (persons != 1)}, {visits} visit{'s' * (visits != 1)}"
 
 
-def _render(
-    head: dict[str, str],
-    tables: dict[str, PageTable],
-    sections: dict[str, list[Figure]],
-    results: StudyResults,
-    formats: str,
-) -> str:
-    return shipped_page("study_report/templates/report.html").render(
-        head=head,
-        tables=tables,
-        sections=sections,
-        plan=results.plan,
-        formats=formats,
-    )
-
-
 def _frames(results: StudyResults) -> dict[str, pd.DataFrame]:
     rows = []
     for c in results.curves:
@@ -150,14 +137,14 @@ def _sections(study: StudyData, results: StudyResults) -> dict[str, list[Figure]
         "srm": list(_srm_figure(results)),
         "by_visit": list(_mean_figures(study, results)),
         "paired": list(_paired_figures(study, results)),
-        "curves": list(_curve_figures(study, results, "change")),
+        "curves": list(_curve_figures(study, results, of_change=True)),
     }
 
 
 def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
     """Figures as the paper's figure 5: A curves of groups, B the index by class of a score, C over a continuous score,
     D by group, E over an ordinal score."""
-    yield from _curve_figures(study, results, "")
+    yield from _curve_figures(study, results, of_change=False)
     measure = INDEX if INDEX in results.plan.measures else next(iter(results.plan.measures), "")
     if not measure:
         return
@@ -170,7 +157,7 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
             note = f"{where}; {_tests(results, measure, score)}"
             drawing = draw_groups(by_class, title)
             yield Figure(_file("5B", score), f"B  {title} by class of {short_of(score)}", note, drawing)
-    ordinal = {score_column(study, i): bool(o) for i, o in study.instruments[["instrument", "ordinal"]].to_numpy()}
+    ordinal = of_scores(study, "ordinal")
     colours = colours_of(results.plan.groups)
     for score in results.plan.scores:
         both = at.dropna(subset=[measure, score])
@@ -255,30 +242,28 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
         )
 
 
-def _curve_figures(study: StudyData, results: StudyResults, comparison: str) -> Iterator[Figure]:
-    """Figures of curves, of "change" or ("") between groups, as the paper's figure 5 A."""
+def _curve_figures(study: StudyData, results: StudyResults, of_change: bool) -> Iterator[Figure]:
+    """Figures of curves, of the change or between groups, as the paper's figure 5 A."""
     groups = colours_of(results.plan.groups)
     for c in results.curves:
-        if (c.comparison == "change") != (comparison == "change") or not len(c.a) or not len(c.b):
+        if (c.comparison == "change") != of_change or not len(c.a) or not len(c.b):
             continue
-        of_change = c.comparison == "change"
-        colours = (BEFORE, AFTER) if of_change else (groups[c.names[1]], groups[c.names[0]])
+        a, b = c.names
+        title = title_of(study, c.angle)
+        if of_change:
+            colours, n = (BEFORE, AFTER), f"n {len(c.a)}"
+            name, title = _file("curves", c.angle), f"{title}, {b} to {a}"
+        else:
+            colours, n = (groups[b], groups[a]), f"n {len(c.a)}, {len(c.b)}"
+            name, title = _file("5A", f"{c.angle}_{b}"), f"A  {title}, {a} and {b}"
         if isinstance(c.test, CurveTest):
             spans = ", ".join(f"{x.first:.0f} to {x.last:.0f} %" for x in c.test.phases)
             test = f"differ at {spans}" if spans else f"differ nowhere (p = {p_text(c.test.p_value)})"
         else:
             test = reason(c.test)
-        n = f"n {len(c.a)}" if of_change else f"n {len(c.a)}, {len(c.b)}"
         left = f"; {c.left_out} left out for unknown points" if c.left_out else ""
-        prefix, letter = ("curves", "") if of_change else ("5A", "A  ")
-        who = f"{c.names[1]} to {c.names[0]}" if of_change else f"{c.names[0]} and {c.names[1]}"
-        name = c.angle if of_change else f"{c.angle}_{c.names[1]}"
-        legend = {c.names[1]: colours[0], c.names[0]: colours[1]}
-        angle = title_of(study, c.angle)
-        drawing = draw_curves(c, colours, angle)
-        yield Figure(
-            _file(prefix, name), f"{letter}{angle}, {who}", f"mean, one sd; {n}{left}; {test}", drawing, legend
-        )
+        drawing = draw_curves(c, colours, title_of(study, c.angle))
+        yield Figure(name, title, f"mean, one sd; {n}{left}; {test}", drawing, {b: colours[0], a: colours[1]})
 
 
 def _file(prefix: str, name: str) -> str:

@@ -12,11 +12,12 @@ import pandas as pd
 
 from pbl_pipeline import words
 from pbl_pipeline.latex import tex_escape
+from pbl_pipeline.stats import CurveTest
 from pbl_pipeline.study import StudyData
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS
 
 from .results import ALPHA, StudyResults, reason
-from .visit_values import INDEX, score_column
+from .visit_values import INDEX, of_scores
 
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
@@ -112,10 +113,7 @@ def unit_of(study: StudyData, name: str) -> str:
         rows: Any = frame[frame[column] == name]
         if len(rows):
             return str(rows["unit"].iloc[0])
-    for instrument, unit in zip(study.instruments["instrument"], study.instruments["unit"], strict=True):
-        if score_column(study, instrument) == name:
-            return unit
-    return ""
+    return of_scores(study, "unit").get(name, "")
 
 
 def number(value: float, digits: int) -> str:
@@ -172,7 +170,6 @@ def _table(name: str, title: str, note: str, frame: pd.DataFrame, columns: _Colu
 
 
 def flow(results: StudyResults) -> PageTable:
-    """Participant flow."""
     columns: _Columns = {
         "Group": lambda r: str(r["group"]),
         "Visit": lambda r: str(r["role"]),
@@ -253,34 +250,30 @@ def srm_table(study: StudyData, results: StudyResults) -> PageTable:
 
 def by_visit(study: StudyData, results: StudyResults) -> PageTable:
     """Mean, interval and spread by visit."""
-    rows = []
     frame: Any = results.by_visit
-    for name in dict.fromkeys(frame["name"]):
-        own = frame[frame["name"] == name]
-        digits = digits_of(own["mean"])
-        for i, r in enumerate(own.to_dict("records")):
-            limits = f"{number(r['low'], digits)} to {number(r['high'], digits)}"
-            interval = limits if math.isfinite(r["low"]) else "one person: none"
-            rows.append(
-                {
-                    "Measure": "" if i else title_of(study, name),
-                    "Group": r["group"],
-                    "Visit": r["role"],
-                    "n": str(r["n"]),
-                    "Mean": number(r["mean"], digits),
-                    "95 % interval": interval,
-                    "SD": number(r["sd"], digits),
-                    "Median": number(r["median"], digits),
-                    "nIQR": number(r["niqr"], digits),
-                }
-            )
-    columns = ["Measure", "Group", "Visit", "n", "Mean", "95 % interval", "SD", "Median", "nIQR"]
+    digits = {name: digits_of(own["mean"]) for name, own in frame.groupby("name")}
+
+    def interval(r: dict[Any, Any]) -> str:
+        limits = (number(r[k], digits[r["name"]]) for k in ("low", "high"))
+        return " to ".join(limits) if math.isfinite(r["low"]) else "one person: none"
+
+    columns: _Columns = {
+        "Measure": lambda r: title_of(study, r["name"]) if r["first"] else "",
+        "Group": lambda r: r["group"],
+        "Visit": lambda r: r["role"],
+        "n": lambda r: str(r["n"]),
+        "Mean": lambda r: number(r["mean"], digits[r["name"]]),
+        "95 % interval": interval,
+        "SD": lambda r: number(r["sd"], digits[r["name"]]),
+        "Median": lambda r: number(r["median"], digits[r["name"]]),
+        "nIQR": lambda r: number(r["niqr"], digits[r["name"]]),
+    }
     note = "Student's interval of the mean; nIQR = IQR x 0.7413."
-    return PageTable("by_visit", "Measures by visit", note, pd.DataFrame(rows, columns=columns))
+    rows = frame.assign(first=~frame["name"].duplicated())
+    return _table("by_visit", "Measures by visit", note, rows, columns, _Marks())
 
 
 def repeatability(study: StudyData, results: StudyResults) -> PageTable:
-    """ICC, SEM, MDC."""
     marks = _Marks()
     note = (
         "SEM and minimal detectable change in the unit of the measure; n persons with k cycles or visits (harmonic "
@@ -303,7 +296,6 @@ def repeatability(study: StudyData, results: StudyResults) -> PageTable:
 
 
 def validity(results: StudyResults) -> PageTable:
-    """Correlations."""
     marks = _Marks()
     note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
     columns: _Columns = {
@@ -320,7 +312,6 @@ def validity(results: StudyResults) -> PageTable:
 
 
 def groups(results: StudyResults) -> PageTable:
-    """Differences between groups."""
     marks = _Marks()
     note = (
         f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
@@ -343,15 +334,13 @@ def groups(results: StudyResults) -> PageTable:
 
 
 def phases(results: StudyResults) -> PageTable:
-    """Phases in which curves differ."""
     marks, rows = _Marks(), []
     for c in results.curves:
         row = {"Measure": short_of(c.angle), "Of": comparison_of(c)}
-        if not hasattr(c.test, "phases"):
-            error: Any = c.test
-            rows.append({**row, "Phase (% of cycle)": marks(reason(error))})
+        test = c.test
+        if not isinstance(test, CurveTest):
+            rows.append({**row, "Phase (% of cycle)": marks(reason(test))})
             continue
-        test: Any = c.test
         found = test.phases or (None,)
         for phase in found:
             inside = slice(None) if phase is None else (test.percent >= phase.first) & (test.percent <= phase.last)

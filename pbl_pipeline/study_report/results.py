@@ -21,13 +21,14 @@ from pbl_pipeline.stats import (
     curve_test,
     hedges_g,
     icc,
+    niqr,
     ratings_table,
     srm,
     wilcoxon,
 )
 from pbl_pipeline.study import StudyData, classes_of
 
-from .visit_values import INDEX, Plan, at_role, cycle_values, mean_curves, pairs, score_column, visit_table
+from .visit_values import INDEX, Plan, at_role, cycle_values, mean_curves, of_scores, pairs, visit_table
 
 #: Two-sided level of significance (the paper, Statistics).
 ALPHA = 0.05
@@ -150,15 +151,13 @@ def summary(values: np.ndarray) -> dict[str, float]:
     n, mean = len(values), float(values.mean())
     sd = float(values.std(ddof=1)) if n > 1 else np.nan
     half = float(distributions.t.isf(0.025, n - 1)) * sd / np.sqrt(n) if n > 1 else np.nan
-    low, high = np.percentile(values, [25, 75])
-    spread = 0.7413 * (high - low) if n > 1 else np.nan
     return {
         "mean": mean,
         "low": mean - half,
         "high": mean + half,
         "sd": sd,
         "median": float(np.median(values)),
-        "niqr": spread,
+        "niqr": niqr(values) if n > 1 else np.nan,
     }
 
 
@@ -193,10 +192,7 @@ def repeatability(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd
 def validity(study: StudyData, to_compare: Plan, table: pd.DataFrame) -> pd.DataFrame:
     """Correlation of each measure with each score at the visit `change_from`: all persons who have both, and the
     changing group if that is not all of them. Spearman for ordinal scores, else Pearson (the paper, Statistics)."""
-    ordinal = {
-        score_column(study, i): o
-        for i, o in zip(study.instruments["instrument"], study.instruments["ordinal"], strict=True)
-    }
+    ordinal = of_scores(study, "ordinal")
     at: Any = table[table["role"] == to_compare.change_from]
     rows = []
     for name in to_compare.measures:
@@ -239,11 +235,7 @@ def group_differences(study: StudyData, to_compare: Plan, table: pd.DataFrame) -
     rows = []
     for by, labels in kinds.items():
         names = list(to_compare.groups) if by == "group" else list(labels.cat.categories)
-        others = (
-            [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
-            if by == "group"
-            else list(itertools.pairwise(names))
-        )
+        others = list(itertools.combinations(names, 2) if by == "group" else itertools.pairwise(names))
         for name in to_compare.measures:
             for a, b in others:
                 x, y = (at.loc[labels == v, name].dropna().to_numpy(float) for v in (a, b))
@@ -271,11 +263,11 @@ def _corrected(tests: pd.DataFrame, family: str) -> pd.DataFrame:
 def score_classes(study: StudyData, to_compare: Plan, table: Any) -> dict[str, Any]:
     """Score -> class of each row of a table, in order from the lowest, of the scores that have classes."""
     found = {}
-    for instrument, text in zip(study.instruments["instrument"], study.instruments["classes"], strict=True):
-        classes, column = classes_of(text), score_column(study, instrument)
-        if len(classes) > 1 and column in to_compare.scores:
+    for score, text in of_scores(study, "classes").items():
+        classes = classes_of(text)
+        if len(classes) > 1 and score in to_compare.scores:
             edges = [v for v, _ in classes]
-            found[column] = pd.cut(table[column], [*edges, np.inf], right=False, labels=[w for _, w in classes])
+            found[score] = pd.cut(table[score], [*edges, np.inf], right=False, labels=[w for _, w in classes])
     return found
 
 
@@ -294,14 +286,12 @@ def curve_results(study: StudyData, to_compare: Plan, permutations: int = 10_000
         before, after = of(start, own), of(to_compare.change_to, own)
         both = before.index.intersection(after.index)
         found.append(
-            _compared(
-                angle, "change", after.loc[both], before.loc[both], True, (to_compare.change_to, start), permutations
-            )
+            _compared(angle, "change", after.loc[both], before.loc[both], (to_compare.change_to, start), permutations)
         )
         for group in to_compare.groups[1:]:
             other = of(start, group)
             if len(other):
-                found.append(_compared(angle, f"{own} and {group}", before, other, False, (own, group), permutations))
+                found.append(_compared(angle, f"{own} and {group}", before, other, (own, group), permutations))
     return found
 
 
@@ -310,10 +300,10 @@ def _compared(
     comparison: str,
     a: pd.DataFrame,
     b: pd.DataFrame,
-    paired: bool,
     names: tuple[str, str],
     permutations: int,
 ) -> CurveResult:
+    paired = comparison == "change"
     known_a, known_b = (np.isfinite(x.to_numpy(float)).all(axis=1) for x in (a, b))
     if paired:
         known_a = known_b = known_a & known_b

@@ -16,7 +16,7 @@ from pbl_pipeline.study import StudyData, content_hash
 
 from .page_tables import PageTable, digits_of, number, short_of, title_of
 from .results import StudyResults
-from .visit_values import score_column
+from .visit_values import of_scores
 
 #: Columns of visits about the recordings (docs/study.md), and their names in the statement.
 FILMED = {
@@ -121,11 +121,8 @@ def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
 
 def _errors(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]]:
     frame: Any = results.repeatability
-    important = {
-        score_column(study, i): f"{classes} (by value before)" if classes else f"{m:g}"
-        for i, m, classes in study.instruments[["instrument", "mic", "mic_classes"]].to_numpy()
-        if classes or m == m
-    }
+    important = {score: f"{mic:g}" for score, mic in of_scores(study, "mic").items() if mic == mic}
+    important |= {score: f"{c} (by value before)" for score, c in of_scores(study, "mic_classes").items() if c}
     for r in frame[frame["kind"] == "2,1"].to_dict("records"):
         item = f"{title_of(study, r['name'])}, {r['of']}, {r['group']}"
         if r["code"]:

@@ -61,6 +61,12 @@ def score_column(study: StudyData, instrument: str) -> str:
     return f"{instrument} (score)" if instrument in taken else instrument
 
 
+def of_scores(study: StudyData, column: str) -> dict[str, Any]:
+    """Score -> value of a column of `instruments`."""
+    values = zip(study.instruments["instrument"], study.instruments[column], strict=True)
+    return {score_column(study, instrument): value for instrument, value in values}
+
+
 def plan(study: StudyData, change_from: str = "", change_to: str = "", change_group: str = "") -> Plan:
     """Plan the comparisons of a study; arguments of "" are taken from its description, or follow from its visits.
 

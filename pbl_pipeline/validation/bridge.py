@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,9 +69,8 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
 
 def _method(name: str, stages: Mapping[str, Stage[Any]]) -> tuple[str, Method[Any]]:
     for stage, methods in stages.items():
-        for method in methods.values():
-            if name in (method.name, method.key):
-                return stage, method
+        if method := methods.registered(name):
+            return stage, method
     known = [m.key for methods in stages.values() for m in methods.values()]
     raise PblError(
         "SOLVER_UNKNOWN",
@@ -121,7 +120,10 @@ def bridge_table(pairs: pd.DataFrame, names: tuple[str, str]) -> Table:
     Raises `PblError` STATS_INPUT where fewer than two visits have both.
     """
     cells: dict[tuple[str, str], Cell] = {}
-    for measure, n, values in _shifts(pairs):
+    for measure in (INDEX, *MEASURES):
+        values = pairs.loc[pairs["measure"] == measure, "shift"].to_numpy(float)
+        if (n := len(values)) < 2:
+            continue
         mean, sd = float(values.mean()), float(values.std(ddof=1))
         half = float(stdtrit(n - 1, 0.975)) * sd / np.sqrt(n)
         largest = float(values[np.abs(values).argmax()])
@@ -141,13 +143,6 @@ def bridge_table(pairs: pd.DataFrame, names: tuple[str, str]) -> Table:
         "The same recordings by both. Mean with its 95 % interval (Student's t), standard deviation, largest shift.",
         {m: 1 if m == INDEX or m.endswith(("_percent", "_min")) else 3 for m, _ in cells},
     )
-
-
-def _shifts(pairs: pd.DataFrame) -> Iterator[tuple[str, int, np.ndarray]]:
-    for measure in (INDEX, *MEASURES):
-        values = pairs.loc[pairs["measure"] == measure, "shift"].to_numpy(float)
-        if len(values) > 1:
-            yield measure, len(values), values
 
 
 def touched(visits: pd.DataFrame) -> pd.DataFrame:

@@ -47,10 +47,7 @@ def median_niqr(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 
     NaN without a value; the nIQR is NaN with one, because one value has no spread.
     """
-    v = _finite(values)
-    if v.size == 0:
-        return float("nan"), float("nan")
-    return float(np.median(v)), niqr(v)
+    return _median(values), niqr(values)
 
 
 def niqr(values: Sequence[float] | np.ndarray) -> float:
@@ -113,10 +110,10 @@ class KinematicErrors:
     median_abs_deg: float
     rte_m: float  # mean distance of the pelvis path to the reference's, NaN where one is not known
     #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
-    view: Mapping[str, str]
+    view: Mapping[str, str] = dataclasses.field(default_factory=lambda: dict.fromkeys(("right", "left"), MIXED))
     #: Medians of the fit's residuals over frames and markers.
-    residual_2d_px: float
-    residual_3d_cm: float
+    residual_2d_px: float = float("nan")
+    residual_3d_cm: float = float("nan")
     #: Names of fit and reference, and of what kind the reference is.
     trial: str = ""
     reference: str = ""
@@ -227,9 +224,6 @@ def compare_angles(
         joints=joints,
         median_abs_deg=_median(np.abs(paper)),
         rte_m=_rte(time_s - lag, pelvis_m, reference, same_world),
-        view={"right": MIXED, "left": MIXED},
-        residual_2d_px=float("nan"),
-        residual_3d_cm=float("nan"),
     )
 
 
@@ -308,9 +302,9 @@ def _check_overlap(trial: str, time_s: np.ndarray, ours: np.ndarray, reference: 
         )
 
 
-def _median(values: np.ndarray) -> float:
-    finite = np.asarray(values, float)[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else float("nan")
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    v = _finite(values)
+    return float(np.median(v)) if v.size else float("nan")
 
 
 def _refused(key: str, found: str, expected: str) -> PblError:

@@ -22,7 +22,6 @@ from .reference import (
     FRONT,
     IPSILATERAL,
     JOINTS_OPENCAP,
-    JOINTS_PAPER,
     LATERAL,
     MIXED,
     ROWS_PAPER,
@@ -31,7 +30,7 @@ from .reference import (
 from .write import Cell, Table, paper_cells
 
 STATIC, HANDHELD, SEVERAL = "static", "handheld", "several"
-_JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError))
+_JOINT_FIELDS = tuple(f.name for f in dataclasses.fields(JointError) if f.name != "joint")
 _TRIAL_FIELDS = ("lag_s", "rte_m", "residual_2d_px", "residual_3d_cm")
 #: The columns that say which trial a row is of.
 KEY = ("dataset", "subject", "population", "activity", "camera", "trial", "detector", "solver")
@@ -40,7 +39,7 @@ COLUMNS = (
     "view",
     "joint",
     "side",
-    *(f for f in _JOINT_FIELDS if f != "joint"),
+    *_JOINT_FIELDS,
     *_TRIAL_FIELDS,
     "trial_median_abs_deg",
 )
@@ -75,9 +74,8 @@ def error_frame(rows: Iterable[TrialErrors]) -> pd.DataFrame:
         trial["trial_median_abs_deg"] = row.errors.median_abs_deg
         for error in row.errors.joints:
             joint, side = split_side(error.joint)
-            values = {f: getattr(error, f) for f in _JOINT_FIELDS if f != "joint"}
-            view = _view(row, side)
-            out.append({**key, "view": view, "joint": joint, "side": side, **values, **trial})
+            values = {f: getattr(error, f) for f in _JOINT_FIELDS}
+            out.append({**key, "view": _view(row, side), "joint": joint, "side": side, **values, **trial})
     return pd.DataFrame(out, columns=list(COLUMNS))
 
 
@@ -98,7 +96,6 @@ _DATASETS = ("MMMC handheld", "MMMC static", "BML-MoVi static")
 #: Titles, notes and decimals of the tables, and other names of the paper's populations and activities, small letters.
 _TEXTS = json.loads(shipped_text("validation/data/table_texts.json"))
 _OPENCAP = [split_side(j)[0] for j in JOINTS_OPENCAP]
-_PAPER_JOINTS = [split_side(j)[0] for j in JOINTS_PAPER]
 
 
 def paper_tables(frame: pd.DataFrame) -> dict[str, Table]:
@@ -145,7 +142,7 @@ def _prepared(frame: pd.DataFrame) -> Any:
         rows[column] = [paper.get(str(v).lower(), str(v)) for v in rows[column]]
     rows["recording"] = rows["dataset"].astype(str) + " " + rows["camera"].astype(str)
     # Missing values of the trial are part of what it is: a comparison without RTE is still one comparison.
-    which = [*KEY, "lag_s", "rte_m", "residual_2d_px", "residual_3d_cm", "trial_median_abs_deg"]
+    which = [*KEY, *_TRIAL_FIELDS, "trial_median_abs_deg"]
     rows["comparison"] = rows.groupby(which, dropna=False, sort=False).ngroup() if len(rows) else []
     return rows
 
@@ -155,7 +152,7 @@ def _trials(rows: Any) -> Any:
     trials = rows.drop_duplicates("comparison").set_index("comparison", drop=False)
     measured = rows[rows["n"] > 0]
     of_opencap = measured[measured["joint"].isin(_OPENCAP)].groupby("comparison")
-    of_paper = measured[measured["joint"].isin(_PAPER_JOINTS)].groupby("comparison")
+    of_paper = measured[measured["joint"].isin(ROWS_PAPER.values())].groupby("comparison")
     methods = zip(trials["detector"].astype(str), trials["solver"].astype(str), strict=True)
     return trials.assign(
         method=[", ".join(filter(None, names)) or "not named" for names in methods],

@@ -112,24 +112,6 @@ JOINTS_OPENCAP: tuple[str, ...] = (
 #: The angles that body rotations of any model give alike (convention "body_rotations").
 JOINTS_CLIP: tuple[str, ...] = (*_HIPS, *_KNEES, *_ANKLES)
 
-#: Row of the paper's tables -> the joint without its side.
-ROWS_PAPER: Mapping[str, str] = {
-    "Hip Flexion": "hip_flexion",
-    "Hip Adduction": "hip_adduction",
-    "Hip Rotation": "hip_rotation",
-    "Knee Flexion": "knee_flexion",
-    "Ankle Angle": "ankle_angle",
-    "Lumbar Extension": "lumbar_extension",
-    "Lumbar Bending": "lumbar_bending",
-    "Lumbar Rotation": "lumbar_rotation",
-    "Neck Extension": "neck_extension",
-    "Neck Bending": "neck_bending",
-    "Neck Rotation": "neck_rotation",
-    "Arm Flex": "arm_flex",
-    "Arm Add": "arm_add",
-    "Elbow Flex": "elbow_flex",
-}
-
 
 def split_side(joint: str) -> tuple[str, str]:
     """`hip_flexion_r` -> (`hip_flexion`, `r`); a joint of the middle has the side ``""``."""
@@ -138,11 +120,21 @@ def split_side(joint: str) -> tuple[str, str]:
     return joint, ""
 
 
+#: Row of the paper's tables -> the joint without its side.
+ROWS_PAPER = {joint.replace("_", " ").title(): joint for joint, _ in map(split_side, JOINTS_PAPER)}
 #: The joints of our body, by its own axes.
 QPOS = "qpos"
 #: Hip, knee and ankle from the rotations of bodies (`body_rotation_angles`), for models that are not ours.
 BODY_ROTATIONS = "body_rotations"
 CONVENTIONS = (QPOS, BODY_ROTATIONS)
+
+
+def check_convention(convention: str, key: str | None = None) -> None:
+    """Raise `PblError` REFERENCE_INPUT for an unknown convention."""
+    if convention not in CONVENTIONS:
+        raise _refused(f"convention {convention!r}", " or ".join(CONVENTIONS), key=key)
+
+
 _FIELDS = ("time_s", "names", "angles_deg", "pelvis_m", "name", "source", "convention")
 
 
@@ -169,8 +161,7 @@ class Reference:
         angles = {k: np.asarray(v, float) for k, v in self.angles_deg.items()}
         object.__setattr__(self, "time_s", time)
         object.__setattr__(self, "angles_deg", angles)
-        if self.convention not in CONVENTIONS:
-            raise _refused(f"convention {self.convention!r}", " or ".join(CONVENTIONS), key=self.name)
+        check_convention(self.convention, self.name)
         if time.ndim != 1 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
             raise _refused("time stamps out of order or not finite", "(T,) increasing seconds", key=self.name)
         for joint, values in angles.items():

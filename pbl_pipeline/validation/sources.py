@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, trial_poses
 
-from .reference import BODY_ROTATIONS, CONVENTIONS, JOINTS_CLIP, QPOS, Reference, body_rotation_angles
+from .reference import BODY_ROTATIONS, JOINTS_CLIP, QPOS, Reference, body_rotation_angles, check_convention
 
 _PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 
@@ -25,7 +25,7 @@ def fit_angles(fit: TrialFit, convention: str = QPOS, poses: BodyPoses | None = 
 
     Raises `PblError` REFERENCE_INPUT (unknown convention), GAIT_INPUT (a fit of another body, or without a frame).
     """
-    _check_convention(convention)
+    check_convention(convention)
     if convention == QPOS:
         return joint_angles(fit.joint_names, fit.qpos)
     poses = poses or trial_poses(fit)
@@ -43,7 +43,7 @@ def fit_angles_sd(fit: TrialFit, convention: str = QPOS) -> dict[str, np.ndarray
 
     For "body_rotations" that of the model's own joint of the same name: its axis is not quite the same.
     """
-    _check_convention(convention)
+    check_convention(convention)
     sd = joint_angles_sd(fit.joint_names, fit.qpos_sd)
     return sd if convention == QPOS else {k: sd[k] for k in JOINTS_CLIP if k in sd}
 
@@ -161,16 +161,6 @@ def _knee_sign(knees: Sequence[np.ndarray]) -> float:
     """+1 where flexion is positive, -1 where it is negative: knees bend further than they overextend."""
     known = [v[np.isfinite(v)] for v in knees if np.any(np.isfinite(v))]
     return -1.0 if known and min(v.min() for v in known) < -max(v.max() for v in known) else 1.0
-
-
-def _check_convention(convention: str) -> None:
-    if convention not in CONVENTIONS:
-        raise PblError(
-            "REFERENCE_INPUT",
-            found=f"convention {convention!r}",
-            expected=" or ".join(CONVENTIONS),
-            next_step="see docs/validation.md, section The reference",
-        )
 
 
 def _unreadable(path: Path, error: Exception, expected: str) -> PblError:

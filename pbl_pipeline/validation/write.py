@@ -36,11 +36,6 @@ def paper_cells(table: str) -> dict[str, dict[str, str]]:
     return paper_figures().get(table, {}).get("cells", {})
 
 
-def paper_where(table: str) -> str:
-    """Place of a table's figures in the paper; "" if it has none."""
-    return paper_figures().get(table, {}).get("where", "")
-
-
 @dataclasses.dataclass(frozen=True)
 class Cell:
     """`value` (`spread`) over `n` trials; `paper` is the paper's figure as printed, or ``""``.
@@ -66,18 +61,16 @@ class Table:
 
     @property
     def rows(self) -> tuple[str, ...]:
-        """Names of the rows, in order."""
         return tuple(dict.fromkeys(row for row, _ in self.cells))
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns, in order."""
         return tuple(dict.fromkeys(column for _, column in self.cells))
 
     @property
     def where(self) -> str:
         """Place of the compared figures in the paper; "" if there are none."""
-        return paper_where(self.name)
+        return paper_figures().get(self.name, {}).get("where", "")
 
     def cell(self, row: str, column: str) -> Cell:
         return self.cells[row, column]

@@ -17,6 +17,7 @@ from research.corpus.true_fit import fit_of_qpos
 from research.corpus.walks import Case, Walk, is_held_out, joined, lasting
 from research.walker.detectors import DETECTORS, DetectorNoise
 from research.walker.observe import observe
+from tests import not_none
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
 TIME_S = np.arange(180) / 30
@@ -237,8 +238,7 @@ def test_a_short_walk_goes_on_stride_by_stride():
     time = np.arange(0, 1.5, 0.01)
     qpos = plain_walk(time, heading_rad=0.0, stride_s=1.1)
     motion = Motion("m", "p", "walk", "", time, qpos, np.ones(40, bool), 0.0, False, "", "", "")
-    longer = lasting(motion, TIME_S)
-    assert longer is not None
+    longer = not_none(lasting(motion, TIME_S))
     x = longer[:, COLUMN["pelvis_tx"]]
     assert (x[-1] - x[0]) / TIME_S[-1] == pytest.approx(1.2, rel=0.02)
     knee = longer[:, COLUMN["knee_angle_r"]]

@@ -225,11 +225,10 @@ def test_the_phone_log_at_the_true_offset_is_the_camera():
     seen = observe(q, TIME_S, camera_motion="handheld", sensor=sensor, seed=6)
     k = seen.keypoints
     assert seen.clock_offset_s == 0.08
-    assert k.phone_time_s is not None
-    assert k.phone_quat_wxyz is not None
-    assert np.allclose(np.diff(k.phone_time_s), 0.01)
-    np.testing.assert_allclose(np.linalg.norm(k.phone_quat_wxyz, axis=1), 1)
-    measured = Slerp(k.phone_time_s, Rotation.from_quat(k.phone_quat_wxyz, scalar_first=True))
+    time_s, quaternion = not_none(k.phone_time_s), not_none(k.phone_quat_wxyz)
+    assert np.allclose(np.diff(time_s), 0.01)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1)
+    measured = Slerp(time_s, Rotation.from_quat(quaternion, scalar_first=True))
     truth = Rotation.from_matrix(seen.R_nc)
 
     def error_deg(offset_s: float) -> float:

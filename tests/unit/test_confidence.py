@@ -1,4 +1,4 @@
-"""What a confidence is worth: curves, the truth that they are fitted to, the table and the page."""
+"""Curves that turn a stated confidence into a probability."""
 
 import dataclasses
 
@@ -15,9 +15,8 @@ from pbl_pipeline.keypoints import (
     probability_within,
 )
 from research.confidence import curve_params
+from tests import not_none
 from tests.unit.test_shortcomings import person
-
-# --- curves that ship -------------------------------------------------------------------------------------------
 
 
 def test_curves_that_ship_are_monotone_and_say_where_they_come_from():
@@ -59,17 +58,7 @@ def test_an_unknown_curve_is_refused_and_none_is_no_curve(tmp_path):
     known.confidence[0, 0] = 0.0
     known.save(tmp_path / "k.npz")
     again = Keypoints.load(tmp_path / "k.npz")
-    probability = probability_within(again)
-    assert probability is not None
+    probability = not_none(probability_within(again))
     assert probability[0, 0] == 0
     np.testing.assert_allclose(probability[1], confidence_curve("blazepose-v1")(np.full(33, 0.9)), atol=1e-5)
     assert "20% of the trunk's length (blazepose-v1)" in confidence_text(again)
-
-
-# --- fitting ----------------------------------------------------------------------------------------------------
-
-
-# --- truth ------------------------------------------------------------------------------------------------------
-
-
-# --- table, page, command ---------------------------------------------------------------------------------------

@@ -93,8 +93,8 @@ def test_events_of_people_it_has_not_seen(changes):
 def test_ankles_at_30_hz_with_20_mm_of_noise():
     truth = truth_of(seed=1, seconds=6.0)
     feet = feet_of(truth)
-    assert feet.legs_m is not None
-    legs = feet.legs_m + 0.02 * np.random.default_rng(0).standard_normal(feet.legs_m.shape)
+    legs = not_none(feet.legs_m).copy()
+    legs += 0.02 * np.random.default_rng(0).standard_normal(legs.shape)
     legs[:, 3:] = np.nan
     error = errors_ms(detect_events(dataclasses.replace(feet, legs_m=legs), PLAIN), truth)
     assert abs(error.mean()) < 22

@@ -11,7 +11,8 @@ from pbl_pipeline.gait.events.network.features import N_FEATURES, features, head
 from pbl_pipeline.gait.events.network.predict import GRID_HZ, Grid, Phases, on_grid
 from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTransformer, load_model, save_model
 from pbl_pipeline.gait.events.phase_filter import crossings, smooth_phases
-from pbl_pipeline.gait.events.walking import turn_deg_per_stride, turning_deg_per_s, walking_stretches
+from pbl_pipeline.gait.events.walking import turn_deg_per_stride, walking_stretches
+from pbl_pipeline.paramset import Paramset
 
 UP = np.array([0.0, 0.0, 1.0])
 SMALL = Architecture(width=16, blocks=1, heads=2, hidden=32)
@@ -176,6 +177,12 @@ def some_phases(n: int, walking: np.ndarray, seen: np.ndarray | None = None) -> 
     return Phases(np.ones((n, 4), complex), walking, np.ones(n, bool) if seen is None else seen)
 
 
+def phases_of(n: int, strides_hz: float) -> Phases:
+    """Phases of a walk with so many strides a second."""
+    phase = 2 * np.pi * strides_hz * np.arange(n) / GRID_HZ
+    return Phases(np.exp(1j * (phase[:, None] - np.arange(4))), np.ones(n), np.ones(n, bool))
+
+
 def test_stretches_end_at_standing_gaps_and_turns():
     n = 1000
     swing = 0.6 * np.sin(2 * np.pi * np.arange(n) / GRID_HZ)
@@ -198,18 +205,12 @@ def test_feet_that_do_not_pass_each_other_do_not_walk():
     assert walking_stretches(still, some_phases(n, np.ones(n)), WalkingParams()) == []
 
 
-def test_turning_is_positive_to_the_left():
-    turn = np.radians(40.0) * np.arange(200) / GRID_HZ
-    np.testing.assert_allclose(turning_deg_per_s(a_grid(200, np.zeros(200), turn))[20:-20], 40.0, atol=0.5)
-
-
 def test_turn_of_a_stride_by_hand():
-    """40 deg/s is 80 deg of a stride at 0.5 strides a second, 32 at 1.25; also at the ends."""
+    """Positive to the left: 40 deg/s is 80 deg of a stride at 0.5 strides a second, 32 at 1.25; also at the ends."""
     n = 400
     turn = np.radians(40.0) * np.arange(n) / GRID_HZ
     for strides_hz, wanted in ((0.5, 80.0), (1.25, 32.0)):
-        phase = 2 * np.pi * strides_hz * np.arange(n) / GRID_HZ
-        phases = Phases(np.exp(1j * (phase[:, None] - np.arange(4))), np.ones(n), np.ones(n, bool))
+        phases = phases_of(n, strides_hz)
         np.testing.assert_allclose(turn_deg_per_stride(a_grid(n, np.zeros(n), turn), phases), wanted, rtol=0.05)
         np.testing.assert_allclose(turn_deg_per_stride(a_grid(n, np.zeros(n)), phases), 0.0, atol=1e-6)
 
@@ -220,8 +221,7 @@ def test_a_bend_ends_a_slow_walk_and_not_a_fast_one():
     turn = np.radians(40.0) * np.clip(np.arange(n) / GRID_HZ - 4.5, 0, 3)
     swing = 0.6 * np.sin(2 * np.pi * np.arange(n) / GRID_HZ)
     for strides_hz, stretches in ((0.5, 2), (1.6, 1)):
-        phase = 2 * np.pi * strides_hz * np.arange(n) / GRID_HZ
-        phases = Phases(np.exp(1j * (phase[:, None] - np.arange(4))), np.ones(n), np.ones(n, bool))
+        phases = phases_of(n, strides_hz)
         found = walking_stretches(a_grid(n, swing, turn), phases, WalkingParams(max_turn_deg_per_stride=30.0))
         assert len(found) == stretches
         assert len(walking_stretches(a_grid(n, swing, turn), phases, WalkingParams())) == 1  # version 1: by time
@@ -230,9 +230,14 @@ def test_a_bend_ends_a_slow_walk_and_not_a_fast_one():
 # --- network
 
 
+@pytest.fixture(scope="module")
+def model() -> PhaseTransformer:
+    """A small network with random weights."""
+    return eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+
+
 @pytest.mark.slow
-def test_the_network_is_saved_and_read_again(tmp_path):
-    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+def test_the_network_is_saved_and_read_again(model, tmp_path):
     save_model(tmp_path / "m.npz", model, {"seed": 3})
     again, about = load_model(tmp_path / "m.npz")
     assert about["seed"] == 3
@@ -244,9 +249,8 @@ def test_the_network_is_saved_and_read_again(tmp_path):
         load_model(tmp_path / "other.npz")
 
 
-def test_frames_that_are_not_seen_do_not_change_the_others_much():
+def test_frames_that_are_not_seen_do_not_change_the_others_much(model):
     """Attention leaves them out; only the convolution of the frames beside them sees their zeros."""
-    model = eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
     x = jax.random.normal(jax.random.key(0), (80, N_FEATURES))
     seen = jnp.arange(80) < 50
     run = eqx.filter_jit(lambda x, seen: model(x, seen))
@@ -257,14 +261,6 @@ def test_frames_that_are_not_seen_do_not_change_the_others_much():
     assert np.abs(everything[:46] - short[:46]).max() > 0.05
 
 
-# --- training data
-
-
-# --- calibration
-
-
 def test_parameters_go_through_the_database_form():
-    from pbl_pipeline.paramset import Paramset
-
     params = PhaseParams("m", "s", filter=FilterParams(rate_noise=2.0))
     assert Paramset.of("gait", "x", 1, params).to(PhaseParams) == params

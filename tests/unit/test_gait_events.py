@@ -33,14 +33,18 @@ def irregular(fps: float, seed: int = 1) -> np.ndarray:
     return np.delete(time, np.arange(5, len(time), 17))
 
 
+def errors_of(feet: gait.FootTrajectories, walker: Walker) -> np.ndarray:
+    """Errors (s) of the events of a walker, without those at the ends."""
+    found, last_s = detect_events(feet), feet.time_s[-1]
+    assert found.status == "PASS"
+    return errors_s(found, walker.events(last_s), 0.5, last_s)
+
+
 @pytest.mark.parametrize("fps", [30.0, 60.0, 120.0])
 @pytest.mark.parametrize("make_time", [regular, irregular])
 def test_events_within_half_a_frame(fps, make_time):
-    time = make_time(fps)
     walker = Walker()
-    found = detect_events(make_feet(time, walker))
-    assert found.status == "PASS"
-    error = errors_s(found, walker.events(time[-1]), 0.5, time[-1])
+    error = errors_of(make_feet(make_time(fps), walker), walker)
     assert len(error) > 20
     assert np.abs(error).max() < 0.5 / 30.0
     assert np.abs(error).mean() < 0.010
@@ -49,12 +53,11 @@ def test_events_within_half_a_frame(fps, make_time):
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 180.0, -47.0])
 @pytest.mark.parametrize("speed", [1.2, 0.0])
 def test_any_heading_and_a_pelvis_that_stands_still(heading_deg, speed):
-    time = regular(30)
     walker = Walker()
-    feet = make_feet(time, walker, heading_deg=heading_deg, speed_m_per_s=speed)
+    feet = make_feet(regular(30), walker, heading_deg=heading_deg, speed_m_per_s=speed)
     expected = [np.cos(np.radians(heading_deg)), np.sin(np.radians(heading_deg)), 0.0]
     np.testing.assert_allclose(feet.forward[30:-30].mean(axis=0), expected, atol=0.03)
-    assert np.abs(errors_s(detect_events(feet), walker.events(time[-1]), 0.5, time[-1])).max() < 0.5 / 30
+    assert np.abs(errors_of(feet, walker)).max() < 0.5 / 30
     if speed == 0:
         assert np.isnan(feet.heading_agreement)
     else:
@@ -65,24 +68,19 @@ def test_a_turn_by_180_degrees():
     time = regular(60)
     walker = Walker()
     turn = 180 / (1 + np.exp(-(time - 4.5) / 0.4))
-    found = detect_events(make_feet(time, walker, heading_deg=turn))
-    assert np.abs(errors_s(found, walker.events(time[-1]), 0.5, time[-1])).max() < 1 / 60
+    assert np.abs(errors_of(make_feet(time, walker, heading_deg=turn), walker)).max() < 1 / 60
 
 
 def test_noise_and_scale():
-    time = irregular(30)
     walker = Walker()
-    found = detect_events(make_feet(time, walker, noise_m=0.012, scale=37.0))
-    error = errors_s(found, walker.events(time[-1]), 0.5, time[-1])
+    error = errors_of(make_feet(irregular(30), walker, noise_m=0.012, scale=37.0), walker)
     assert np.sqrt(np.mean(error**2)) < 0.03
     assert np.abs(error).max() < 0.08
 
 
 def test_asymmetric_walking_keeps_both_sides():
-    time = regular(30)
     walker = Walker(right_delay=0.58)
-    error = errors_s(detect_events(make_feet(time, walker)), walker.events(time[-1]), 0.5, time[-1])
-    assert np.abs(error).max() < 0.5 / 30
+    assert np.abs(errors_of(make_feet(regular(30), walker), walker)).max() < 0.5 / 30
 
 
 def test_probability_falls_with_the_size_of_the_movement():
@@ -117,8 +115,7 @@ def test_a_long_gap_splits_the_bout_a_short_one_does_not():
 
 
 def test_standing_is_empty():
-    time = irregular(30)
-    found = detect_events(make_feet(time, None, speed_m_per_s=0.0, noise_m=0.01))
+    found = detect_events(make_feet(irregular(30), None, speed_m_per_s=0.0, noise_m=0.01))
     assert found.status == "EMPTY"
     assert found.events == ()
     assert "no walking" in found.reason
@@ -148,13 +145,11 @@ def test_one_leg_swinging_is_empty():
 
 
 def test_too_fast_for_walking_is_empty():
-    time = regular(60)
-    assert detect_events(make_feet(time, Walker(stride_s=0.5))).status == "EMPTY"
+    assert detect_events(make_feet(regular(60), Walker(stride_s=0.5))).status == "EMPTY"
 
 
 def test_short_view_is_empty():
-    time = regular(30)[:25]
-    found = detect_events(make_feet(time, Walker()))
+    found = detect_events(make_feet(regular(30)[:25], Walker()))
     assert found.status == "EMPTY"
     assert "1 s at a time" in found.reason
 

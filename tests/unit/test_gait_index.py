@@ -10,6 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     BODY_ANGLES,
     GDI_METHODS,
+    GDI_MODEL,
     GILLETTE_MODEL,
     NINE_ANGLES,
     PAPER_INDEX,
@@ -31,6 +32,7 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 from pbl_pipeline.synthetic.physique import leg_length_m as by_mujoco
+from tests import not_none
 from tests.unit.test_gait_gdi import ABOUT, PERCENT, cycle, toy_vectors
 
 NINE = "gillette-166-nine-angles"
@@ -126,15 +128,13 @@ def test_profile_stands_beside_the_index():
         nine_cycle(norm.mean_deg + 2.0),
         nine_cycle(norm.mean_deg + 5.0, "right"),
     ]
-    result = score_gdi(cycles, norm)
-    assert result.profile is not None
-    assert result.profile.left["knee_flexion"] == pytest.approx(3.0)
-    assert (result.profile.gps_left, result.profile.gps_right) == pytest.approx((3.0, 5.0))
+    profile = not_none(score_gdi(cycles, norm).profile)
+    assert profile.left["knee_flexion"] == pytest.approx(3.0)
+    assert (profile.gps_left, profile.gps_right) == pytest.approx((3.0, 5.0))
     assert score_gdi(cycles[:2], norm).profile is None
-    three = score_gdi([dataclasses.replace(c, angle_model=BODY_ANGLES) for c in cycles])
-    assert three.profile is not None
-    assert set(three.profile.left) == set(THREE_ANGLES)
-    assert three.profile.gps is None
+    three = not_none(score_gdi([dataclasses.replace(c, angle_model=BODY_ANGLES) for c in cycles]).profile)
+    assert set(three.left) == set(THREE_ANGLES)
+    assert three.gps is None
 
 
 def test_radians_are_refused():
@@ -143,7 +143,7 @@ def test_radians_are_refused():
         with pytest.raises(PblError, match="ANGLE_UNITS"):
             score_gdi([nine_cycle(norm.mean_deg * factor)], norm)
         with pytest.raises(PblError, match="ANGLE_UNITS"):
-            fit_norm(toy_vectors() * factor, variables=THREE_ANGLES, percent=PERCENT, **ABOUT)
+            make(toy_vectors() * factor)
 
 
 def test_index_and_norm_must_fit_together():
@@ -154,6 +154,14 @@ def test_index_and_norm_must_fit_together():
         score_gdi(cycles, model="gdi")
 
 
+def make(vectors: np.ndarray, **changes) -> NormativeSet:
+    return fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT, **changes)
+
+
+#: A set of the body's angles.
+OWN = make(toy_vectors(), angle_model=BODY_ANGLES)
+
+
 @pytest.mark.parametrize(
     ("models", "norm", "outcome"),
     [
@@ -162,42 +170,23 @@ def test_index_and_norm_must_fit_together():
         ((BODY_ANGLES, BODY_ANGLES), "gillette-166-three-angles", "WARN"),
         ((BODY_ANGLES, BODY_ANGLES), "gillette-166-body-angles", "PASS"),  # the usual: described with the index
         ((PLUG_IN_GAIT, BODY_ANGLES), NINE, "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), dataclasses.replace(OWN, mapped_from=PLUG_IN_GAIT), "WARN"),
+        ((BODY_ANGLES, BODY_ANGLES), OWN, "PASS"),
     ],
 )
-def test_mixed_conventions_warn(models, norm, outcome):
+def test_mixed_and_mapped_conventions_warn(models, norm, outcome):
     mean = load_norm(NINE).mean_deg
     cycles = [nine_cycle(mean + 3, s, m) for s, m in zip(("left", "right"), models, strict=True)]
     check = next(c for c in score_gdi(cycles, norm).qc if c.check == "norm_convention")
     assert check.outcome == outcome
     assert bool(check.advice) == (outcome == "WARN")
-
-
-def test_another_norm_that_was_mapped_warns():
-    mapped = fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, angle_model=BODY_ANGLES, **ABOUT)
-    mapped = dataclasses.replace(mapped, mapped_from=PLUG_IN_GAIT)
-    cycles = [nine_cycle(load_norm(NINE).mean_deg + 3, s, BODY_ANGLES) for s in ("left", "right")]
-    check = next(c for c in score_gdi(cycles, mapped).qc if c.check == "norm_convention")
-    assert (check.outcome, "mapped" in check.advice) == ("WARN", True)
-
-
-def test_a_norm_of_the_bodys_own_cycles_passes():
-    own = fit_norm(toy_vectors(), variables=THREE_ANGLES, percent=PERCENT, angle_model=BODY_ANGLES, **ABOUT)
-    mean = load_norm(NINE).mean_deg
-    cycles = [nine_cycle(mean + 3, s, BODY_ANGLES) for s in ("left", "right")]
-    check = next(c for c in score_gdi(cycles, own).qc if c.check == "norm_convention")
-    assert check.outcome == "PASS"
-
-
-def make(vectors: np.ndarray, **changes) -> NormativeSet:
-    return fit_norm(vectors, variables=THREE_ANGLES, percent=PERCENT, **ABOUT, **changes)
+    assert ("mapped" in check.advice) == (isinstance(norm, NormativeSet) and bool(norm.mapped_from))
 
 
 def test_no_more_components_than_cycles():
     with pytest.raises(PblError, match="40 vectors for 40 components"):
         make(toy_vectors(40), n_components=40)
     assert len(make(toy_vectors(40), n_components=12).components) == 12
-    with pytest.raises(PblError, match="NORM_INVALID"):
-        make(toy_vectors(12), n_components=20)
 
 
 def test_pooled_components_come_from_patients_too():
@@ -242,15 +231,14 @@ def test_the_papers_index_is_the_mean_over_all_steps_with_nothing_taken_back():
 
 def test_paramsets():
     assert {name: p.version for name, p in GDI_METHODS.items()} == {
-        "pbl-2025-three-angles": 6,
+        GDI_MODEL: 6,
         GILLETTE_MODEL: 1,
         PAPER_INDEX: 1,
     }
     # A row of version 1 is understood as it was.
-    old = score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles", 1)
-    assert (
-        old.params_hash != score_gdi([], "gillette-166-three-angles", GdiParams(), "pbl-2025-three-angles").params_hash
-    )
+    first = GDI_METHODS.make(GDI_MODEL, 1, GdiParams())
+    old, new = (score_gdi([], "gillette-166-three-angles", GdiParams(), model) for model in (first, GDI_MODEL))
+    assert old.params_hash != new.params_hash
 
 
 # --- Normal curves at a person's speed.

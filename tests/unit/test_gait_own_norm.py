@@ -76,10 +76,3 @@ def test_what_makes_no_norm(change, found):
     with pytest.raises(PblError, match="NORM_INVALID") as caught:
         norm_from_cycles(cycles, people, **ABOUT, **more)
     assert found in caught.value.found
-
-
-def test_radians_make_no_norm():
-    cycles, people = made()
-    small = [dataclasses.replace(c, curves={k: np.radians(v) for k, v in c.curves.items()}) for c in cycles]
-    with pytest.raises(PblError, match="ANGLE_UNITS"):
-        norm_from_cycles(small, people, **ABOUT)

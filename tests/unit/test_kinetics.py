@@ -166,6 +166,17 @@ def test_a_gap_splits_the_motion_and_a_short_one_is_none() -> None:
 
 
 # -------------------------------------------------------------------------------------------------------------- ground
+#: Frames of standing on the right foot.
+ON_RIGHT = np.tile([0.0, 1.0], (50, 1))
+
+
+def right_both_left() -> np.ndarray:
+    """Contact (60, 2) of 20 frames each on the right foot, on both and on the left."""
+    contact = np.ones((60, 2))
+    contact[:20, 0] = contact[40:, 1] = 0
+    return contact
+
+
 def event(time_s: float, side: str, kind: str) -> GaitEvent:
     return GaitEvent(time_s, side, f"foot_{kind}", 1.0)
 
@@ -186,9 +197,7 @@ def test_contact_follows_the_events_and_is_unknown_elsewhere() -> None:
 
 
 def test_on_one_foot_that_foot_carries_everything() -> None:
-    motion = still(n=50)
-    d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=50)), ON_RIGHT)
     assert ground.force_n[:, 1, 2] == pytest.approx(np.full(50, GRAVITY))
     assert not ground.force_n[:, 0].any()
     assert np.isnan(ground.centre_m[:, 0]).all()
@@ -196,12 +205,8 @@ def test_on_one_foot_that_foot_carries_everything() -> None:
 
 
 def test_on_both_feet_the_forces_add_up_and_change_over() -> None:
-    n = 60
-    contact = np.ones((n, 2))
-    contact[:20, 0] = 0  # right alone, both, left alone
-    contact[40:, 1] = 0
-    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=n)), contact)
-    assert ground.force_n[:, :, 2].sum(axis=1) == pytest.approx(np.full(n, GRAVITY), abs=1e-9)
+    ground = ground_reaction(BODY, ONE, dynamics_of(still(n=60)), right_both_left())
+    assert ground.force_n[:, :, 2].sum(axis=1) == pytest.approx(np.full(60, GRAVITY), abs=1e-9)
     behind = ground.force_n[20:40, 1, 2]
     assert (np.diff(behind) < 0).all()
     assert behind[0] > 0.8 * GRAVITY > 0.1 * GRAVITY > behind[-1]
@@ -218,10 +223,8 @@ def test_unknown_contact_has_no_force() -> None:
 
 def test_the_centre_of_pressure_stays_under_the_sole() -> None:
     n = 100
-    contact = np.zeros((n, 2))
-    contact[:, 0] = 1
-    contact[[0, -1], 0] = 0
-    contact[[0, -1], 1] = 1
+    contact = np.tile([1.0, 0.0], (n, 1))
+    contact[[0, -1]] = [0.0, 1.0]
     d = dynamics_of(still(n=n))
     ground = ground_reaction(BODY, ONE, d, contact)
     heel = d.xpos[50, BODY.body_names.index("calcn_l")]
@@ -241,21 +244,17 @@ def test_what_is_added_as_feet_land_takes_no_weight() -> None:
 
 
 def test_a_foot_that_lands_does_not_push_backwards_at_once() -> None:
-    motion = still(n=60, hip_flexion_l=0.4, hip_flexion_r=-0.4)
-    contact = np.ones((60, 2))
-    contact[:20, 0] = 0  # right alone and behind, both, left alone
-    contact[40:, 1] = 0
-    ground = ground_reaction(BODY, ONE, dynamics_of(motion), contact)
+    behind = still(n=60, hip_flexion_l=0.4, hip_flexion_r=-0.4)  # the right foot
+    ground = ground_reaction(BODY, ONE, dynamics_of(behind), right_both_left())
     landed = -ground.force_n[:, 0, 0] / ground.force_n[:, 0, 2].clip(1e-6)  # backwards, of the vertical force
     assert landed[21] < 0.6 * landed[39]
 
 
 # -------------------------------------------------------------------------------------------------------------- joints
 def test_moments_of_standing_on_one_leg_by_hand() -> None:
-    n = 50
-    motion = still(n=n)
+    motion = still(n=50)
     d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (n, 1)))
+    ground = ground_reaction(BODY, ONE, d, ON_RIGHT)
     moment, power = leg_moments(BODY, d, ground, motion)
     at = 25
     inertia = segment_inertia(BODY, ONE)
@@ -275,7 +274,7 @@ def test_the_knee_has_the_sign_of_flexion() -> None:
     # Crouching on one leg: the knee is held by its extensors, so its flexing moment is negative.
     motion = still(n=50, hip_flexion_r=0.9, knee_angle_r=-1.4, ankle_angle_r=0.4)
     d = dynamics_of(motion)
-    ground = ground_reaction(BODY, ONE, d, np.tile([0.0, 1.0], (50, 1)))
+    ground = ground_reaction(BODY, ONE, d, ON_RIGHT)
     moment, _ = leg_moments(BODY, d, ground, motion)
     assert MOMENTS[JOINTS.index("knee_angle")] == "knee_flexion"
     assert moment[25, 1, MOMENTS.index("knee_flexion")] < -0.2
@@ -306,8 +305,8 @@ def test_a_walk_has_measures_with_intervals(walk: TrialFit, found: Kinetics) -> 
     by_markers = kinetics_of(dataclasses.replace(walk, orientation_source="measured: calibration")).measures
     peak = by_markers["vertical_peak_loading_bw"]
     assert 0.9 < peak.mean < 1.6
-    assert peak.interval is not None
-    assert peak.interval[0] < peak.mean < peak.interval[1]
+    low, high = not_none(peak.interval)
+    assert low < peak.mean < high
     impulse = found.measures["vertical_impulse_bw_s"]
     # Over a stride both feet carry the weight: half a stride each.
     assert impulse.mean == pytest.approx(0.55, abs=0.05)
@@ -454,6 +453,10 @@ def steps(n: int = N) -> np.ndarray:
     return np.stack([both | left, both | ~left], axis=1)
 
 
+#: Force of the model's persons over such steps.
+USUAL = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
+
+
 def levels(sd: float) -> VerticalModel:
     """A model in which persons differ by a constant force alone."""
     ones = np.ones_like(SHIPPED.phase)
@@ -474,28 +477,23 @@ def test_the_posterior_of_a_constant_is_the_closed_form() -> None:
 
 
 def test_what_is_certain_stays() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    needed = usual + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
+    needed = USUAL + 0.3 * np.sin(2 * np.pi * 1.3 * np.arange(N) / 100)  # another rhythm than that of the steps
     found = vertical_force(needed, steps(), SPEED, SHIPPED, Noise(1e-5, 1.0, 1.0, 1e-3))
     np.testing.assert_allclose(found.mean[::3], needed[::3], atol=1e-3)
     assert np.sqrt(np.mean((found.mean - needed) ** 2)) < 0.02
     assert np.abs(found.draw(np.random.default_rng(0)) - found.mean)[::3].max() < 0.001
 
 
-def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed() -> None:
-    method = METHODS.find()
-    fit = walking_fit(BODY.joint_names, BODY.sha256, n_frames=240, start_m=(6.0, -4.5, -0.2))
-    fit = dataclasses.replace(
-        fit, orientation_source="measured: phone", marker_set="blazepose_33", qpos_sd=np.full_like(fit.qpos, 0.01)
-    )
+def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed(walk: TrialFit) -> None:
+    params = METHODS.find().params
+    fit = dataclasses.replace(walk, marker_set="blazepose_33")
     events = gait_metrics([fit]).trials[0].events.events
 
     def vertical(**changes) -> np.ndarray:
         changed = dataclasses.replace(fit, **changes)
         inertia = segment_inertia(BODY, fit.scale)
-        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, method.params)
-        assert series is not None
-        return series.force_bw[:, :, 2].sum(axis=1)
+        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, params)
+        return not_none(series).force_bw[:, :, 2].sum(axis=1)
 
     needed = vertical(orientation_source="measured: calibration")
     assert np.nanmax(np.abs(vertical() - needed)) > 0.02
@@ -511,22 +509,18 @@ def test_the_models_of_stored_methods_stay(name: str) -> None:
 def test_a_force_unlike_that_of_healthy_people_survives() -> None:
     """A person whose force hardly changes, as few at that speed, keeps most of that."""
     found = vertical_force(np.ones(N), steps(), SPEED, SHIPPED, NOISE)
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    assert np.std(found.mean) < 0.4 * np.std(usual)
+    assert np.std(found.mean) < 0.4 * np.std(USUAL)
 
 
 def test_a_push_off_unlike_that_of_the_persons_of_the_model_survives() -> None:
-    phase = support_phase(steps())
-    usual = np.interp(phase, SHIPPED.phase, SHIPPED.expected(SPEED))
-    lower = -0.2 * np.exp(-0.5 * ((phase - 1.85) / 0.12) ** 2)
-    smoothed = gaussian_filter1d(usual + lower - 1.0, 100 * NOISE.smoothing_s)
+    lower = -0.2 * np.exp(-0.5 * ((support_phase(steps()) - 1.85) / 0.12) ** 2)
+    smoothed = gaussian_filter1d(USUAL + lower - 1.0, 100 * NOISE.smoothing_s)
     found = vertical_force(1.0 + NOISE.gain * smoothed, steps(), SPEED, SHIPPED, NOISE)
-    assert np.sum(lower * (found.mean - usual)) > 0.7 * np.sum(lower**2)
+    assert np.sum(lower * (found.mean - USUAL)) > 0.7 * np.sum(lower**2)
 
 
 def test_the_smoothing_of_a_fit_is_undone() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
-    sharp = usual + 0.1 * np.sin(2 * np.pi * np.arange(N) / 20)  # 5 Hz
+    sharp = USUAL + 0.1 * np.sin(2 * np.pi * np.arange(N) / 20)  # 5 Hz
     known = Noise(3e-3, 0.9, 1.0, 0.03)
     needed = 1.0 + known.gain * gaussian_filter1d(sharp - 1.0, 100 * known.smoothing_s)
     found = vertical_force(needed, steps(), SPEED, SHIPPED, known)
@@ -534,10 +528,9 @@ def test_the_smoothing_of_a_fit_is_undone() -> None:
 
 
 def test_noise_is_weighed_against_people() -> None:
-    usual = np.interp(support_phase(steps()), SHIPPED.phase, SHIPPED.expected(SPEED))
     off = np.repeat(np.random.default_rng(1).normal(0.0, NOISE.sd, N // 6), 6)
-    found = vertical_force(1.0 + NOISE.gain * (usual - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
-    assert np.std(found.mean - usual) < 0.7 * np.std(off)
+    found = vertical_force(1.0 + NOISE.gain * (USUAL - 1.0) + off, steps(), SPEED, SHIPPED, NOISE)
+    assert np.std(found.mean - USUAL) < 0.7 * np.std(off)
 
 
 def test_the_benchmark_compares_only_times_that_the_phone_saw(walk: TrialFit) -> None:

@@ -11,6 +11,7 @@ from pbl_pipeline.keypoints import Keypoints, Picture, PictureMeter, check_keypo
 from pbl_pipeline.keypoints.blazepose import NAMES
 from pbl_pipeline.keypoints.picture import detail_of
 from pbl_pipeline.video import Camera, Frame
+from tests import not_none
 
 SIZE = (720, 1280)
 CAMERA = Camera(np.array([[900.0, 0, 360], [0, 900.0, 640], [0, 0, 1]]), np.zeros(5), "test")
@@ -219,8 +220,7 @@ def test_a_person_out_of_the_picture_is_not_measured():
 
 def test_the_picture_survives_the_file(tmp_path):
     person().save(tmp_path / "k.npz")
-    again = Keypoints.load(tmp_path / "k.npz").picture
-    assert again is not None
+    again = not_none(Keypoints.load(tmp_path / "k.npz").picture)
     np.testing.assert_allclose(again.luma, CLEAN.luma)
     np.testing.assert_allclose(again.detail, CLEAN.detail)
     data = dict(np.load(tmp_path / "k.npz"))

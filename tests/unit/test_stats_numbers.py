@@ -205,10 +205,6 @@ def test_correction_for_many_tests():
     np.testing.assert_allclose(bh[3:10], [0.035625, 0.0603, 0.06385714, 0.06385714, 0.0645, 0.0765, 0.486], atol=1e-8)
 
 
-def test_the_papers_summaries():
-    assert niqr([9, 1, 8, 2, 7, 3, 6, 4, 5]) == pytest.approx(4 * 0.7413)
-
-
 NAN = [1.0, 2.0, np.nan, 4.0, 5.0]
 LINE = [1.0, 2.0, 3.0, 4.0, 5.5]
 FLAT = [2.0] * 5

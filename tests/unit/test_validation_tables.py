@@ -12,7 +12,8 @@ from scipy import stats
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.gait import find_cycles
+from pbl_pipeline.fit import TrialFit
+from pbl_pipeline.gait import GaitCycle, find_cycles
 from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.validation import (
     COLUMNS,
@@ -376,11 +377,17 @@ def test_what_is_printed(capsys: pytest.CaptureFixture[str]):
 # --- curves
 
 
-def test_curves_of_fit_and_reference_are_pairs(tmp_path: Path):
-    """The reference's clock is 40 ms behind, its knees bend 3 degrees more: the pairs differ by just that."""
+@pytest.fixture(scope="module")
+def walk() -> tuple[TrialFit, tuple[GaitCycle, ...]]:
+    """A walk and its cycles."""
     fit = walking_fit(load_body().joint_names, "x", n_frames=240)
     events = [GaitEvent(t, side, event, 1.0, 0) for t, side, event in foot_events(7.5, 0.1)]
-    cycles = find_cycles(events, fit)
+    return fit, find_cycles(events, fit)
+
+
+def test_curves_of_fit_and_reference_are_pairs(walk, tmp_path: Path):
+    """The reference's clock is 40 ms behind, its knees bend 3 degrees more: the pairs differ by just that."""
+    fit, cycles = walk
     truth = reference_of_fit(fit, "x")
     angles = {k: v + 3.0 * k.startswith("knee") for k, v in truth.angles_deg.items()}
     truth = replace(truth, time_s=truth.time_s - 0.04, angles_deg=angles)
@@ -403,10 +410,8 @@ def test_curves_of_fit_and_reference_are_pairs(tmp_path: Path):
         assert data["percent"][[0, -1]].tolist() == [0, 100]
 
 
-def test_cycles_with_holes_give_no_pair():
-    fit = walking_fit(load_body().joint_names, "x", n_frames=240)
-    events = [GaitEvent(t, side, event, 1.0, 0) for t, side, event in foot_events(7.5, 0.1)]
-    cycles = find_cycles(events, fit)
+def test_cycles_with_holes_give_no_pair(walk):
+    fit, cycles = walk
     truth = reference_of_fit(fit, "x")
     holed = {k: np.where((fit.time_s > 3.0) & (fit.time_s < 3.3), np.nan, v) for k, v in truth.angles_deg.items()}
     frame = cycle_curves(fit, replace(truth, angles_deg=holed), cycles)

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS, Check
 
-from .order import PLACE
+from .order import comes_next
 from .types import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
 
 #: Shortest time between two events of a side (s): a swing or a stance; the fastest walkers swing for 0.25 s.
@@ -54,7 +54,7 @@ def check_correction(
         raise _implausible(f"{len(found)} events", f"at most {MOST_EVENTS} of a recording")
     outside = next((e for e in found if not first_s <= e.time_s <= last_s), None)
     if outside is not None:
-        raise _implausible(f"{_said(outside)}", f"a time inside the recording, {first_s:.2f} to {last_s:.2f} s")
+        raise _implausible(_said(outside), f"a time inside the recording, {first_s:.2f} to {last_s:.2f} s")
     left_so = _neighbours([GaitEvent(t, side, event, 1.0) for t, side, event in detected])
     for side in SIDES:
         own = [e for e in found if e.side == side]
@@ -98,7 +98,7 @@ def apply_correction(detected: GaitEvents, events: Sequence[GaitEvent], n_change
         if bouts[-1]:
             last = bouts[-1][-1]
             far = e.time_s - last.time_s > LONGEST_PHASE_S
-            if far or PLACE[e.side, e.event] != (PLACE[last.side, last.event] + 1) % 4:
+            if far or not comes_next(last, e):
                 bouts.append([])
                 breaks += not far
         bouts[-1].append(e)

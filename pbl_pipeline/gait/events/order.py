@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from .types import FOOT_DOWN, LEFT, RIGHT, EventParams
+from .types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, EventParams, GaitEvent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,12 +19,17 @@ class Candidate:
 
 
 #: Place of each event in the cycle; the next event has the next place.
-PLACE = {(LEFT, "foot_down"): 0, (RIGHT, "foot_up"): 1, (RIGHT, "foot_down"): 2, (LEFT, "foot_up"): 3}
+PLACE = {(LEFT, FOOT_DOWN): 0, (RIGHT, FOOT_UP): 1, (RIGHT, FOOT_DOWN): 2, (LEFT, FOOT_UP): 3}
+
+
+def comes_next(a: Candidate | GaitEvent, b: Candidate | GaitEvent) -> bool:
+    """True if `b` is the next event after `a` in the order of walking."""
+    return (PLACE[a.side, a.event] + 1) % 4 == PLACE[b.side, b.event]
 
 
 def follows(a: Candidate, b: Candidate, params: EventParams) -> bool:
     """True where `b` can be the very next event after `a`: next place, phase neither too short nor too long."""
-    if (PLACE[a.side, a.event] + 1) % 4 != PLACE[b.side, b.event]:
+    if not comes_next(a, b):
         return False
     shortest = params.min_swing_s if b.event == FOOT_DOWN else 0.0
     return shortest < b.time_s - a.time_s <= params.max_phase_s

@@ -15,12 +15,13 @@ from pbl_pipeline.qc import PASS, WARN, Check, warn_if
 
 from ._preconditions import check_preconditions, input_error
 from .network.predict import GRID_HZ, check_model, load, predict
+from .order import PLACE, comes_next
 from .phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
-from .types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents, heading_check, no_events
+from .types import FOOT_DOWN, FOOT_UP, GaitEvent, GaitEvents, heading_check, no_events
 from .walking import WalkingParams, reach_leg, swing_leg, turns, walking_stretches
 
 #: Order of the model's phases.
-PHASE_ORDER = ((LEFT, FOOT_DOWN), (RIGHT, FOOT_UP), (RIGHT, FOOT_DOWN), (LEFT, FOOT_UP))
+PHASE_ORDER = tuple(PLACE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,8 +218,4 @@ def _checks(feet: FootTrajectories, events: list[GaitEvent], half_seen: int, tur
 
 def _breaks(events: list[GaitEvent]) -> int:
     """Number of events that do not follow the previous one in the order of walking."""
-    return sum(
-        PHASE_ORDER[(PHASE_ORDER.index((a.side, a.event)) + 1) % 4] != (b.side, b.event)
-        for a, b in itertools.pairwise(events)
-        if a.bout == b.bout
-    )
+    return sum(not comes_next(a, b) for a, b in itertools.pairwise(events) if a.bout == b.bout)

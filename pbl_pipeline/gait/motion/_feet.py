@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.errors import PblError
 
-from ._legs import LEG_JOINTS, BodyPoses, legs_from_points, trial_poses
+from ._legs import LEG_JOINTS, LEG_POINTS, BodyPoses, legs_from_points, trial_poses
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -76,27 +76,13 @@ def _moving_mean(time_s: np.ndarray, values: np.ndarray, window_s: float) -> np.
     return (total[high] - total[low]) / n[:, None]
 
 
-#: Points of a marker set that are read: hips for pelvis and heading, heel and toe, each (left, right).
-_POINTS: dict[str, dict[str, tuple[str, str]]] = {
-    "blazepose_33": {
-        "hip": ("left_hip", "right_hip"),
-        "heel": ("left_heel", "right_heel"),
-        "toe": ("left_foot_index", "right_foot_index"),
-    },
-    # MeTRAbs' 17 joints end at the ankles: the ankle stands for heel and toe. What is lost: toe-off is then the
-    # rearmost ankle, which comes before toe-off because the heel rises first.
-    "mpi_inf_3dhp_17": {
-        "hip": ("left_hip", "right_hip"),
-        "heel": ("left_ankle", "right_ankle"),
-        "toe": ("left_ankle", "right_ankle"),
-    },
-    "bml_movi_87": {
-        "hip": ("LHip", "RHip"),
-        "heel": ("LHeel", "RHeel"),
-        "toe": ("lfirstmetatarsal", "rfirstmetatarsal"),
-    },
-    # Laboratory markers; the anterior spines give the line of the hips.
-    "plug_in_gait": {"hip": ("LASI", "RASI"), "heel": ("LHEE", "RHEE"), "toe": ("LTOE", "RTOE")},
+#: Points of a marker set that are read: hips for pelvis and heading, heel and toe, each (left, right). Of laboratory
+#: markers the anterior spines give the line of the hips. MeTRAbs' 17 joints end at the ankles: the ankle stands for
+#: heel and toe. What is lost: toe-off is then the rearmost ankle, which comes before toe-off because the heel rises
+#: first.
+_POINTS = {
+    marker_set: {part: [own[0] for own in joints.get(part, joints["ankle"])] for part in ("hip", "heel", "toe")}
+    for marker_set, joints in LEG_POINTS.items()
 }
 #: Marker sets that `feet_from_keypoints` and `feet_from_markers` understand.
 FOOT_MARKER_SETS = tuple(_POINTS)
@@ -156,19 +142,12 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
-    hip, knee, ankle, heel, toe = [], [], [], [], []
-    for side in "lr":
-        calcn = poses.index(f"calcn_{side}")
-        knee.append(poses.position_m[:, poses.index(f"tibia_{side}")])
-        ankle.append(poses.position_m[:, poses.index(f"talus_{side}")])
-        hip.append(poses.position_m[:, poses.index(f"femur_{side}")])
-        toe.append(poses.position_m[:, poses.index(f"toes_{side}")])
-        point = _HEEL_IN_CALCN_M * poses.scale_of(f"calcn_{side}", fit.scale)
-        heel.append(poses.position_m[:, calcn] + poses.rotation[:, calcn] @ point)
+    hips, knees, ankles, heels, toes = map(poses.of_sides, ("femur", "tibia", "talus", "calcn", "toes"))
+    for s, name in enumerate(("calcn_l", "calcn_r")):
+        heels[:, s] += poses.rotation[:, poses.index(name)] @ (_HEEL_IN_CALCN_M * poses.scale_of(name, fit.scale))
     confidence = np.full((len(fit.time_s), 2), np.nan)
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    hips, knees, ankles, heels, toes = (np.stack(part, axis=1) for part in (hip, knee, ankle, heel, toe))
     unseen = ~_feet_seen(fit)
     for joint in (knees, ankles, heels, toes):
         joint[unseen] = np.nan

@@ -34,6 +34,10 @@ class BodyPoses:
         """Index of a body in the second axis."""
         return self.body.body_names.index(name)
 
+    def of_sides(self, name: str) -> np.ndarray:
+        """Positions (T, 2, 3) of a body of the [left, right] side."""
+        return self.position_m[:, [self.index(f"{name}_{side}") for side in "lr"]]
+
     def scale_of(self, name: str, scale: np.ndarray) -> float:
         """The multiplier of a body's points."""
         return float(np.asarray(scale)[self.body.scale_index[self.index(name)]])
@@ -89,7 +93,7 @@ def _compiled() -> Any:
 LEG_JOINTS = ("hip", "knee", "ankle", "heel", "toe")
 
 #: joint -> names (left, right) by marker set. Several names are averaged.
-_NAMES: dict[str, dict[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
+LEG_POINTS: dict[str, dict[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
     "blazepose_33": {
         "hip": (("left_hip",), ("right_hip",)),
         "knee": (("left_knee",), ("right_knee",)),
@@ -136,7 +140,7 @@ def legs_from_points(
         unsure = np.asarray(confidence) < MIN_CONFIDENCE  # False for NaN: unknown is not low
         seen = np.where(unsure[..., None], np.nan, seen)
     out = np.full((len(seen), len(LEG_JOINTS), 2, 3), np.nan)
-    for joint, sides in _NAMES.get(marker_set, {}).items():
+    for joint, sides in LEG_POINTS.get(marker_set, {}).items():
         for s, wanted in enumerate(sides):
             if all(name in index for name in wanted):
                 out[:, LEG_JOINTS.index(joint), s] = seen[:, [index[n] for n in wanted]].mean(axis=1)

@@ -6,13 +6,13 @@ import dataclasses
 import functools
 import json
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
-_FILE = Path(__file__).parent / "curves" / "schwartz_2008.json"
+from pbl_pipeline.shipped import shipped_text
+
 #: Acceleration of gravity (m/s^2), which makes speeds comparable between people: v / sqrt(g * leg length).
 GRAVITY = 9.81
 
@@ -40,7 +40,6 @@ class GaitNorm:
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """Names of the angles."""
         return tuple(self.mean_deg)
 
     def curve(
@@ -87,7 +86,7 @@ def harmonic_sum(coefficients: np.ndarray, phase_rad: np.ndarray) -> np.ndarray:
 @functools.cache
 def gait_norm() -> GaitNorm:
     """The norm that ships with the package (`curves/schwartz_2008.json`, written by `build_schwartz.py`)."""
-    raw = json.loads(_FILE.read_text(encoding="utf-8"))
+    raw = json.loads(shipped_text("gait/normative/curves/schwartz_2008.json"))
     return GaitNorm(
         groups=tuple(raw["groups"]),
         speed=np.array(raw["speed"]),

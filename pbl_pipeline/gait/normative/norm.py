@@ -9,13 +9,12 @@ import json
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pbl_pipeline.bounded import parse_json, read_json
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.paramset import canonical_json
+from pbl_pipeline.paramset import canonical_json, structured
 
 #: The original index (Schwartz & Rozumalski 2008): nine angles x 51 points.
 NINE_ANGLES: tuple[str, ...] = (
@@ -262,7 +261,12 @@ def load_norm(name: str = DEFAULT_NORM) -> NormativeSet:
     """
     shipped = not name.endswith(".json")
     if name not in norm_names() if shipped else not Path(name).is_file():
-        raise _unknown(name)
+        raise PblError(
+            "NORM_UNKNOWN",
+            found=f"normative set {name!r}",
+            expected=f"one of {', '.join(norm_names())}, or a .json file of build_norm",
+            next_step="name one of these with --norm",
+        )
     try:
         data = parse_json(_FOLDER.joinpath(name + ".json").read_text(encoding="utf-8")) if shipped else read_json(name)
         checksum = data.pop("sha256")
@@ -301,25 +305,8 @@ def _checksum(data: dict) -> str:
     return hashlib.sha256(canonical_json({k: v for k, v in data.items() if k != "sha256"}).encode()).hexdigest()
 
 
-#: Types of the fields that are not arrays.
-_PLAIN = {
-    **dict.fromkeys(("name", "source", "licence", "convention", "source_sha256", "angle_model", "mapped_from"), str),
-    **dict.fromkeys(("version", "n"), int),
-    **dict.fromkeys(("explained_share", "ln_mean", "ln_sd"), (int, float)),
-}
-
-
 def _from_json(data: dict, checksum: str) -> NormativeSet:
-    values: dict[str, Any] = dict(data, sha256=checksum, variables=tuple(data["variables"]))
-    for name in ("percent", "mean_deg", "components", "explained_variance"):
-        values[name] = np.asarray(data[name], float)
-    values["curves"] = {
-        name: {key: np.asarray(v, float) for key, v in band.items()} for name, band in data["curves"].items()
-    }
-    for name, kind in _PLAIN.items():
-        if name in values and not isinstance(values[name], kind):
-            raise TypeError(f"{name} is {values[name]!r}"[:80])
-    norm = NormativeSet(**values)
+    norm = structured({**data, "sha256": checksum}, NormativeSet)
     bands = [np.stack([band[key] for key in ("percent", "mean_deg", "sd_deg")]) for band in norm.curves.values()]
     numbers = [norm.percent, norm.mean_deg, norm.components, norm.explained_variance, *bands]
     if norm.percent.ndim != 1 or not all(np.isfinite(n).all() for n in [*numbers, norm.ln_mean, norm.ln_sd]):
@@ -347,12 +334,3 @@ def _enough(n: int, k: int) -> None:
         raise _invalid(f"{n} vectors", f"at least {MIN_VECTORS}")
     if k >= n:
         raise _invalid(f"{n} vectors for {k} components", "more normative vectors than components")
-
-
-def _unknown(name: str) -> PblError:
-    return PblError(
-        "NORM_UNKNOWN",
-        found=f"normative set {name!r}",
-        expected=f"one of {', '.join(norm_names())}, or a .json file of build_norm",
-        next_step="name one of these with --norm",
-    )
