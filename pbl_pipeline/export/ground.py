@@ -27,11 +27,8 @@ def write_forces(
     in the air.
 
     `floor_m` (T,): heights subtracted from those of the trial's frames. Times with unknown contact are omitted. The
-    moment about the vertical is not computed and written as 0.
-
-    Raises `PblError` EXPORT_INPUT if there are no forces or the mass is not known (`check_forces`).
+    moment about the vertical is not computed and written as 0. `check_forces` is called before.
     """
-    check_forces(trial)
     assert trial.kinetics is not None
     assert trial.kinetics.series is not None
     assert trial.mass_kg is not None

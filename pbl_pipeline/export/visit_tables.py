@@ -202,7 +202,8 @@ def _curves_wide(cycles: Sequence[_Cycle]) -> Table:
     ]
     for angle, text in ANGLE_NAMES.items():
         values = [c.cycle.curves.get(angle, np.full(n, np.nan)) for c in own]
-        columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", _positive(text)))
+        positive = text.removeprefix("deg, ")
+        columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", positive))
     for name in CURVES:
         values = [({} if c.forces is None else c.forces.curves).get(name, np.full(n, np.nan)) for c in own]
         text = "of the own foot or leg (docs/kinetics.md)"
@@ -226,10 +227,6 @@ def _curves_long(cycles: Sequence[_Cycle]) -> Table:
 
 def _percent(n: int) -> np.ndarray:
     return np.linspace(0.0, 100.0, n)
-
-
-def _positive(text: str) -> str:
-    return text.removeprefix("deg, ")
 
 
 # ------------------------------------------------------------------------------------------------------------ measures

@@ -67,7 +67,6 @@ class Contacts:
     """Targets of the sole's points: P points, N times. `weight` 1/m per axis of the world; `target` m;
     `floor` (N, P): the least height (m)."""
 
-    names: tuple[str, ...]
     target_m: Float[np.ndarray, "N P 3"]
     weight: Float[np.ndarray, "N P 3"]
     floor_m: Float[np.ndarray, "N P"]
@@ -279,7 +278,7 @@ class _Soles:
                 if k:
                     fraction = np.clip((t - own[k - 1].up_s) / (step.down_s - own[k - 1].up_s), 0, 1)
                     floor[:, i] += CLEARANCE_M * np.sin(np.pi * fraction) ** 2
-        return Contacts(tuple(self.names), target, weight, floor)
+        return Contacts(target, weight, floor)
 
     def _spot(self, i: int, step: Step) -> np.ndarray:
         c, s = np.cos(step.heading_rad), np.sin(step.heading_rad)

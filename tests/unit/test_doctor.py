@@ -66,7 +66,7 @@ def test_missing_assets_are_missing_and_the_next_step_is_named(machine):
 
 
 def test_all_there_ends_with_zero(machine, monkeypatch):
-    monkeypatch.setattr(assets, "status", lambda: [assets.AssetStatus(a, a.path, "ok") for a in assets.ASSETS.values()])
+    monkeypatch.setattr(assets, "status", lambda: dict.fromkeys(assets.ASSETS, "ok"))
     result = doctor()
     assert result.exit_code == 0, result.output
     assert result.output.splitlines()[-1] == "Nothing is missing."
