@@ -125,7 +125,7 @@ def test_a_server_unpacked_into_home_counts(machine):
 
 def test_a_runtime_that_does_not_load(machine, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)  # import raises ImportError
-    finding = module._onnx()
+    finding = {f.what: f for f in module.examine()}["ONNX runtime"]
     assert finding.state == module.MISSING
     assert finding.next_step.startswith("pip install onnxruntime")
 

@@ -70,10 +70,19 @@ def walking(time_s: np.ndarray, heading_deg: float = 0.0, start_s: float = 0.0, 
     return values
 
 
+def walk(seconds: float = 6.0, heading_deg: float = 0.0, start_s: float = 0.0, **changes) -> TrialFit:
+    """A body that walks for so long."""
+    time_s = np.arange(0, seconds, 1 / 30)
+    return make_fit(time_s, walking(time_s, heading_deg, start_s), **changes)
+
+
+def standing(seconds: float = 6.0, **changes) -> TrialFit:
+    return make_fit(np.arange(0, seconds, 1 / 30), {}, **changes)
+
+
 def test_feet_of_the_standing_body_by_hand():
     """Positions of the figures added up: pelvis, femur, tibia, talus, calcaneus (x forward, y up, z right)."""
-    time = np.arange(40) / 30
-    feet = feet_from_fit(make_fit(time, {}))
+    feet = feet_from_fit(standing(1.3))
     right = np.array([-0.07219 - 0.00167 - 0.05446, -0.06749 - 0.36555 - 0.48017 - 0.04684, 0.08526 + 0.00884])
     heel = right + np.array([-0.01617, -0.00123, 0.0])
     toe = right + np.array([0.19051, -0.00213, 0.00115])
@@ -85,14 +94,13 @@ def test_feet_of_the_standing_body_by_hand():
     np.testing.assert_allclose(feet.heel_m[5, 1] - feet.pelvis_m[5], world(heel - hip), atol=1e-5)
     np.testing.assert_allclose(feet.toe_m[5, 1] - feet.pelvis_m[5], world(toe - hip), atol=1e-5)
     np.testing.assert_allclose(feet.heel_m[5, 0] * [1, -1, 1], feet.heel_m[5, 1], atol=1e-5)
-    np.testing.assert_allclose(feet.forward, np.tile([1.0, 0, 0], (40, 1)), atol=1e-5)
+    np.testing.assert_allclose(feet.forward, np.tile([1.0, 0, 0], (len(feet.forward), 1)), atol=1e-5)
 
 
 def test_the_foot_grows_with_its_scale():
-    time = np.arange(40) / 30
     scale = np.ones(8)
     scale[load_body().scale_names.index("right_leg_and_foot")] = 1.5
-    plain, scaled = feet_from_fit(make_fit(time, {})), feet_from_fit(make_fit(time, {}, scale=scale))
+    plain, scaled = feet_from_fit(standing()), feet_from_fit(standing(scale=scale))
     length = [np.linalg.norm(f.toe_m - f.heel_m, axis=2)[0] for f in (plain, scaled)]
     np.testing.assert_allclose(length[1] / length[0], [1.0, 1.5], atol=1e-5)
 
@@ -159,9 +167,7 @@ def test_pelvis_curves_belong_to_a_side():
 
 @pytest.mark.parametrize("heading_deg", [0.0, 120.0])
 def test_a_walking_body(heading_deg):
-    time = np.arange(0, 10, 1 / 30)
-    fit = make_fit(time, walking(time, heading_deg))
-    metrics = gait_metrics([fit])
+    metrics = gait_metrics([walk(10, heading_deg)])
     assert metrics.status == "PASS"
     values = metrics.spatiotemporal
     stride, cadence, stance = (
@@ -184,11 +190,8 @@ def test_a_walking_body(heading_deg):
 
 
 def test_a_session_pools_its_trials_and_an_empty_one_takes_no_part():
-    time = np.arange(0, 6, 1 / 30)
-    one = make_fit(time, walking(time))
-    two = make_fit(time, walking(time, 90.0, start_s=0.4), name="back")
-    still = make_fit(time, {}, name="standing")
-    alone, together = gait_metrics([one]), gait_metrics([one, two, still])
+    one, two = walk(), walk(heading_deg=90.0, start_s=0.4, name="back")
+    alone, together = gait_metrics([one]), gait_metrics([one, two, standing(name="standing")])
     n = [alone.gdi.n, together.trials[1].gdi.n]
     assert together.gdi.n == sum(n)
     assert together.trials[2].status == "EMPTY"
@@ -204,8 +207,7 @@ def test_a_session_pools_its_trials_and_an_empty_one_takes_no_part():
      ((40.0, 0.0, 1.0), 0.0, ""), ((-40.0, 0.0, 1.0), 0.0, "")],
 )  # fmt: skip
 def test_legs_that_one_camera_does_not_see_alike_are_not_compared(camera_m, heading_deg, far):
-    time_s = np.arange(0, 10, 1 / 30)
-    fit = make_fit(time_s, walking(time_s, heading_deg), camera_position_m=np.array(camera_m))
+    fit = walk(10, heading_deg, camera_position_m=np.array(camera_m))
     metrics = gait_metrics([fit])
     assert {c.far_leg for c in metrics.trials[0].cycles if c.used} == {far}
     step = not_none(metrics.spatiotemporal["step_time_s"])
@@ -239,8 +241,7 @@ def test_standing_gives_nulls_with_reasons(tmp_path):
 
 
 def test_nothing_is_measured_on_a_fit_that_failed():
-    time = np.arange(0, 6, 1 / 30)
-    fit = make_fit(time, walking(time))
+    fit = walk()
     fine = Check("residual_2d_share_of_body_height", "WARN", 0.03, 0.02, "look")
     failed = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the detector's 3D points disagree")
     assert gait_metrics([fit], fit_checks=[fine]).status == "PASS"
@@ -261,8 +262,7 @@ def test_nothing_is_measured_on_a_fit_that_failed():
 
 
 def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
-    time = np.arange(0, 6, 1 / 30)
-    usual = make_fit(time, walking(time))
+    usual = walk()
     hasty = dataclasses.replace(usual, time_s=usual.time_s * 0.6, name="hasty")
     why = "the cadence is unusual for walking, and no one has accepted it"
     metrics = gait_metrics([hasty])
@@ -288,39 +288,35 @@ def test_an_unusual_cadence_is_measured_only_where_a_person_accepts_it():
 
 
 def test_a_slow_walk_is_measured_with_a_warning():
-    time = np.arange(0, 12, 1 / 30)
-    usual = make_fit(time, walking(time))
+    usual = walk(12)
     metrics = gait_metrics([dataclasses.replace(usual, time_s=usual.time_s * 2.0)])
     assert not_none(metrics.spatiotemporal["cadence_steps_per_min"]).mean < 60.0
     assert [(c.outcome, c.threshold) for c in metrics.checks if c.check == "cadence_plausible"] == [("WARN", 60.0)]
 
 
 def test_the_outcome_counts_what_came_before():
-    time = np.arange(0, 6, 1 / 30)
-    metrics = gait_metrics([make_fit(time, walking(time))])
+    metrics = gait_metrics([walk()])
     assert metrics.outcome == "WARN"
     seen = Check("leg_confidence", "FAIL", 0.1, 0.5, "the legs are hidden")
     judged = metrics.with_checks([seen])
     assert judged.outcome == "FAIL"
     assert judged.to_dict()["session"]["outcome"] == "FAIL"
     assert "FAIL leg_confidence: the legs are hidden" in judged.table()
-    still = gait_metrics([make_fit(time, walking(time)), make_fit(time, {}, name="standing")])
+    still = gait_metrics([walk(), standing(name="standing")])
     assert still.outcome == "WARN"
 
 
 def test_out_of_view_in_the_middle():
-    time = np.arange(0, 12, 1 / 30)
-    fit = make_fit(time, walking(time))
+    fit = walk(12)
     fit.qpos[170:200] = np.nan
     cycles = find_cycles(detect_events(feet_from_fit(fit)), fit)
     assert {c.bout for c in cycles} == {0, 1}
-    assert not [c for c in cycles if c.start_s < time[169] and c.end_s > time[200]]
+    assert not [c for c in cycles if c.start_s < fit.time_s[169] and c.end_s > fit.time_s[200]]
     assert all(c.curves for c in cycles)
 
 
 def test_input_errors():
-    time = np.arange(0, 2, 1 / 30)
-    fit = make_fit(time, {})
+    fit = standing(2)
     with pytest.raises(PblError, match="GAIT_INPUT"):
         gait_metrics([])
     with pytest.raises(PblError, match="GAIT_INPUT"):
@@ -363,8 +359,7 @@ def make_keypoints(fit: TrialFit, marker_set: str, root_relative: bool = True, t
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0])
 def test_keypoints_give_the_events_of_the_fit(tilt_deg):
-    time = np.arange(0, 8, 1 / 30)
-    fit = make_fit(time, walking(time, 90.0))
+    fit = walk(8, 90.0)
     expected = detect_events(feet_from_fit(fit), "zeni-2008")
     found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)), "zeni-2008")
     assert [(e.side, e.event) for e in found.events] == [(e.side, e.event) for e in expected.events]
@@ -378,8 +373,7 @@ def test_keypoints_give_the_events_of_the_fit(tilt_deg):
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0])
 def test_the_event_model_needs_neither_knees_nor_a_level_camera(tilt_deg):
     """Hips, heels and toes instead of all joints, and a camera that is tilted: the same events within half a frame."""
-    time = np.arange(0, 8, 1 / 30)
-    fit = make_fit(time, walking(time, 90.0))
+    fit = walk(8, 90.0)
     expected = detect_events(feet_from_fit(fit))
     found = detect_events(feet_from_keypoints(make_keypoints(fit, "blazepose_33", tilt_deg=tilt_deg)))
     inner = [e for e in expected.events if 0.3 < e.time_s < 7.7]
@@ -390,14 +384,12 @@ def test_the_event_model_needs_neither_knees_nor_a_level_camera(tilt_deg):
 
 
 def test_absolute_keypoints_know_the_way():
-    time = np.arange(0, 8, 1 / 30)
-    keypoints = make_keypoints(make_fit(time, walking(time, 90.0)), "blazepose_33", root_relative=False)
+    keypoints = make_keypoints(walk(8, 90.0), "blazepose_33", root_relative=False)
     assert feet_from_keypoints(keypoints).heading_agreement > 0.99
 
 
 def test_a_turned_phone_is_turned_back():
-    time = np.arange(0, 8, 1 / 30)
-    fit = make_fit(time, walking(time, 90.0))
+    fit = walk(8, 90.0)
     plain = make_keypoints(fit, "blazepose_33")
     # A level camera's orientation: columns are its axes in the world; then rolled by 90 deg as a phone held upright.
     level = np.column_stack([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
@@ -414,35 +406,28 @@ def test_a_turned_phone_is_turned_back():
 
 
 def test_ankles_alone_are_enough_for_events():
-    time = np.arange(0, 8, 1 / 30)
-    fit = make_fit(time, walking(time))
-    found = detect_events(feet_from_keypoints(make_keypoints(fit, "mpi_inf_3dhp_17")))
+    found = detect_events(feet_from_keypoints(make_keypoints(walk(8), "mpi_inf_3dhp_17")))
     assert found.status == "PASS"
     assert len(found.events) >= 20
 
 
 def test_keypoints_without_feet_or_depth_are_refused():
-    time = np.arange(0, 3, 1 / 30)
-    keypoints = make_keypoints(make_fit(time, walking(time)), "blazepose_33")
+    keypoints = make_keypoints(walk(3), "blazepose_33")
     flat = dataclasses.replace(keypoints, xyz_cam_m=np.full_like(keypoints.xyz_cam_m, np.nan))
-    for wrong in (flat, dataclasses.replace(keypoints, marker_set="hands"), _renamed(keypoints)):
+    renamed = dataclasses.replace(keypoints, names=("a", *keypoints.names[1:]))
+    for wrong in (flat, dataclasses.replace(keypoints, marker_set="hands"), renamed):
         with pytest.raises(PblError, match="GAIT_INPUT"):
             feet_from_keypoints(wrong)
     with pytest.raises(PblError, match="GAIT_INPUT"):
-        feet_from_markers(time, ["LHEE"], "plug_in_gait", np.zeros((len(time), 1, 3)))
-
-
-def _renamed(keypoints: Keypoints) -> Keypoints:
-    return dataclasses.replace(keypoints, names=("a", *keypoints.names[1:]))
+        feet_from_markers(np.arange(90) / 30, ["LHEE"], "plug_in_gait", np.zeros((90, 1, 3)))
 
 
 def test_commands(tmp_path):
-    time = np.arange(0, 6, 1 / 30)
-    fit = make_fit(time, walking(time))
+    fit = walk()
     paths = {"fit": tmp_path / "walk.fit.npz", "keypoints": tmp_path / "keypoints.npz", "still": tmp_path / "s.fit.npz"}
     fit.save(paths["fit"])
     make_keypoints(fit, "blazepose_33").save(paths["keypoints"])
-    make_fit(time, {}).save(paths["still"])
+    standing().save(paths["still"])
     run = CliRunner()
     for name in ("fit", "keypoints"):
         out = tmp_path / f"{name}.csv"
@@ -505,8 +490,7 @@ def test_a_foot_out_of_sight_for_a_moment_is_bridged_and_for_longer_is_not():
 
 def test_the_checks_of_the_fit_lie_beside_it(tmp_path):
     """`pbl gait` obeys the session.json of the fit, as `pbl run` and the tables obey its checks."""
-    time = np.arange(0, 6, 1 / 30)
-    fit = make_fit(time, walking(time))
+    fit = walk()
     path, out, beside = tmp_path / "walk.fit.npz", tmp_path / "metrics.json", tmp_path / "session.json"
     fit.save(path)
     run = CliRunner()
@@ -543,19 +527,17 @@ def test_the_checks_of_the_fit_lie_beside_it(tmp_path):
 
 
 def test_an_error_names_the_trial():
-    time = np.arange(0, 4, 1 / 30)
-    good = make_fit(time, walking(time))
-    upside_down = make_fit(time, {**walking(time), "pelvis_list": np.pi}, name="the second")
+    good = walk(4)
+    upside_down = make_fit(good.time_s, {**walking(good.time_s), "pelvis_list": np.pi}, name="the second")
     with pytest.raises(PblError, match="GAIT_INPUT") as error:
         gait_metrics([good, upside_down])
     assert error.value.key == "the second"
 
 
 def test_joints_in_degrees_are_refused():
-    time = np.arange(0, 4, 1 / 30)
-    fit = make_fit(time, walking(time))
+    fit = walk(4)
     with pytest.raises(PblError, match="GAIT_INPUT") as error:
         gait_metrics([fit, dataclasses.replace(fit, name="degrees", qpos=np.degrees(fit.qpos))])
     assert (error.value.key, "radians" in error.value.expected) == ("degrees", True)
-    round_and_round = make_fit(time, {**walking(time), "pelvis_rotation": 20.0})
+    round_and_round = make_fit(fit.time_s, {**walking(fit.time_s), "pelvis_rotation": 20.0})
     assert gait_metrics([round_and_round]).status == "PASS"
