@@ -37,9 +37,10 @@ def session_tables(
     measured = [(t.name, t.measured) for t in trials if t.measured is not None]
     if measured:
         made.append(joined([_events(name, m) for name, m in measured]))
-        of_cycles = {(t.name, c.number): c for t in trials if t.kinetics is not None for c in t.kinetics.cycles}
+        forces = {(t.name, c.number): c for t in trials if t.kinetics is not None for c in t.kinetics.cycles}
+        index = {(name, c.number, c.side): c.gdi for name, m in measured for c in m.gdi.cycles}
         cycles = [
-            _Cycle(name, c, _gdi_of(m.gdi, c), of_cycles.get((name, c.number)))
+            _Cycle(name, c, index.get((name, c.number, c.side), np.nan), forces.get((name, c.number)))
             for name, m in measured
             for c in m.cycles
         ]
@@ -137,10 +138,6 @@ _CYCLE_TIMES = {
     "foot_up_s": "toe-off",
     "end_s": "next initial contact",
 }
-
-
-def _gdi_of(gdi: Gdi, cycle: GaitCycle) -> float:
-    return next((c.gdi for c in gdi.cycles if c.number == cycle.number and c.side == cycle.side), np.nan)
 
 
 def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[Column]:
