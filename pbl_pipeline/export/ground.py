@@ -20,9 +20,7 @@ from .osim import pelvis_rest_m
 from .trial import ExportTrial
 
 
-def write_forces(
-    trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "forces", floor_m: np.ndarray | None = None
-) -> None:
+def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str, floor_m: np.ndarray) -> None:
     """Write the forces of both feet (N) and their points of application (m) in OpenSim's ground, 100 Hz; 0 for a foot
     in the air.
 
@@ -35,9 +33,8 @@ def write_forces(
     s = trial.kinetics.series
     known = np.isfinite(s.force_bw).all(axis=(1, 2))
     centre = s.centre_m.copy()
-    if floor_m is not None:
-        seen = np.isfinite(floor_m)
-        centre[..., 2] -= np.interp(s.time_s, np.asarray(trial.fit.time_s)[seen], floor_m[seen])[:, None]
+    seen = np.isfinite(floor_m)
+    centre[..., 2] -= np.interp(s.time_s, np.asarray(trial.fit.time_s)[seen], floor_m[seen])[:, None]
     force = trial.mass_kg * GRAVITY * s.force_bw @ Y_UP_TO_Z_UP
     centre = np.nan_to_num(centre @ Y_UP_TO_Z_UP)
     columns, names = [s.time_s], ["time"]
@@ -87,7 +84,7 @@ def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
     return names, np.column_stack(values)
 
 
-def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "coordinates") -> None:
+def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str) -> None:
     """Write the 40 joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)

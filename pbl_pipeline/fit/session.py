@@ -26,7 +26,7 @@ from pbl_pipeline.video import undistort_px
 from .params import CostParams, Params, ViewParams
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
 from .rotations import rotation_matrices
-from .units import BODY, FILE, body_metres, check_units, pixel_px
+from .units import BODY, body_metres, check_units, pixel_px
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -186,7 +186,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
     return np.isfinite(points @ np.ones(points.shape[-1]))
 
 
-def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str = FILE) -> tuple[TrialArrays, str]:
+def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str) -> tuple[TrialArrays, str]:
     """The arrays of a trial and the source of its camera's orientation."""
     t, j = len(trial.time_s), len(trial.names)
     if isinstance(trial, WorldMarkers):

@@ -13,16 +13,14 @@ from scipy.stats import multivariate_normal
 
 from pbl_pipeline.body import SCALE_NAMES, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import LEVEL_CAMERA_R_NC, METHODS, ImplicitAdamParams, check_trial, fit_session
+from pbl_pipeline.fit import METHODS, ImplicitAdamParams, check_trial, fit_session
 from pbl_pipeline.fit.checks import _converged
 from pbl_pipeline.fit.initial_pose import root_positions
 from pbl_pipeline.fit.joint_terms import inclination, pose_cost, pose_z, posture
 from pbl_pipeline.fit.keypoint_terms import (
-    in_camera,
     mean_weights,
     offset_m,
     project_px,
-    residual_2d_px,
     residual_3d_cm,
 )
 from pbl_pipeline.fit.priors import learned_poses, pose_prior, scale_precision
@@ -124,19 +122,6 @@ def test_projection_by_hand_and_bounded_behind_the_camera():
 def distance_3d_cm2(x: jax.Array, detected: jax.Array, c: jax.Array, weight: float | jax.Array = 1.0) -> jax.Array:
     """Squared distances of points in a camera's axes, with their mean over the seen markers removed."""
     return square(residual_3d_cm(x - offset_m(x, detected, mean_weights(c, weight * jnp.ones(c.shape))), detected))
-
-
-def test_distances_by_hand():
-    x_world = jnp.array([[4.0, 0.0, 0.0], [4.0, 1.0, 0.0], [4.0, 0.0, 1.0]])
-    x_cam = in_camera(x_world[None], jnp.asarray(LEVEL_CAMERA_R_NC)[None, None], jnp.zeros((1, 1, 3)))[0, 0]
-    moved = x_cam + jnp.array([7.0, 0.0, 0.0])  # as a whole: the centred distance does not see it
-    c = jnp.ones(3)
-    np.testing.assert_allclose(distance_3d_cm2(x_cam, moved, c), 0, atol=1e-3)
-    # Ahead of a level camera: world +y is to the left, world +z up.
-    xy = jnp.array([[960.0, 540.0], [960.0 - 375, 540.0], [960.0, 540.0 - 375 + 3]])
-    np.testing.assert_allclose(square(residual_2d_px(x_cam, xy, jnp.asarray(CAMERA.matrix))), [0, 0, 9], atol=1e-2)
-    weights = mean_weights(jnp.array([0.4, 0.7, 0.0]), jnp.ones(3))
-    np.testing.assert_allclose(offset_m(x_world, 0 * x_world, weights), [[4.0, 0.5, 0.0]], rtol=1e-6)
 
 
 def test_markers_without_weight_do_not_move_the_centre_of_the_others():

@@ -25,11 +25,8 @@ from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide
 from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
-    mean_weights,
-    offset_m,
     project_px,
     residual_2d_px,
-    residual_3d_cm,
 )
 from pbl_pipeline.fit.lanes import begin_of, finish, fit_problem
 from pbl_pipeline.fit.linearised import linearised
@@ -43,7 +40,7 @@ from pbl_pipeline.fit.solvers import linear
 from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
-from pbl_pipeline.fit.term import At, Term, Unknowns, square
+from pbl_pipeline.fit.term import At, Term, Unknowns
 from pbl_pipeline.fit.weights import Weights
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
@@ -448,17 +445,6 @@ def test_second_differences_span_gaps_and_end_with_the_frames_that_count():
     used = np.array([0, 1, 1, 0, 0, 1, 1, 0], bool)
     assert np.flatnonzero(bend_weights(np.arange(8) / 30, used).any(axis=1)).tolist() == [2, 3, 4, 5]
     assert not bend_weights(np.arange(8) / 30, np.zeros(8, bool)).any()
-
-
-def test_depth_counts_by_its_ratio():
-    c = jnp.ones(2)
-    model = jnp.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0]])
-    # Apart by 2 cm across and 6 cm along the camera's axis; centred, each point is off by half of it.
-    detected = model + jnp.array([[0.01, 0.0, 0.03], [-0.01, 0.0, -0.03]])
-    away = offset_m(model, detected, mean_weights(c, jnp.ones(2)))
-    for ratio in (1.0, 0.5):
-        got = square(residual_3d_cm(model - away, detected, ratio))
-        np.testing.assert_allclose(got, [1 + 9 * ratio**2] * 2, rtol=1e-3)
 
 
 def test_distance_in_pixels_of_a_moved_and_turned_camera():
