@@ -34,7 +34,7 @@ from pbl_pipeline.fit.vertical import on_their_feet, vertical
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.synthetic import CORRELATED_NOISE, Noise, Seen
+from pbl_pipeline.synthetic import CORRELATED_NOISE, Noise, Seen, SynthSpec, synthesise
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import person, walk_qpos
@@ -218,6 +218,13 @@ def test_a_phone_in_the_hand_and_its_clock(seed):
     assert trial.phone_clock_offset_s == pytest.approx(seen.clock_offset_s, abs=0.010)
     assert np.rad2deg(np.median(Rotation.from_matrix(turned(trial, seen)).magnitude())) < 1.5
     assert_near(trial, walk(seed), deg=2.8, m=0.04)
+
+
+def test_a_trial_of_pbl_synth():
+    made = synthesise(SynthSpec(seed=3, seconds=4.0, camera="handheld", view="oblique"))
+    trial = fit_session([made.keypoints], ["a"], PARAMSET, "handheld").trials[0]
+    error = np.angle(np.exp(1j * (trial.qpos[:, 3:] - made.truth.qpos[:, 3:])))
+    assert np.rad2deg(np.nanmedian(np.abs(error))) < 3.0
 
 
 def test_a_clock_that_is_known_stays(tmp_path):
