@@ -93,8 +93,8 @@ def test_report_and_metrics_agree_on_the_outcome(
     visit, _ = pipeline.run_visit([chain.small_video(tmp_path, "walk")], tmp_path / "out")
     pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
-    (shown,) = written
-    page = page_of(*shown, "Gait report", None)
+    ((shown, pictures),) = written
+    page = page_of(shown, pictures, "Gait report", None)
     assert visit.judged is not None
     assert content["outcome"] == page["verdict"]["outcome"] == visit.judged.outcome
     assert content["outcome"] == ("FAIL" if outcome == "FAIL" else "WARN")
