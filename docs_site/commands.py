@@ -13,20 +13,18 @@ from pbl_pipeline.cli.command_line import cli
 FOLDER = "reference/commands"
 
 
-def tree() -> Iterator[tuple[str, click.Context]]:
+def tree(
+    command: click.Command = cli, name: str = "pbl", parent: click.Context | None = None
+) -> Iterator[tuple[str, click.Context]]:
     """Full name (`pbl db init`) and context of every command, parents before children."""
-
-    def below(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, click.Context]]:
-        own = name.rsplit(" ", 1)[-1]
-        ctx = click.Context(command, info_name=own, parent=parent, terminal_width=88, max_content_width=88)
-        yield name, ctx
-        if isinstance(command, click.Group):
-            for sub in command.list_commands(ctx):
-                child = command.get_command(ctx, sub)
-                assert child is not None, sub
-                yield from below(child, f"{name} {sub}", ctx)
-
-    yield from below(cli, "pbl", None)
+    own = name.rsplit(" ", 1)[-1]
+    ctx = click.Context(command, info_name=own, parent=parent, terminal_width=88, max_content_width=88)
+    yield name, ctx
+    if isinstance(command, click.Group):
+        for sub in command.list_commands(ctx):
+            child = command.get_command(ctx, sub)
+            assert child is not None, sub
+            yield from tree(child, f"{name} {sub}", ctx)
 
 
 def pages() -> dict[str, str]:

@@ -52,15 +52,6 @@ class Asset:
         return folder() / (self.file or Path(self.member).name)
 
 
-@dataclasses.dataclass(frozen=True)
-class AssetStatus:
-    """State of an asset on this machine: "ok", "missing" or "changed" (other bytes than pinned)."""
-
-    asset: Asset
-    path: Path
-    state: str
-
-
 def _listed() -> dict[str, Asset]:
     content = tomllib.loads(shipped_text("assets.toml"))
     packages: dict[str, Package] = {}
@@ -120,14 +111,14 @@ def fetch(name: str) -> Path:
     return asset.path
 
 
-def status() -> list[AssetStatus]:
-    """The state of every asset on this machine; fetches nothing."""
-    found = []
-    for asset in ASSETS.values():
-        state = "missing"
+def status() -> dict[str, str]:
+    """State of every asset on this machine by name: "ok", "missing" or "changed" (other bytes than pinned); fetches
+    nothing."""
+    found = {}
+    for name, asset in ASSETS.items():
+        found[name] = "missing"
         if asset.path.is_file():
-            state = "ok" if _is_pinned(asset.path, asset.sha256) else "changed"
-        found.append(AssetStatus(asset, asset.path, state))
+            found[name] = "ok" if _is_pinned(asset.path, asset.sha256) else "changed"
     return found
 
 

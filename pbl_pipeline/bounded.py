@@ -203,14 +203,14 @@ def npz_fields(path: str | Path) -> tuple[str, ...]:
         return tuple(m.filename.removesuffix(".npy") for m in archive.infolist())
 
 
-def read_npz(path: str | Path, fields: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Those of `fields` that an .npz file has (None: all), up to `MAX_ARRAYS` together. Others are not unpacked, and
-    nothing is unpickled."""
+def read_npz(path: str | Path, fields: Collection[str]) -> dict[str, np.ndarray]:
+    """Those of `fields` that an .npz file has, up to `MAX_ARRAYS` together. Others are not unpacked, and nothing is
+    unpickled."""
     arrays, room = {}, MAX_ARRAYS
     with opened_zip(path) as archive:
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
-            if fields is None or name in fields:
+            if name in fields:
                 try:
                     arrays[name] = _array(read_member(archive, member, room), room)
                 except ValueError as error:

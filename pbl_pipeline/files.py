@@ -19,11 +19,10 @@ from pbl_pipeline.names import is_plain
 
 #: A shape; None stands for any length.
 Shape = tuple[int | None, ...]
-
-
 #: Largest width or height (px) of a picture that a file names.
 _WIDEST_PX = 100_000
 _unwritable = functools.partial(PblError, "FILE_UNWRITABLE", next_step="pass another place with --out")
+_bad_field = functools.partial(PblError, "FILE_FORMAT", next_step="write the field as docs/files.md describes it")
 
 
 def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:
@@ -82,7 +81,7 @@ def _coded(path: str | Path) -> Iterator[None]:
                 found=f"no readable .npz file ({error})",
                 expected="an .npz file without pickled objects, as docs/files.md describes it",
                 next_step="make one with `pbl detect` or `pbl fit`, or copy it again",
-                key=str(path),
+                key=path,
             ) from error
 
 
@@ -97,59 +96,39 @@ def check_numbers(path: str | Path, data: Mapping[str, np.ndarray], shapes: Mapp
         if fits and array.dtype.kind in "fiub":
             continue
         wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"{name} has shape {array.shape} and type {array.dtype}",
-            expected=f"numbers of shape {wanted}",
-            next_step="write the field as docs/files.md describes it",
-            key=str(path),
-        )
+        found = f"{name} has shape {array.shape} and type {array.dtype}"
+        raise _bad_field(found, f"numbers of shape {wanted}", key=path)
 
 
 def text_of(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> str:
     """A field of a file that is one text. Raises `PblError` FILE_FORMAT."""
     if data[name].ndim == 0:
         return _texts(path, data, name)[0]
-    raise _not_text(path, name, f"shape {data[name].shape}", "one text")
+    raise _bad_field(f"{name}: shape {data[name].shape}", "one text", key=path)
 
 
 def texts_of(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
     """A field of a file that is a list of texts, such as names. Raises `PblError` FILE_FORMAT."""
     if data[name].ndim == 1:
         return _texts(path, data, name)
-    raise _not_text(path, name, f"shape {data[name].shape}", "texts of shape (any)")
+    raise _bad_field(f"{name}: shape {data[name].shape}", "texts of shape (any)", key=path)
 
 
 def _texts(path: str | Path, data: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
     if data[name].size and data[name].dtype.kind != "U":
-        raise _not_text(path, name, f"type {data[name].dtype}", "text")
+        raise _bad_field(f"{name}: type {data[name].dtype}", "text", key=path)
     texts = tuple(map(str, data[name].ravel()))
     if odd := next((t for t in texts if not is_plain(t)), None):
-        raise _not_text(path, name, ascii(odd)[:80], "texts of one line without control characters")
+        expected = "texts of one line without control characters"
+        raise _bad_field(f"{name}: {ascii(odd)[:80]}", expected, key=path)
     return texts
-
-
-def _not_text(path: str | Path, name: str, found: str, expected: str) -> PblError:
-    return PblError(
-        "FILE_FORMAT",
-        found=f"{name}: {found}",
-        expected=expected,
-        next_step="write the field as docs/files.md describes it",
-        key=str(path),
-    )
 
 
 def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
     """Width and height (px) of a picture from the field `image_size_px` of a file. Raises `PblError` FILE_FORMAT."""
     if np.all((size_px >= 1) & (size_px <= _WIDEST_PX)):  # False for NaN
         return int(size_px[0]), int(size_px[1])
-    raise PblError(
-        "FILE_FORMAT",
-        found=f"image_size_px {size_px.tolist()}",
-        expected=f"width and height in px, 1 to {_WIDEST_PX}",
-        next_step="write the field as docs/files.md describes it",
-        key=str(path),
-    )
+    raise _bad_field(f"image_size_px {size_px.tolist()}", f"width and height in px, 1 to {_WIDEST_PX}", key=path)
 
 
 def check_out_folder(path: Path) -> None:

@@ -213,14 +213,14 @@ def draw_overlay(recording: Recording, path: Path) -> None:
     render_overlay(video, recording.fit, path, keypoints=recording.keypoints, events=events)
 
 
-def write_visit_report(path: Path, visit: Visit, title: str = "Gait report", language: str = LANGUAGES[0]) -> Path:
+def write_visit_report(path: Path, visit: Visit, language: str = LANGUAGES[0]) -> Path:
     """Write the report of a visit with pictures from its videos and return its path.
 
     Raises the `PblError`s of `overlay_frames` and `deidentify.to_show`.
     """
     with _as_shown(visit) as shown:
         pictures = {r.name: _pictures(r, r.fit) for r in shown.fitted if r.fit is not None}
-        return write_report(path, shown, pictures, title, None, language)
+        return write_report(path, shown, pictures, language=language)
 
 
 @contextlib.contextmanager

@@ -21,7 +21,6 @@ def walking_fit(
     fps: float = 30.0,
     seen: tuple[int, int] | None = None,
     image_size_px: tuple[int, int] = (640, 360),
-    focal_px: float = 600.0,
     start_m: tuple[float, float, float] = (6.0, -2.2, -0.2),
     speed_m_s: float = 1.2,
     walks: bool = True,
@@ -62,7 +61,7 @@ def walking_fit(
         residual_2d_px=np.full((n_frames, j), 4.0),
         residual_3d_m=np.full((n_frames, j), 0.03),
         camera=Camera(
-            np.array([[focal_px, 0, image_size_px[0] / 2], [0, focal_px, image_size_px[1] / 2], [0, 0, 1]], float),
+            np.array([[600.0, 0, image_size_px[0] / 2], [0, 600.0, image_size_px[1] / 2], [0, 0, 1]]),
             np.zeros(5),
             "guess: a test",
         ),

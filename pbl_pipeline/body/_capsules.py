@@ -50,17 +50,6 @@ class BodyFrames:
     rotation: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True)
-class _Local:
-    """One capsule in its body's frame."""
-
-    name: str
-    body: int
-    start: np.ndarray
-    end: np.ndarray
-    radius: float
-
-
 def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
     """The body's shapes at the poses `qpos` (T, 40) with scale multipliers (8,), lengths and radii scaled alike.
 
@@ -90,15 +79,10 @@ def stature_m(body: Body, scale: np.ndarray) -> float:
 
 def capsule_shapes(body: Body, scale: np.ndarray) -> CapsuleShapes:
     """The body's shapes with scale multipliers (8,), which move with their bodies."""
-    local, own = _local(body), np.asarray(scale, np.float64)[body.scale_index]
-    index = np.array([c.body for c in local])
-    return CapsuleShapes(
-        names=tuple(c.name for c in local),
-        body=index,
-        start=own[index, None] * np.stack([c.start for c in local]),
-        end=own[index, None] * np.stack([c.end for c in local]),
-        radius_m=own[index] * np.array([c.radius for c in local]),
-    )
+    shapes = _unscaled(body)
+    own = np.asarray(scale, np.float64)[body.scale_index[shapes.body]]
+    start, end = own[:, None] * shapes.start, own[:, None] * shapes.end
+    return dataclasses.replace(shapes, start=start, end=end, radius_m=own * shapes.radius_m)
 
 
 def body_frames(body: Body, qpos: np.ndarray, scale: np.ndarray) -> BodyFrames:
@@ -124,7 +108,7 @@ def scaled_model(body: Body, scale: np.ndarray) -> Any:
 
 
 @functools.cache
-def _local(body: Body) -> tuple[_Local, ...]:
+def _unscaled(body: Body) -> CapsuleShapes:
     model, found = body.mj_model, []
     for i in range(model.ngeom):
         rotation = np.empty(9)
@@ -138,8 +122,9 @@ def _local(body: Body) -> tuple[_Local, ...]:
         name, owner = model.geom(i).name, int(model.geom_bodyid[i]) - 1
         for k, (start, end, radius) in enumerate(strands):
             label = name if len(strands) == 1 else f"{name}_{k + 1}"
-            found.append(_Local(label, owner, centre + start, centre + end, radius))
-    return tuple(found)
+            found.append((label, owner, centre + start, centre + end, radius))
+    names, *arrays = zip(*found, strict=True)
+    return CapsuleShapes(names, *map(np.array, arrays))
 
 
 def _strands(axes: np.ndarray, half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, float]]:

@@ -128,9 +128,7 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     if not names:
         raise _format_error("no markers", key=path)
     index = np.array([known.index(b) for b in bodies], np.int32)
-    position_m = np.array(positions, np.float64)
-    index.setflags(write=False)
-    weight_3d = np.array(weights, np.float64)
-    for array in (position_m, weight_3d):
+    position_m, weight_3d = np.array(positions, np.float64), np.array(weights, np.float64)
+    for array in (index, position_m, weight_3d):
         array.setflags(write=False)
     return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m, weight_3d)

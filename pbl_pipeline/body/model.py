@@ -10,7 +10,7 @@ import functools
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import mujoco
@@ -73,11 +73,12 @@ def load_body(path: Path = _MJCF) -> Body:
     The MJCF names its scale groups in texts `scale_group/NAME`, whose data are the bodies of the group; `*` stands for
     all other bodies.
     """
-    xml, model = _c_model(path)
+    xml = path.read_bytes()
+    model = mujoco.MjModel.from_xml_string(xml.decode())
     texts = _texts(model)
+    groups = {k.removeprefix(_GROUP_PREFIX): v for k, v in texts.items() if k.startswith(_GROUP_PREFIX)}
     limited = np.asarray(model.jnt_limited, bool)[:, None]
     names = tuple(model.body(i).name for i in range(1, model.nbody))
-    groups = _scale_groups(texts)
     parent = np.asarray(model.body_parentid[1:], np.int32) - 1
     joint_body = np.asarray(model.jnt_bodyid, np.int32) - 1
     above = np.eye(len(names))
@@ -98,19 +99,9 @@ def load_body(path: Path = _MJCF) -> Body:
         scale_names=tuple(groups),
         scale_index=_frozen(_scale_index(names, groups)),
         sha256=hashlib.sha256(xml).hexdigest(),
-        name=_name(model),
+        name=bytes(model.names).split(b"\0", 1)[0].decode(),
         version=texts["version"],
     )
-
-
-@functools.cache
-def _c_model(path: Path) -> tuple[bytes, mujoco.MjModel]:
-    xml = path.read_bytes()
-    return xml, mujoco.MjModel.from_xml_string(xml.decode())
-
-
-def _scale_groups(texts: dict[str, str]) -> dict[str, str]:
-    return {k.removeprefix(_GROUP_PREFIX): v for k, v in texts.items() if k.startswith(_GROUP_PREFIX)}
 
 
 def _scale_index(body_names: tuple[str, ...], groups: dict[str, str]) -> np.ndarray:
@@ -132,17 +123,13 @@ def _texts(model: mujoco.MjModel) -> dict[str, str]:
     return texts
 
 
-def _name(model: Any) -> str:
-    return bytes(model.names).split(b"\0", 1)[0].decode()
-
-
 def _frozen(array: np.ndarray) -> np.ndarray:
     array.setflags(write=False)
     return array
 
 
 #: The entries of `scale`, as the MJCF lists them: overall first, then the groups.
-SCALE_NAMES: tuple[str, ...] = tuple(_scale_groups(_texts(_c_model(_MJCF)[1])))
+SCALE_NAMES: tuple[str, ...] = load_body().scale_names
 
 
 #: Joints whose angle has the other sign: OpenSim's knee is negative in flexion. Nothing else changes the sign.

@@ -69,10 +69,7 @@ def fit(
     docs/benchmarks.md describes the measurements. A case that fails is a row with the code of its error.
     """
     from pbl_pipeline import bench as b
-    from pbl_pipeline.files import check_out_file
 
-    if json_path is not None:
-        check_out_file(json_path)
     cases = b.fit_cases(method, (1,), (1,), 1, 1) if quick else b.fit_cases(method, trials, batch, seeds, repeat)
     rows = keep("fit", b.run_cases(cases, timeout_s, note=lambda what: click.echo(what, err=True)), json_path)
     click.echo(b.fit_text(rows))
@@ -102,10 +99,7 @@ def detect(
     docs/benchmarks.md describes the measurements.
     """
     from pbl_pipeline import bench as b
-    from pbl_pipeline.files import check_out_file
 
-    if json_path is not None:
-        check_out_file(json_path)
     found = b.run_detect(video, person, repeat, timeout_s, lambda w: click.echo(w, err=True), keypoints)
     rows = keep("detect", found, json_path)
     click.echo("\n\n".join(b.detect_text(row) for row in rows))
@@ -114,9 +108,15 @@ def detect(
 
 
 def keep(benchmark: str, rows: Iterable[Row], path: Path | None) -> list[Row]:
-    """Collect the rows of a benchmark and write them to `path` after each one: a run of hours may be interrupted."""
-    from pbl_pipeline.code_version import code_version
+    """Collect the rows of a benchmark and write them to `path` after each one: a run of hours may be interrupted.
 
+    Raises `PblError` FILE_UNWRITABLE before the first one is asked for.
+    """
+    from pbl_pipeline.code_version import code_version
+    from pbl_pipeline.files import check_out_file
+
+    if path is not None:
+        check_out_file(path)
     begun = datetime.now(UTC).isoformat(timespec="seconds")
     kept: list[Row] = []
     for row in rows:

@@ -101,8 +101,6 @@ def main() -> None:
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
         sys.exit(EXIT_INTERRUPTED)
-    except PblError as error:
-        _explain(error)
     except Exception as error:  # noqa: BLE001 - every error gets a next step instead of a traceback
         _explain(error)
 

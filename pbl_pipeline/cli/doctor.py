@@ -60,12 +60,17 @@ def doctor(fetch: bool) -> None:
 
 def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
     """Collect all findings, in the order of printing. `fetch_errors`: asset -> why it could not be fetched just now."""
-    found = [_python(), *_packages(), _jax_device(), _jax_cache(), _litert(), _onnx(), _codecs(), _database()]
-    found += list(_assets(fetch_errors or {}))
-    found += list(_models())
-    found.append(_folder("cache folder", settings.cache_dir, "PBL_CACHE"))
-    found.append(_folder("home folder", settings.home_dir, "PBL_HOME"))
-    return found
+    return [
+        *(_python(), *_packages()),
+        _loads("JAX device", _jax_device, "pip install --upgrade jax jaxlib"),
+        _loads("compile cache", _jax_cache, "pip install --upgrade jax mujoco-mjx"),
+        _loads("LiteRT", _litert, "pip install ai-edge-litert"),
+        _loads("ONNX runtime", _onnx, "pip install onnxruntime, or correct PBL_ONNX_DEVICE"),
+        _loads("video codecs", _codecs, "pip install av"),
+        *(_database(), *_assets(fetch_errors or {}), *_models()),
+        _folder("cache folder", settings.cache_dir, "PBL_CACHE"),
+        _folder("home folder", settings.home_dir, "PBL_HOME"),
+    ]
 
 
 def _print(found: list[Finding]) -> None:
@@ -126,81 +131,67 @@ def _loads(what: str, check: Callable[[], Finding], next_step: str) -> Finding:
 
 
 def _jax_device() -> Finding:
-    def check() -> Finding:
-        import jax
+    import jax
 
-        devices = jax.devices()
-        detail = f"{devices[0].platform}: {', '.join(sorted({d.device_kind for d in devices}))} ({len(devices)})"
-        if devices[0].platform == "cpu" and (shutil.which("nvidia-smi") or ctypes.util.find_library("cuda")):
-            note = f"{detail}; an NVIDIA GPU is not used"
-            return Finding("JAX device", NOTE, note, "pip install 'pbl-pipeline[gpu]'")
-        return Finding("JAX device", OK, detail)
-
-    return _loads("JAX device", check, "pip install --upgrade jax jaxlib")
+    devices = jax.devices()
+    detail = f"{devices[0].platform}: {', '.join(sorted({d.device_kind for d in devices}))} ({len(devices)})"
+    if devices[0].platform == "cpu" and (shutil.which("nvidia-smi") or ctypes.util.find_library("cuda")):
+        return Finding("JAX device", NOTE, f"{detail}; an NVIDIA GPU is not used", "pip install 'pbl-pipeline[gpu]'")
+    return Finding("JAX device", OK, detail)
 
 
 def _jax_cache() -> Finding:
-    def check() -> Finding:
-        import jax
+    import jax
 
-        from pbl_pipeline import jax_setup
+    from pbl_pipeline import jax_setup
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # its warning is the finding below
-            jax_setup.configure()
-        jax_setup.import_mjx()
-        folder = getattr(jax.config, "jax_compilation_cache_dir", None)
-        if not folder:
-            return Finding("compile cache", NOTE, "off: every start compiles anew", "make PBL_CACHE a writable folder")
-        files = list(Path(folder).glob("*")) if Path(folder).is_dir() else []
-        megabytes = sum(f.stat().st_size for f in files if f.is_file()) / 1e6
-        return Finding("compile cache", OK, f"on: {folder} ({len(files)} files, {megabytes:.1f} MB)")
-
-    return _loads("compile cache", check, "pip install --upgrade jax mujoco-mjx")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # its warning is the finding below
+        jax_setup.configure()
+    jax_setup.import_mjx()
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if not folder:
+        return Finding("compile cache", NOTE, "off: every start compiles anew", "make PBL_CACHE a writable folder")
+    files = list(Path(folder).glob("*")) if Path(folder).is_dir() else []
+    megabytes = sum(f.stat().st_size for f in files if f.is_file()) / 1e6
+    return Finding("compile cache", OK, f"on: {folder} ({len(files)} files, {megabytes:.1f} MB)")
 
 
 def _litert() -> Finding:
-    def check() -> Finding:
-        from ai_edge_litert.interpreter import Interpreter
+    from ai_edge_litert.interpreter import Interpreter
 
-        detail = f"ai-edge-litert {version('ai-edge-litert')}"
-        try:
-            detector = assets.ASSETS["blazepose_detector"].path
-        except PblError:  # no cache folder, which is another finding
-            detector = None
-        if detector is None or not detector.is_file():
-            return Finding("LiteRT", OK, f"{detail}; not tried, no model here yet")
-        model = Interpreter(model_path=str(detector), num_threads=1)
-        model.allocate_tensors()
-        shape = model.get_input_details()[0]["shape"].tolist()
-        return Finding("LiteRT", OK, f"{detail}; loads the person detector, input {shape}")
-
-    return _loads("LiteRT", check, "pip install ai-edge-litert")
+    detail = f"ai-edge-litert {version('ai-edge-litert')}"
+    try:
+        detector = assets.ASSETS["blazepose_detector"].path
+    except PblError:  # no cache folder, which is another finding
+        detector = None
+    if detector is None or not detector.is_file():
+        return Finding("LiteRT", OK, f"{detail}; not tried, no model here yet")
+    model = Interpreter(model_path=str(detector), num_threads=1)
+    model.allocate_tensors()
+    shape = model.get_input_details()[0]["shape"].tolist()
+    return Finding("LiteRT", OK, f"{detail}; loads the person detector, input {shape}")
 
 
 def _onnx() -> Finding:
     """Check the execution providers of ONNX models, and which of them will be used."""
+    import onnxruntime
 
-    def check() -> Finding:
-        import onnxruntime
+    from pbl_pipeline import models
 
-        from pbl_pipeline import models
-
-        there = models.available_devices()
-        detail = f"{onnxruntime.__version__}: {', '.join(there)}"
-        asked = models.asked_device()
-        try:
-            models.providers_for(asked)
-        except PblError as error:
-            return Finding("ONNX runtime", MISSING, f"{detail}; {asked} is requested", error.next_step)
-        if "cuda" in there:
-            return Finding("ONNX runtime", OK, f"{detail}; {asked}: `pbl models verify` checks that CUDA starts")
-        if shutil.which("nvidia-smi") and asked != "cpu":
-            remedy = "pip uninstall onnxruntime && pip install onnxruntime-gpu"
-            return Finding("ONNX runtime", NOTE, f"{detail}; an NVIDIA GPU is not used, models run on the CPU", remedy)
-        return Finding("ONNX runtime", OK, f"{detail}; models run on the CPU")
-
-    return _loads("ONNX runtime", check, "pip install onnxruntime, or correct PBL_ONNX_DEVICE")
+    there = models.available_devices()
+    detail = f"{onnxruntime.__version__}: {', '.join(there)}"
+    asked = models.asked_device()
+    try:
+        models.providers_for(asked)
+    except PblError as error:
+        return Finding("ONNX runtime", MISSING, f"{detail}; {asked} is requested", error.next_step)
+    if "cuda" in there:
+        return Finding("ONNX runtime", OK, f"{detail}; {asked}: `pbl models verify` checks that CUDA starts")
+    if shutil.which("nvidia-smi") and asked != "cpu":
+        remedy = "pip uninstall onnxruntime && pip install onnxruntime-gpu"
+        return Finding("ONNX runtime", NOTE, f"{detail}; an NVIDIA GPU is not used, models run on the CPU", remedy)
+    return Finding("ONNX runtime", OK, f"{detail}; models run on the CPU")
 
 
 def _models() -> Iterator[Finding]:
@@ -216,23 +207,20 @@ def _models() -> Iterator[Finding]:
 
 
 def _codecs() -> Finding:
-    def check() -> Finding:
-        import av
-        from av.codec.codec import Codec, UnknownCodecError
+    import av
+    from av.codec.codec import Codec, UnknownCodecError
 
-        lacking = []
-        for name in ("h264", "hevc", "vp9", "libx264"):
-            try:
-                Codec(name, "w" if name == "libx264" else "r")
-            except UnknownCodecError:
-                lacking.append(name)
-        detail = f"PyAV {av.__version__}, libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))}"
-        if lacking:
-            remedy = "pip install --force-reinstall --only-binary=av av"
-            return Finding("video codecs", MISSING, f"{detail} lacks {', '.join(lacking)}", remedy)
-        return Finding("video codecs", OK, f"{detail}: reads H.264, HEVC, VP9; writes H.264")
-
-    return _loads("video codecs", check, "pip install av")
+    lacking = []
+    for name in ("h264", "hevc", "vp9", "libx264"):
+        try:
+            Codec(name, "w" if name == "libx264" else "r")
+        except UnknownCodecError:
+            lacking.append(name)
+    detail = f"PyAV {av.__version__}, libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))}"
+    if lacking:
+        remedy = "pip install --force-reinstall --only-binary=av av"
+        return Finding("video codecs", MISSING, f"{detail} lacks {', '.join(lacking)}", remedy)
+    return Finding("video codecs", OK, f"{detail}: reads H.264, HEVC, VP9; writes H.264")
 
 
 # --- what lies around it
@@ -260,25 +248,23 @@ def _database() -> Finding:
 
 def _assets(errors: dict[str, PblError]) -> Iterator[Finding]:
     try:
-        items = assets.status()
+        states = assets.status()
     except PblError as error:
         yield Finding("assets", MISSING, error.found, error.next_step)
         return
-    for item in items:
-        asset, where = item.asset, f"{item.path}"
-        if item.state == "ok":
-            yield Finding(asset.name, OK, f"{where} ({asset.licence})")
-            continue
-        error = errors.get(asset.name)
+    for name, found in states.items():
+        asset = assets.ASSETS[name]
         state = NOTE if asset.optional else MISSING
-        detail = f"{where} has other bytes than pinned" if item.state == "changed" else f"{asset.what}: not fetched yet"
-        if asset.optional:
-            detail += ", not needed by the default methods"
-        if error is not None:
-            yield Finding(asset.name, state, error.found, error.next_step)
+        if found == "ok":
+            yield Finding(name, OK, f"{asset.path} ({asset.licence})")
+        elif (error := errors.get(name)) is not None:
+            yield Finding(name, state, error.found, error.next_step)
         else:
+            changed = f"{asset.path} has other bytes than pinned"
+            detail = changed if found == "changed" else f"{asset.what}: not fetched yet"
+            detail += ", not needed by the default methods" if asset.optional else ""
             size = asset.package.size_bytes / 1e6
-            yield Finding(asset.name, state, detail, f"`pbl doctor --fetch` ({size:.0f} MB from the package registry)")
+            yield Finding(name, state, detail, f"`pbl doctor --fetch` ({size:.0f} MB from the package registry)")
 
 
 def _folder(what: str, where: Callable[[], Path], variable: str) -> Finding:

@@ -7,14 +7,6 @@ from pathlib import Path
 import click
 
 
-class _Impairment(click.ParamType):
-    name = "NAME[:SEVERITY[:SIDE]]"
-
-
-class _Speed(click.ParamType):
-    name = "M/S|GROUP"
-
-
 @click.command(
     epilog="Example: pbl synth --out trials --seed 3 --impairment crouch:0.7 --view sagittal --camera handheld"
 )
@@ -30,7 +22,7 @@ class _Speed(click.ParamType):
 @click.option(
     "--impairment",
     "impairments",
-    type=_Impairment(),
+    metavar="NAME[:SEVERITY[:SIDE]]",
     multiple=True,
     help="crouch, stiff_knee, drop_foot, short_steps, weakness, trunk_sway or widened_base, with a severity of 0 to 1 "
     "(default 1) and right, left or both, where it may be on one side. Repeat for several.",
@@ -48,7 +40,9 @@ class _Speed(click.ParamType):
 @click.option("--marker-set", default="bml_movi_87", show_default=True, help="Points of the detector.")
 @click.option("--seconds", type=float, help="Default: 5 for walk, standing; 10 for others; whole tug, four_square.")
 @click.option("--fps", type=float, default=30.0, show_default=True)
-@click.option("--speed", type=_Speed(), help="m/s, or very_slow, slow, free, fast, very_fast (default: the person's).")
+@click.option(
+    "--speed", metavar="M/S|GROUP", help="m/s, or very_slow, slow, free, fast, very_fast (default: the person's)."
+)
 @click.option("--ground", type=click.Choice(["overground", "treadmill"]), default="overground", show_default=True)
 @click.option("--noise", type=click.Choice(["benchmark", "memory", "none"]), default="benchmark", show_default=True)
 def synth(

@@ -29,12 +29,12 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     """Write points (mm), 4x4 poses of the bodies, events, and the phone's sensors if the trial has its log.
 
     The axes are those of our world: z up. A C3D has one rate: frames at uneven times are interpolated to their median
-    rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN.
+    rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN. `check_frames` is
+    called before.
 
-    Raises `PblError` PACKAGE_MISSING without ezc3d; EXPORT_INPUT for a trial with more than 65,535 frames.
+    Raises `PblError` PACKAGE_MISSING without ezc3d.
     """
     ezc3d: Any = needed("ezc3d.ezc3d", "export", "writing C3D files")
-    check_frames(trial)
     even = trial.even
     file = _Parameters(ezc3d)
     # In this order: ezc3d accepts no further channel once it knows the rate of the points.

@@ -117,9 +117,6 @@ class Table:
     def __len__(self) -> int:
         return len(self.columns[0].values)
 
-    def __getitem__(self, name: str) -> np.ndarray | Labels:
-        return next(c.values for c in self.columns if c.name == name)
-
 
 def joined(parts: Sequence[Table]) -> Table:
     """Concatenate tables of the same name and columns. Columns that a part lacks are missing there."""

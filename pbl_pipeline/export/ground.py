@@ -20,27 +20,21 @@ from .osim import pelvis_rest_m
 from .trial import ExportTrial
 
 
-def write_forces(
-    trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "forces", floor_m: np.ndarray | None = None
-) -> None:
+def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str, floor_m: np.ndarray) -> None:
     """Write the forces of both feet (N) and their points of application (m) in OpenSim's ground, 100 Hz; 0 for a foot
     in the air.
 
     `floor_m` (T,): heights subtracted from those of the trial's frames. Times with unknown contact are omitted. The
-    moment about the vertical is not computed and written as 0.
-
-    Raises `PblError` EXPORT_INPUT if there are no forces or the mass is not known (`check_forces`).
+    moment about the vertical is not computed and written as 0. `check_forces` is called before.
     """
-    check_forces(trial)
     assert trial.kinetics is not None
     assert trial.kinetics.series is not None
     assert trial.mass_kg is not None
     s = trial.kinetics.series
     known = np.isfinite(s.force_bw).all(axis=(1, 2))
     centre = s.centre_m.copy()
-    if floor_m is not None:
-        seen = np.isfinite(floor_m)
-        centre[..., 2] -= np.interp(s.time_s, np.asarray(trial.fit.time_s)[seen], floor_m[seen])[:, None]
+    seen = np.isfinite(floor_m)
+    centre[..., 2] -= np.interp(s.time_s, np.asarray(trial.fit.time_s)[seen], floor_m[seen])[:, None]
     force = trial.mass_kg * GRAVITY * s.force_bw @ Y_UP_TO_Z_UP
     centre = np.nan_to_num(centre @ Y_UP_TO_Z_UP)
     columns, names = [s.time_s], ["time"]
@@ -90,7 +84,7 @@ def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
     return names, np.column_stack(values)
 
 
-def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "coordinates") -> None:
+def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str) -> None:
     """Write the 40 joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline.csv_cells import quoted
-from pbl_pipeline.errors import PblError
 
 from .columns import lines, number_cells
 from .trial import ExportTrial
@@ -17,19 +16,9 @@ from .trial import ExportTrial
 
 def write_keypoints_csv(trial: ExportTrial, path: Path) -> None:
     """Write pixels of the upright picture (x right, y down, origin at its upper left corner) and the detector's
-    confidence (`likelihood`). One row per frame, number first; a point that was not seen has empty cells.
-
-    Raises `PblError` EXPORT_INPUT for a trial without keypoints.
-    """
+    confidence (`likelihood`). One row per frame, number first; a point that was not seen has empty cells."""
     points = trial.keypoints
-    if points is None:
-        raise PblError(
-            "EXPORT_INPUT",
-            found="a fit without its keypoints",
-            expected="the keypoints.npz of the trial beside the fit, named alike",
-            next_step="put the keypoints of `pbl detect` or `pbl run` beside the fit, or leave out --to dlc",
-            key=trial.name,
-        )
+    assert points is not None  # `write_export` has checked it
     n, j = points.xy_px.shape[:2]
     scorer = f"pbl_{points.marker_set}"
     head = [

@@ -29,7 +29,7 @@ from .columns import lines, number_cells
 from .trial import ExportTrial, site_positions, wanted_markers
 
 
-def write_trc(trial: ExportTrial, path: Path, title: str = "markers") -> None:
+def write_trc(trial: ExportTrial, path: Path, title: str) -> None:
     """Write the fitted markers in mm, in OpenSim's ground: x as ours, y up, z = -y of our world.
 
     Frames without a known marker are omitted, because OpenSim's inverse kinematics stops at them; a single unknown
@@ -77,7 +77,7 @@ _JOINTS = {
 _FREE_RAD, _FREE_M = 2 * np.pi, 100.0
 
 
-def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str = "pbl_body") -> None:
+def write_osim(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str) -> None:
     """Write the scaled body with the fitted markers as an OpenSim 4 model.
 
     Lengths are scaled as in the fit. If the person's mass is known, masses, centres and inertias are those of the

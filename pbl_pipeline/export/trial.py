@@ -93,11 +93,6 @@ class EvenTrial:
     position_m: np.ndarray  # (N, B, 3) of the bodies
     rotation: np.ndarray  # (N, B, 3, 3) body to world
 
-    @property
-    def time_s(self) -> np.ndarray:
-        """(N,) times of the frames."""
-        return (self.first + np.arange(len(self.markers_m))) / self.rate_hz
-
 
 def wanted_markers(trial: ExportTrial) -> MarkerSet:
     """Positions of the fit's markers on the body.

@@ -37,9 +37,10 @@ def session_tables(
     measured = [(t.name, t.measured) for t in trials if t.measured is not None]
     if measured:
         made.append(joined([_events(name, m) for name, m in measured]))
-        of_cycles = {(t.name, c.number): c for t in trials if t.kinetics is not None for c in t.kinetics.cycles}
+        forces = {(t.name, c.number): c for t in trials if t.kinetics is not None for c in t.kinetics.cycles}
+        index = {(name, c.number, c.side): c.gdi for name, m in measured for c in m.gdi.cycles}
         cycles = [
-            _Cycle(name, c, _gdi_of(m.gdi, c), of_cycles.get((name, c.number)))
+            _Cycle(name, c, index.get((name, c.number, c.side), np.nan), forces.get((name, c.number)))
             for name, m in measured
             for c in m.cycles
         ]
@@ -139,10 +140,6 @@ _CYCLE_TIMES = {
 }
 
 
-def _gdi_of(gdi: Gdi, cycle: GaitCycle) -> float:
-    return next((c.gdi for c in gdi.cycles if c.number == cycle.number and c.side == cycle.side), np.nan)
-
-
 def _cycle_keys(cycles: Sequence[tuple[str, GaitCycle]], each: int = 1) -> list[Column]:
     return [
         Column("trial", _repeated([n for n, _ in cycles], each), "", _TRIAL),
@@ -202,7 +199,8 @@ def _curves_wide(cycles: Sequence[_Cycle]) -> Table:
     ]
     for angle, text in ANGLE_NAMES.items():
         values = [c.cycle.curves.get(angle, np.full(n, np.nan)) for c in own]
-        columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", _positive(text)))
+        positive = text.removeprefix("deg, ")
+        columns.append(Column(f"{angle}_deg", np.concatenate([*values, np.zeros(0)]), "deg", positive))
     for name in CURVES:
         values = [({} if c.forces is None else c.forces.curves).get(name, np.full(n, np.nan)) for c in own]
         text = "of the own foot or leg (docs/kinetics.md)"
@@ -226,10 +224,6 @@ def _curves_long(cycles: Sequence[_Cycle]) -> Table:
 
 def _percent(n: int) -> np.ndarray:
     return np.linspace(0.0, 100.0, n)
-
-
-def _positive(text: str) -> str:
-    return text.removeprefix("deg, ")
 
 
 # ------------------------------------------------------------------------------------------------------------ measures

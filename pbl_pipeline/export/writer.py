@@ -27,7 +27,7 @@ from pbl_pipeline.visit import Visit
 
 from .bids import Labels, bids_files, check_labels
 from .c3d import check_frames, write_c3d
-from .columns import Table, dictionary, write_csv, write_parquet
+from .columns import dictionary, write_csv, write_parquet
 from .ground import check_forces, on_floor, taken_off, write_forces, write_mot
 from .keypoints_csv import write_keypoints_csv
 from .osim import write_osim, write_trc
@@ -240,17 +240,12 @@ def _write_tables(
     if not {"csv", "parquet"} & set(formats):
         return []
     tables, paths = session_tables(trials, visit.measures, visit.kinetics), []
-
-    def parquet(table: Table) -> Callable[[Path], object]:
-        return lambda path: write_parquet(table, path, about)
-
-    def csv(table: Table) -> Callable[[Path], object]:
-        return lambda path: write_csv(table, path)
-
     for table in tables:
-        paths += [_written(out / f"{table.name}.csv", csv(table))] if "csv" in formats else []
-        paths += [_written(out / f"{table.name}.parquet", parquet(table))] if "parquet" in formats else []
-    return [*paths, _written(out / "data_dictionary.csv", csv(dictionary(tables)))]
+        if "csv" in formats:
+            paths.append(_written(out / f"{table.name}.csv", functools.partial(write_csv, table)))
+        if "parquet" in formats:
+            paths.append(_written(out / f"{table.name}.parquet", functools.partial(write_parquet, table, about=about)))
+    return [*paths, _written(out / "data_dictionary.csv", functools.partial(write_csv, dictionary(tables)))]
 
 
 def _written(path: Path, write: Callable[[Path], object]) -> Path:

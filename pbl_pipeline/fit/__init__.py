@@ -11,7 +11,7 @@ from .params import (
     ViewParams,
 )
 from .results import SessionFit, TrialFit
-from .session import LEVEL_CAMERA_R_NC, Trial
+from .session import Trial
 from .session_fit import (
     SessionInput,
     check_trial,

@@ -6,9 +6,8 @@ is slower by a factor of ten and more where cores are shared (measured: 110 ms b
 
 from __future__ import annotations
 
-import contextlib
 import functools
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 from threadpoolctl import ThreadpoolController
 
@@ -20,8 +19,6 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-@contextlib.contextmanager
-def one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> AbstractContextManager[object]:
     """One thread per call of BLAS and LAPACK inside the block."""
-    with _controller().limit(limits=1, user_api="blas"):
-        yield
+    return _controller().limit(limits=1, user_api="blas")

@@ -16,10 +16,8 @@ from .shared_terms import CLOCK, DETECTOR, FLOOR, LOFFSET, SCALE, SIZE
 from .term import At, SharedTerm, Term
 
 AnyTerm = Term | SharedTerm
-#: Of points seen by a detector or a laboratory.
-KEYPOINTS = (L3D, L_MARKERS, L2D)
 #: The paper's own terms; markers of a laboratory count as its L3D.
-PAPER = (*KEYPOINTS, LPHONE, LOFFSET)
+PAPER = (L3D, L_MARKERS, L2D, LPHONE, LOFFSET)
 #: Those that need no neighbouring frames: what a random draw of frames can be fitted by.
 OF_SINGLE_FRAMES: tuple[AnyTerm, ...] = (*PAPER, POSE_PRIOR, SCALE)
 #: All of them.

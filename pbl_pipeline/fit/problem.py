@@ -247,7 +247,7 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
     quats, starts = _phone_samples(trials, n, coarse)
     soles = sum(name in body.body_names for name, _ in SOLES)
     arrays: dict[str, Any] = {
-        "weight_3d": _padded(markers.weight_3d, size),
+        "weight_3d": np.pad(markers.weight_3d, (0, size - n_markers)),
         "time_s": rows(lambda t: t.time_s - t.time_s[0]),
         "weight": rows(lambda t: t.used),
         "x_cam": rows(lambda t: t.x_cam, 2),
@@ -265,8 +265,8 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
         "contact": np.zeros((frames, soles)),
         "pelvis": np.zeros((frames, 2)),
         "c_pelvis": np.zeros(frames),
-        "has_phone": _padded([float(t.phone_time_s is not None) for t in trials], n),
-        "clock_sd_s": _padded([0.0 if math.isnan(t.phone_clock_sd_s) else t.phone_clock_sd_s for t in trials], n),
+        "has_phone": np.pad([t.phone_time_s is not None for t in trials], (0, n - len(trials))),
+        "clock_sd_s": np.pad(np.nan_to_num([t.phone_clock_sd_s for t in trials]), (0, n - len(trials))),
         "sample_quat_wxyz": quats,
         "sample_start_s": starts,
         "sample_step_s": np.asarray(SAMPLE_S),
@@ -276,13 +276,6 @@ def pack(trials: Sequence[TrialArrays], body: Body, markers: MarkerSet) -> Probl
     lengths[-1] += frames - sum(lengths)  # padding belongs to the last trial
     arrays["trial"] = np.repeat(np.arange(len(trials), dtype=np.int32), lengths)
     return Problem(points=point_table(body, markers, size), **arrays)
-
-
-def _padded(values: Sequence[float] | np.ndarray, n: int) -> np.ndarray:
-    """(n,): the values, then zeros."""
-    out = np.zeros(n, np.float32)
-    out[: len(values)] = values
-    return out
 
 
 def _matrix_of_cost(trial: TrialArrays) -> np.ndarray:

@@ -72,7 +72,12 @@ class TrialFit:
         data = {"height_m": np.asarray(np.nan), **load_npz(path, fields)}
         missing = [k for k in fields if k not in data]
         if missing:
-            raise _format_error(f"{path} lacks {', '.join(missing)}", "a file that `pbl fit` wrote")
+            raise PblError(
+                "FILE_FORMAT",
+                found=f"{path} lacks {', '.join(missing)}",
+                expected="a file that `pbl fit` wrote",
+                next_step="see docs/files.md, section fit.npz",
+            )
         check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
         values = {k: data[k] for k in wanted}
         for k in ("joint_names", "marker_names"):
@@ -114,7 +119,3 @@ def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:
     shapes |= {"time_s": (n,), "markers_world_m": (n, j, 3), "phone_quat_wxyz": (n, 4), "site_offset_m": (j, 3)}
     shapes |= {"scale": (len(SCALE_NAMES),), "image_size_px": (2,), "camera_matrix": (3, 3), "distortion": (5,)}
     return shapes | {"loss": (), "seconds": (), "height_m": (), "camera_position_m": (3,), "phone_clock_offset_s": ()}
-
-
-def _format_error(found: str, expected: str) -> PblError:
-    return PblError("FILE_FORMAT", found=found, expected=expected, next_step="see docs/files.md, section fit.npz")

@@ -12,11 +12,6 @@ def rotation_matrices(time_s: np.ndarray, quat_wxyz: np.ndarray, at_s: np.ndarra
     return turn(np.clip(at_s, time_s[0], time_s[-1])).as_matrix()
 
 
-def mean_rotation(R: np.ndarray) -> np.ndarray:
-    """(3, 3): the chordal mean of (T, 3, 3)."""
-    return Rotation.from_matrix(R).mean().as_matrix()
-
-
 def quat_wxyz(R: np.ndarray) -> np.ndarray:
     """(T, 4) quaternions of (T, 3, 3), without jumps of sign from one to the next."""
     q = Rotation.from_matrix(R, assume_valid=True).as_quat(scalar_first=True)

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
 from pbl_pipeline.errors import PblError
@@ -24,8 +25,8 @@ from pbl_pipeline.video import undistort_px
 
 from .params import CostParams, Params, ViewParams
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
-from .rotations import mean_rotation, rotation_matrices
-from .units import BODY, FILE, body_metres, check_units, pixel_px
+from .rotations import rotation_matrices
+from .units import BODY, body_metres, check_units, pixel_px
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -128,25 +129,25 @@ def check_trial(
             "at least two, finite and strictly increasing",
             name,
         )
-    if isinstance(trial, WorldMarkers):
-        _check_finite(name, trial.confidence > 0, trial.xyz_world_m)
-        seen = trial.confidence > 0
-        in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(trial.confidence) >= view.min_confidence)
-    elif isinstance(trial, MultiView):
-        for k in trial.views:
-            _check_points(name, k, need_3d=False)
-        check_views_agree(trial, name)
-        confidence = np.max([k.confidence for k in trial.views], axis=0)
-        seen = confidence > 0
-        in_view = (np.mean(seen, axis=1) >= SEEN_SHARE) & (_mean_seen(confidence) >= view.min_confidence)
-    else:
-        _check_points(name, trial, need_3d=has_3d(trial))
+    if isinstance(trial, Keypoints):
+        _check_finite(name, trial.confidence, trial.xy_px)
+        if has_3d(trial):
+            _check_finite(name, trial.confidence, trial.xyz_cam_m)
         shown = visibility(trial, view.min_confidence, view.max_gap_s, view.max_blind_s)
         used = _long_enough(shown.counts, trial.time_s, name, view)
         _check_phone(trial, name, used)
         return used, shown.whole_share
-    used = bridge_gaps(in_view, trial.time_s, view.max_gap_s)
-    used &= ~blind_runs(np.mean(seen, axis=1) >= SEEN_SHARE, trial.time_s, view.max_blind_s)
+    if isinstance(trial, MultiView):
+        for k in trial.views:
+            _check_finite(name, k.confidence, k.xy_px)
+        check_views_agree(trial, name)
+        confidence = np.max([k.confidence for k in trial.views], axis=0)
+    else:
+        _check_finite(name, trial.confidence, trial.xyz_world_m)
+        confidence = trial.confidence
+    enough = np.mean(confidence > 0, axis=1) >= SEEN_SHARE
+    in_view = enough & (_mean_seen(confidence) >= view.min_confidence)
+    used = bridge_gaps(in_view, trial.time_s, view.max_gap_s) & ~blind_runs(enough, trial.time_s, view.max_blind_s)
     return _long_enough(used, trial.time_s, name, view), float(np.mean(in_view))
 
 
@@ -175,15 +176,8 @@ def has_3d(trial: Keypoints) -> bool:
     return any(np.isfinite(x[c > 0]).any() for x, c in frames)
 
 
-def _check_points(name: str, trial: Keypoints, need_3d: bool) -> None:
-    seen = trial.confidence > 0
-    _check_finite(name, seen, trial.xy_px)
-    if need_3d:
-        _check_finite(name, seen, trial.xyz_cam_m)
-
-
-def _check_finite(name: str, seen: np.ndarray, points: np.ndarray) -> None:
-    if not np.isfinite(points).all() and np.any(seen & ~_finite(points)):
+def _check_finite(name: str, confidence: np.ndarray, points: np.ndarray) -> None:
+    if not np.isfinite(points).all() and np.any((confidence > 0) & ~_finite(points)):
         raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
 
 
@@ -192,7 +186,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
     return np.isfinite(points @ np.ones(points.shape[-1]))
 
 
-def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str = FILE) -> tuple[TrialArrays, str]:
+def _arrays(trial: Trial, name: str, motion: str, used: np.ndarray, pixel: str) -> tuple[TrialArrays, str]:
     """The arrays of a trial and the source of its camera's orientation."""
     t, j = len(trial.time_s), len(trial.names)
     if isinstance(trial, WorldMarkers):
@@ -264,7 +258,7 @@ def _orientation(
         return np.tile(LEVEL_CAMERA_R_NC, (t, 1, 1)), None, LEVEL
     turned = rotation_matrices(trial.phone_time_s, trial.phone_quat_wxyz, trial.time_s)
     if motion == "static":
-        return np.tile(mean_rotation(turned[used]), (t, 1, 1)), None, MEASURED
+        return np.tile(Rotation.from_matrix(turned[used]).mean().as_matrix(), (t, 1, 1)), None, MEASURED
     return turned, (np.asarray(trial.phone_time_s), np.asarray(trial.phone_quat_wxyz)), MEASURED
 
 

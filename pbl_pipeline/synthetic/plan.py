@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import joint_of, load_body
+from pbl_pipeline.body import Y_UP_TO_Z_UP, joint_of, load_body
 from pbl_pipeline.gait.normative import harmonic_sum
 from pbl_pipeline.shipped import shipped_text
 
@@ -65,8 +65,6 @@ BOB_M, SWAY_M = 0.020, 0.022
 PELVIS_HEIGHT_M = 0.95
 #: The pelvis' own angles among `MIDDLE_CURVES_DEG`.
 _PELVIS = ("tilt", "list", "rotation")
-#: Turns the body's frame (x forward, y up, z right) into the world's (z up).
-_UPRIGHT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def plain_walk(
@@ -129,9 +127,9 @@ def pelvis_joints(angles_rad: Float[np.ndarray, "T 3"], heading_rad: Float[np.nd
     rotation, each about the axes the ones before have turned). `angles_rad` are the same three about the axes of the
     walking direction, so that they are what gait people mean at any heading. The rotation is continuous in time.
     """
-    turned = _UPRIGHT @ Rotation.from_euler("ZXY", angles_rad).as_matrix()
+    turned = Y_UP_TO_Z_UP @ Rotation.from_euler("ZXY", angles_rad).as_matrix()
     world = Rotation.from_euler("Z", heading_rad[:, None]).as_matrix() @ turned
-    joints = Rotation.from_matrix(_UPRIGHT.T @ world).as_euler("ZXY")
+    joints = Rotation.from_matrix(Y_UP_TO_Z_UP.T @ world).as_euler("ZXY")
     rotation = np.unwrap(joints[:, 2])
     whole = np.round((np.median(heading_rad) - np.median(rotation)) / (2 * np.pi))
     return np.column_stack([joints[:, 0], joints[:, 1], rotation + 2 * np.pi * whole])

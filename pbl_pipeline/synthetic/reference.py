@@ -78,7 +78,7 @@ def swing_bump(plan: Plan, side: str) -> Float[np.ndarray, " N"]:
     return out
 
 
-def swing_window(plan: Plan, side: str, early_s: float = 0.08) -> Float[np.ndarray, " N"]:
+def swing_window(plan: Plan, side: str, early_s: float) -> Float[np.ndarray, " N"]:
     """1 in each swing of a side, smoothly 0 outside; it begins a little before toe-off."""
     out = np.zeros(len(plan.grid_s))
     own = [s for s in plan.steps if s.side == side]

@@ -67,7 +67,6 @@ class Contacts:
     """Targets of the sole's points: P points, N times. `weight` 1/m per axis of the world; `target` m;
     `floor` (N, P): the least height (m)."""
 
-    names: tuple[str, ...]
     target_m: Float[np.ndarray, "N P 3"]
     weight: Float[np.ndarray, "N P 3"]
     floor_m: Float[np.ndarray, "N P"]
@@ -229,8 +228,7 @@ class _Soles:
                 size.append(float(scale[body.scale_index[index]]))
                 local.append(size[-1] * np.array(place) * [1, 1, sign])
         self._ids, self._local = np.array(ids), np.array(local)
-        joints = self._model.jnt_bodyid
-        self._carried_by = np.array([[self._hangs_on(body, other) for other in joints] for body in ids])
+        self._carried_by = body.moves[self._ids - 1]
         # The foot flat at the origin, pointing along x: forward, left, height above the floor.
         self._flat = np.empty((len(ids), 3))
         for i, (name, place) in enumerate(zip(self.names, self._local, strict=True)):
@@ -238,11 +236,6 @@ class _Soles:
             toes = self._model.body(f"toes_{name[-1]}").pos if part == "toes" else np.zeros(3)
             at = toes + place
             self._flat[i] = [at[0], -at[2], at[1] + SOLE_M * size[i]]
-
-    def _hangs_on(self, body: int, other: int) -> bool:
-        while body > other:  # parents have smaller numbers
-            body = self._model.body_parentid[body]
-        return body == other
 
     def points(self, q: np.ndarray) -> np.ndarray:
         return self._points(*self._placed(q, "xpos", "xmat"))
@@ -279,7 +272,7 @@ class _Soles:
                 if k:
                     fraction = np.clip((t - own[k - 1].up_s) / (step.down_s - own[k - 1].up_s), 0, 1)
                     floor[:, i] += CLEARANCE_M * np.sin(np.pi * fraction) ** 2
-        return Contacts(tuple(self.names), target, weight, floor)
+        return Contacts(target, weight, floor)
 
     def _spot(self, i: int, step: Step) -> np.ndarray:
         c, s = np.cos(step.heading_rad), np.sin(step.heading_rad)

@@ -42,7 +42,7 @@ def test_models_and_demo_are_fetched_and_usable(cache):
     camera = load_camera(assets.fetch("demo_camera"), (info.width_px, info.height_px))
     assert camera.matrix[0, 0] == pytest.approx(2520.09, abs=0.01)
     assert camera.source == "file: Calib_demo.toml [demo]"
-    found = [item for item in assets.status() if item.asset.name in there]
-    assert {item.state for item in found} == {"ok"}
-    assert [item.path.stat().st_size for item in found] == [item.asset.size_bytes for item in found]
+    states = assets.status()
+    for asset in (assets.ASSETS[name] for name in there):
+        assert (states[asset.name], asset.path.stat().st_size) == ("ok", asset.size_bytes)
     assert not [*assets.folder().glob("*.whl"), *assets.folder().glob("*.tgz")]

@@ -25,8 +25,14 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
         return list(rows.fieldnames or ()), list(rows)
 
 
-def test_columns_are_time_and_the_joints_in_their_order(walk, tmp_path: Path) -> None:
-    columns, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+@pytest.fixture(scope="module")
+def written(walk, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and rows of the walk's file."""
+    return _read(write_angles_csv(walk, tmp_path_factory.mktemp("angles") / "walk.angles.csv"))
+
+
+def test_columns_are_time_and_the_joints_in_their_order(walk, written) -> None:
+    columns, rows = written
     assert len(rows) == 40
     assert columns[0] == "time_s"
     assert [c for c in columns[1:] if not c.startswith("knee_flexion")] == list(walk.joint_names)
@@ -34,9 +40,8 @@ def test_columns_are_time_and_the_joints_in_their_order(walk, tmp_path: Path) ->
         assert columns[columns.index(f"knee_angle_{side}") + 1] == f"knee_flexion_{side}"
 
 
-def test_values_are_degrees_and_metres(walk, tmp_path: Path) -> None:
-    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
-    row, column = rows[20], {n: i for i, n in enumerate(walk.joint_names)}
+def test_values_are_degrees_and_metres(walk, written) -> None:
+    row, column = written[1][20], {n: i for i, n in enumerate(walk.joint_names)}
     assert float(row["time_s"]) == pytest.approx(20 / 30, abs=1e-6)
     assert float(row["pelvis_tx"]) == pytest.approx(walk.qpos[20, column["pelvis_tx"]], abs=1e-5)  # m, not degrees
     for joint in ("pelvis_rotation", "elbow_flex_l", "hip_flexion_r"):
@@ -44,17 +49,15 @@ def test_values_are_degrees_and_metres(walk, tmp_path: Path) -> None:
     assert float(row["pelvis_rotation"]) == pytest.approx(90.0, abs=6)  # she goes along world y
 
 
-def test_knee_flexion_is_positive_and_opposite_to_the_knee_angle(walk, tmp_path: Path) -> None:
-    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
-    flexion = np.array([float(r["knee_flexion_r"]) for r in rows[5:]])
-    angle = np.array([float(r["knee_angle_r"]) for r in rows[5:]])
+def test_knee_flexion_is_positive_and_opposite_to_the_knee_angle(written) -> None:
+    flexion, angle = (np.array([float(r[n]) for r in written[1][5:]]) for n in ("knee_flexion_r", "knee_angle_r"))
     np.testing.assert_allclose(flexion, -angle)
     # One whole cycle of 33 frames: swing bends the knee as far as in a textbook, about 60 deg.
     assert flexion.max() == pytest.approx(60, abs=4)
 
 
-def test_unknown_frames_are_empty_cells(walk, tmp_path: Path) -> None:
-    _, rows = _read(write_angles_csv(walk, tmp_path / "walk.angles.csv"))
+def test_unknown_frames_are_empty_cells(written) -> None:
+    _, rows = written
     assert all(v == "" for k, v in rows[0].items() if k != "time_s")
     assert rows[0]["time_s"] == "0.000000"
     assert all(v != "" for v in rows[5].values())

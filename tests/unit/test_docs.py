@@ -18,10 +18,10 @@ from docs_site import _notebook, api, commands
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.report.words import VERDICT_WORDS
-from pbl_pipeline.settings import VARIABLES
 from schemas import STAGES, computed_tables
 from tests import pages
 from tests.command import pbl
+from tests.source import files
 
 ROOT = pages.ROOT
 #: Modules of tables: docs/tables.md has what is in them.
@@ -36,9 +36,10 @@ def test_errors_page_lists_exactly_the_codes():
 
 def test_readme_names_every_variable_and_command():
     text = (ROOT / "README.md").read_text()
-    missing = [v for v in VARIABLES if f"`{v}`" not in text]
-    missing += [c.name for c in entry_points(group="pbl.commands") if f"`pbl {c.name}`" not in text]
-    assert not missing
+    source = "".join(file.read_text("utf-8") for file in files("pbl_pipeline", "schemas", "workers"))
+    listed = re.findall(r"^\| (`PBL_\w+`[^|]*) \|", text, re.MULTILINE)
+    assert sorted(re.findall(r"`(\w+)`", " ".join(listed))) == sorted(set(re.findall(r'"(PBL_[A-Z0-9_]+)"', source)))
+    assert not [c.name for c in entry_points(group="pbl.commands") if f"`pbl {c.name}`" not in text]
 
 
 def test_readme_has_no_placeholder():

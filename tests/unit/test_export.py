@@ -25,6 +25,7 @@ from pbl_pipeline.export.columns import Column, Labels, Table, lines, number_cel
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
+from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import FAIL, Check
 from pbl_pipeline.validation import reference_of_mot
 from pbl_pipeline.video import PhoneLog, Sensor
@@ -75,6 +76,11 @@ def written(trial: Recording, folder: Path, *formats: str, **options: Any) -> Pa
     """A trial alone, in some formats; its folder."""
     write_export(Visit((trial,)), formats, folder, ExportOptions(**options))
     return folder / trial.name
+
+
+def c3d_of(path: Path) -> Any:
+    """A C3D file as ezc3d reads it."""
+    return pytest.importorskip("ezc3d").c3d(str(path))
 
 
 # ----------------------------------------------------------------------------------------------------- markers, angles
@@ -268,8 +274,7 @@ def test_the_floor_is_at_0_where_it_was_found(walk, tmp_path):
 
 
 def test_the_floor_of_a_c3d_is_at_0(walk, tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
-    file = ezc3d.c3d(str(written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d"))
+    file = c3d_of(written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d")
     heels = [walk.marker_names.index(f"{s}_heel") for s in ("left", "right")]
     assert np.abs(file["data"]["points"][2, heels].min(axis=0)).mean() < 60  # mm: the marker is above the sole
     assert file["parameters"]["PBL"]["GROUND"]["value"][0].startswith("height 0 is the floor")
@@ -294,8 +299,7 @@ def test_what_0_is_where_no_floor_was_found(walk, what, tmp_path):
 
 # ----------------------------------------------------------------------------------------------------------------- c3d
 def test_ezc3d_reads_points_poses_and_events(out, fit, metrics):
-    ezc3d = pytest.importorskip("ezc3d")
-    file = ezc3d.c3d(str(out / "walk" / "walk.c3d"))
+    file = c3d_of(out / "walk" / "walk.c3d")
     points, parameters = file["data"]["points"], file["parameters"]
     assert parameters["POINT"]["LABELS"]["value"] == list(fit.marker_names)
     assert parameters["POINT"]["UNITS"]["value"] == ["mm"]
@@ -343,14 +347,13 @@ def test_py_c3d_reads_the_same(out, fit, metrics):
 
 
 def test_uneven_frames_are_brought_to_one_rate(tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
     even = marked_fit(n_frames=121)
     kept = np.sort(np.random.default_rng(5).permutation(121)[:110])
     kept[0], kept[-1] = 0, 120
     kept = np.unique(kept)
     fields = {f: getattr(even, f)[kept] for f in ("time_s", "qpos", "qpos_sd", "markers_world_m", "phone_quat_wxyz")}
     uneven = dataclasses.replace(even, **fields)
-    file = ezc3d.c3d(str(written(Recording.of("walk", uneven), tmp_path / "a", "c3d") / "walk.c3d"))
+    file = c3d_of(written(Recording.of("walk", uneven), tmp_path / "a", "c3d") / "walk.c3d")
     assert file["parameters"]["PBL"]["TIMES"]["value"] == ["interpolated to an even rate"]
     points = file["data"]["points"][:3].transpose(2, 1, 0)
     assert points.shape == (121, 33, 3)
@@ -362,20 +365,18 @@ def test_uneven_frames_are_brought_to_one_rate(tmp_path):
 
 
 def test_a_recording_that_starts_later_keeps_its_times(tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
     fit = marked_fit(n_frames=60)
     late = dataclasses.replace(fit, time_s=fit.time_s + 2.0)
-    path = written(Recording.of("walk", late), tmp_path / "a", "c3d") / "walk.c3d"
-    assert ezc3d.c3d(str(path))["header"]["points"]["first_frame"] == 60  # from 0: the 61st, 2 s after the first
+    file = c3d_of(written(Recording.of("walk", late), tmp_path / "a", "c3d") / "walk.c3d")
+    assert file["header"]["points"]["first_frame"] == 60  # from 0: the 61st, 2 s after the first
 
 
 def test_sensors_of_the_phone_are_analog_channels_on_the_videos_clock(fit, tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
     time = np.arange(0.0, 5.0, 0.01)
     xyz = np.column_stack([time, 2 * time, np.full_like(time, 9.81)])  # straight lines: interpolation is exact
     log = PhoneLog(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), "camera", None, "own", None, {}, "CSV")
     log = dataclasses.replace(log, sensors={"accelerometer": Sensor(time, xyz), "gyroscope": Sensor(time, xyz)})
-    file = ezc3d.c3d(str(written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d"))
+    file = c3d_of(written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d")
     analog = file["parameters"]["ANALOG"]
     assert analog["LABELS"]["value"][:4] == [*(f"phone_accelerometer_{a}" for a in "xyz"), "phone_gyroscope_x"]
     assert analog["UNITS"]["value"][:4] == ["m/s^2"] * 3 + ["rad/s"]
@@ -684,11 +685,10 @@ def test_the_command_on_files(files, tmp_path):
 
 
 def test_the_command_with_events_and_the_phones_log(files, tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
     log = ("--attitude", files / "log.csv")
     done = pbl("export", files / "walk.fit.npz", "--to", "c3d", *log, "--out", tmp_path / "a")
     assert done.code == 0, done.err
-    file = ezc3d.c3d(str(tmp_path / "a" / "walk" / "walk.c3d"))
+    file = c3d_of(tmp_path / "a" / "walk" / "walk.c3d")
     truth = [t for t, side, event in foot_events(5.5, 0.6) if (side, event) == ("right", "foot_down")]
     group = file["parameters"]["EVENT"]
     kinds = zip(group["CONTEXTS"]["value"], group["LABELS"]["value"], group["TIMES"]["value"][1], strict=True)
@@ -791,9 +791,6 @@ def test_no_table_is_written_past_it():
 
 
 def test_a_name_that_does_not_show_what_it_is_is_refused(tmp_path: Path):
-    from pbl_pipeline.errors import PblError
-    from pbl_pipeline.names import check_label
-
     for name in ("a\u202eb", "\u2066a", "a\u200bb", "\ufeffa", "a\u00adb", "a\x7fb", "a\nb", "\u3164", "\u2800"):
         with pytest.raises(PblError, match="USAGE"):
             check_label("session", name, 64)

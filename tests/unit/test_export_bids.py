@@ -55,24 +55,10 @@ def dataset(visit: Visit, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_names_of_the_files(dataset: Path):
     found = sorted(p.relative_to(dataset).as_posix() for p in dataset.rglob("*") if p.is_file())
     of_visit = [
-        "task-unknown_events.json",
-        "task-unknown_events.tsv",
-        "task-unknown_tracksys-video_channels.json",
-        "task-unknown_tracksys-video_channels.tsv",
-        "task-unknown_tracksys-video_motion.json",
-        "task-unknown_tracksys-video_motion.tsv",
-    ]
-    of_visit += [
-        f"task-walking{system}_run-{run}_{end}"
-        for run in (1, 2)
-        for system, end in (
-            ("", "events.json"),
-            ("", "events.tsv"),
-            ("_tracksys-video", "channels.json"),
-            ("_tracksys-video", "channels.tsv"),
-            ("_tracksys-video", "motion.json"),
-            ("_tracksys-video", "motion.tsv"),
-        )
+        f"task-{task}{system}{run}_{table}.{ending}"
+        for task, run in (("unknown", ""), ("walking", "_run-1"), ("walking", "_run-2"))
+        for system, table in (("", "events"), ("_tracksys-video", "channels"), ("_tracksys-video", "motion"))
+        for ending in ("json", "tsv")
     ]
     visits = (("P001", "20260301"), ("P001", "20260601"), ("P002", "20260301"))
     expected = [f"sub-{s}/ses-{v}/motion/sub-{s}_ses-{v}_{name}" for s, v in visits for name in of_visit]

@@ -1,6 +1,7 @@
 """The fit against the synthetic walker, whose angles are known; the cost terms against hand-worked numbers."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import cv2
 import jax
@@ -12,27 +13,17 @@ from scipy.stats import multivariate_normal
 
 from pbl_pipeline.body import SCALE_NAMES, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import (
-    LEVEL_CAMERA_R_NC,
-    METHODS,
-    ImplicitAdamParams,
-    check_trial,
-    fit_session,
-)
+from pbl_pipeline.fit import METHODS, ImplicitAdamParams, check_trial, fit_session
 from pbl_pipeline.fit.checks import _converged
 from pbl_pipeline.fit.initial_pose import root_positions
 from pbl_pipeline.fit.joint_terms import inclination, pose_cost, pose_z, posture
 from pbl_pipeline.fit.keypoint_terms import (
-    in_camera,
     mean_weights,
     offset_m,
     project_px,
-    residual_2d_px,
     residual_3d_cm,
 )
 from pbl_pipeline.fit.priors import learned_poses, pose_prior, scale_precision
-from pbl_pipeline.fit.solution import Outcome, Solution
-from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import huber, square
 from pbl_pipeline.fit.trajectory import fit_ranges, pose_of, raw_of
 from pbl_pipeline.keypoints import bridge_gaps, longest_run_s, whole_person_in_view
@@ -133,19 +124,6 @@ def distance_3d_cm2(x: jax.Array, detected: jax.Array, c: jax.Array, weight: flo
     return square(residual_3d_cm(x - offset_m(x, detected, mean_weights(c, weight * jnp.ones(c.shape))), detected))
 
 
-def test_distances_by_hand():
-    x_world = jnp.array([[4.0, 0.0, 0.0], [4.0, 1.0, 0.0], [4.0, 0.0, 1.0]])
-    x_cam = in_camera(x_world[None], jnp.asarray(LEVEL_CAMERA_R_NC)[None, None], jnp.zeros((1, 1, 3)))[0, 0]
-    moved = x_cam + jnp.array([7.0, 0.0, 0.0])  # as a whole: the centred distance does not see it
-    c = jnp.ones(3)
-    np.testing.assert_allclose(distance_3d_cm2(x_cam, moved, c), 0, atol=1e-3)
-    # Ahead of a level camera: world +y is to the left, world +z up.
-    xy = jnp.array([[960.0, 540.0], [960.0 - 375, 540.0], [960.0, 540.0 - 375 + 3]])
-    np.testing.assert_allclose(square(residual_2d_px(x_cam, xy, jnp.asarray(CAMERA.matrix))), [0, 0, 9], atol=1e-2)
-    weights = mean_weights(jnp.array([0.4, 0.7, 0.0]), jnp.ones(3))
-    np.testing.assert_allclose(offset_m(x_world, 0 * x_world, weights), [[4.0, 0.5, 0.0]], rtol=1e-6)
-
-
 def test_markers_without_weight_do_not_move_the_centre_of_the_others():
     c = jnp.ones(3)
     model = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.9]])
@@ -197,17 +175,19 @@ def test_the_pelvis_of_the_prior_is_against_the_vertical_whichever_way_it_faces(
     assert posture(jnp.zeros(7), jnp.zeros(0, jnp.int32)).shape == (7,)  # a body without these joints
 
 
-def test_a_pose_prior_that_does_not_exist_is_refused():
-    with pytest.raises(PblError, match="nobody") as error:
-        pose_prior(load_body().joint_names, [], "nobody")
+@pytest.mark.parametrize(
+    ("entries", "learned", "expected"),
+    [
+        ([("hip_rotatoin", 0, 10)], "", "a joint of the body"),
+        ([("hip_rotation", 0, 0)], "", "a positive number"),
+        ([], "nobody", "people"),
+    ],
+)
+def test_a_pose_prior_of_nothing_is_refused(entries, learned, expected):
+    with pytest.raises(PblError, match=learned or entries[0][0]) as error:
+        pose_prior(["hip_rotation_r"], entries, learned)
     assert error.value.code == "FIT_INPUT"
-    assert "people" in error.value.expected
-
-
-@pytest.mark.parametrize("entry", [("hip_rotatoin", 0, 10), ("hip_rotation", 0, 0)])
-def test_pose_prior_of_no_joint_or_without_width_is_refused(entry):
-    with pytest.raises(PblError, match=entry[0]):
-        pose_prior(["hip_rotation_r"], [entry])
+    assert expected in error.value.expected
 
 
 def test_scale_prior_by_hand_leaves_the_whole_body_free():
@@ -215,12 +195,6 @@ def test_scale_prior_by_hand_leaves_the_whole_body_free():
     s = np.array([0.3, 0.1, 0, 0, -0.05, 0, 0.2, 0.2])
     each, thighs = 1 + 0.25 + 4 + 4, (0.05 / 0.02) ** 2
     assert s @ scale_precision(SCALE_NAMES, 0.1, 0.02) @ s == pytest.approx(each + thighs, rel=1e-5)
-
-
-def test_the_papers_cost_has_neither_prior():
-    cost = METHODS["paper-2025"].params.cost
-    assert (cost.weight_pose, cost.weight_scale) == (0.0, 0.0)
-    assert (cost.weight_3d, cost.weight_2d, cost.weight_offset_per_m2) == (1.0, 0.1, 100.0)
 
 
 def test_root_position_from_pixels():
@@ -277,15 +251,6 @@ def test_markers_that_the_detector_never_gives_do_not_hide_the_person():
     assert not whole_person_in_view(dataclasses.replace(k, confidence=c), 0.3).any()
 
 
-def test_paramsets_survive_json_and_name_their_steps():
-    import json
-
-    for p in METHODS.values():
-        stored = Paramset(p.stage, p.name, p.version, json.loads(p.paramset.canonical_json))
-        assert METHODS.find(stored).params == p.params
-        assert stored.hash == p.hash
-
-
 def test_where_nothing_was_seen_nothing_is_known():
     k = observe(plain_walk(TIME_S), TIME_S)
     confidence = k.confidence.copy()
@@ -301,21 +266,7 @@ def test_where_nothing_was_seen_nothing_is_known():
 def test_convergence_is_judged_by_the_second_half_and_needs_a_trace():
     def outcome(loss):
         trace = np.column_stack([np.arange(len(loss)), loss])
-        solution = Solution(
-            qpos=np.zeros((1, 40)),
-            R_nc=np.zeros((1, 1, 3, 3)),
-            s=np.zeros(8),
-            scale=np.ones(8),
-            site_offset_m=np.zeros((33, 3)),
-            clock_s=np.zeros(1),
-            loss_trace=trace,
-            compile_seconds=0.0,
-            seconds=0.0,
-            iterations=len(loss),
-            result=Result.SMALL_STEP,
-            outcome=Outcome(jnp.zeros((1, 33, 3)), jnp.zeros((1, 33)), jnp.zeros((1, 33)), jnp.zeros((1, 3))),
-        )
-        return _converged(solution).outcome
+        return _converged(SimpleNamespace(qpos_sd=None, loss_trace=trace)).outcome  # type: ignore[arg-type]
 
     assert outcome([9.0, 3.0, 1.5, 1.1, 1.05, 1.02, 1.01, 1.0]) == "PASS"
     assert outcome([9.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.2, 1.0]) == "WARN"

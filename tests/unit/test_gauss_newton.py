@@ -1,6 +1,7 @@
 """The algebra of the Gauss-Newton solver: structured systems, derivatives of markers and of the cost, its terms."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import (
     MarkerSet,
-    body_poses,
     chain_frames,
     load_body,
     marker_jacobian,
@@ -25,11 +25,8 @@ from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide
 from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
-    mean_weights,
-    offset_m,
     project_px,
     residual_2d_px,
-    residual_3d_cm,
 )
 from pbl_pipeline.fit.lanes import begin_of, finish, fit_problem
 from pbl_pipeline.fit.linearised import linearised
@@ -43,7 +40,7 @@ from pbl_pipeline.fit.solvers import linear
 from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
-from pbl_pipeline.fit.term import At, Term, Unknowns, square
+from pbl_pipeline.fit.term import At, Term, Unknowns
 from pbl_pipeline.fit.weights import Weights
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
@@ -103,7 +100,20 @@ def random_system(
 
 def solution_and_variance(system, g, h):
     """Both in one program, which compiles what they share once."""
-    return solve(system, g, h), marginal_variance(system)
+    return *solve(system, g, h), *marginal_variance(system)
+
+
+def right_side(rng: np.random.Generator, *shape: int, k: int = 4) -> tuple[jax.Array, jax.Array]:
+    g, h = rng.normal(size=(*shape, 5)), rng.normal(size=(*shape[:-1], k))
+    return jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
+
+
+def assert_solved(full: np.ndarray, g, h, x, y, by_frame, shared) -> None:
+    """The solution and the variances are those of the full matrix."""
+    want = np.linalg.solve(full, np.concatenate([np.ravel(g), h]))
+    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
+    variance = np.diag(np.linalg.inv(full))
+    np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), variance, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -113,38 +123,25 @@ def test_a_bordered_system_is_solved_as_the_full_matrix(frames, chain, monkeypat
     monkeypatch.setitem(linear.CHAIN, jax.default_backend(), chain)
     rng = np.random.default_rng(frames)
     system, full = random_system(frames, rng)
-    g, h = rng.normal(size=(frames, 5)), rng.normal(size=4)
-    (x, y), (by_frame, shared) = jax.jit(solution_and_variance)(
-        system, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
-    )
-    want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
-    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
-    variance = np.diag(np.linalg.inv(full))
-    np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), variance, rtol=1e-4)
+    side = right_side(rng, frames)
+    assert_solved(full, *side, *jax.jit(solution_and_variance)(system, *side))
 
 
 @pytest.mark.parametrize(("k", "columns"), [(4, 3), (4, 32), (6, 3)])
 def test_a_large_border_by_columns_gives_the_same(k, columns, monkeypatch):
     rng = np.random.default_rng(k)
     system, full = random_system(10, rng, k=k)
-    g, h = rng.normal(size=(10, 5)), rng.normal(size=k)
+    side = right_side(rng, 10, k=k)
     monkeypatch.setattr(linear, "LARGE_BORDER", 0)
     monkeypatch.setattr(linear, "COLUMNS", columns)
-    (x, y), (by_frame, shared) = solution_and_variance(system, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32))
-    want = np.linalg.solve(full, np.concatenate([g.ravel(), h]))
-    np.testing.assert_allclose(np.concatenate([np.ravel(x), y]), want, atol=2e-5 * np.abs(want).max())
-    np.testing.assert_allclose(np.concatenate([np.ravel(by_frame), shared]), np.diag(np.linalg.inv(full)), rtol=1e-4)
+    assert_solved(full, *side, *solution_and_variance(system, *side))
 
 
-@dataclasses.dataclass(frozen=True)
-class Model:
+class Model(NamedTuple):
     cost: jax.Array
     system: BorderedBandedSystem
     g: jax.Array
     h: jax.Array
-
-
-jax.tree_util.register_dataclass(Model)
 
 
 @pytest.mark.parametrize("over", [4.0, 0.5])
@@ -173,14 +170,10 @@ def test_many_systems_at_once():
     rng = np.random.default_rng(7)
     systems, fulls = zip(*[random_system(6, rng) for _ in range(3)], strict=True)
     many = jax.tree.map(lambda *a: jnp.stack(a), *systems)
-    g, h = rng.normal(size=(3, 6, 5)), rng.normal(size=(3, 4))
-    (x, y), (by_frame, _) = jax.jit(jax.vmap(solution_and_variance))(
-        many, jnp.asarray(g, jnp.float32), jnp.asarray(h, jnp.float32)
-    )
-    for i, full in enumerate(fulls):
-        want = np.linalg.solve(full, np.concatenate([g[i].ravel(), h[i]]))
-        np.testing.assert_allclose(np.concatenate([np.ravel(x[i]), y[i]]), want, atol=2e-5 * np.abs(want).max())
-        np.testing.assert_allclose(np.ravel(by_frame[i]), np.diag(np.linalg.inv(full))[:30], rtol=1e-4)
+    side = right_side(rng, 3, 6)
+    found = jax.jit(jax.vmap(solution_and_variance))(many, *side)
+    for full, *one in zip(fulls, *side, *found, strict=True):
+        assert_solved(full, *one)
 
 
 # --- markers and their derivatives ---
@@ -212,31 +205,6 @@ def test_derivatives_of_markers_are_those_of_automatic_differentiation():
     own = np.einsum("tmimj->tmij", by_o)
     np.testing.assert_allclose(ours.per_offset, own, atol=1e-5)
     assert np.count_nonzero(np.abs(by_o) > 1e-6) == np.count_nonzero(np.abs(own) > 1e-6)  # a marker moves itself alone
-
-
-def test_bodies_are_where_mujoco_and_mjx_have_them():
-    import mujoco
-    from mujoco import mjx
-
-    body = load_body()
-    qpos, scale, _ = random_body_state(np.random.default_rng(2), 8, 1)
-    xpos, xmat = body_poses(body, qpos, scale)
-    model = body.mj_model.__copy__()
-    for b, parent in enumerate(body.parent_index):
-        model.body_pos[b + 1] *= scale[body.scale_index[parent]] if parent >= 0 else 1.0
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    for t in range(len(qpos)):
-        data.qpos[:] = np.asarray(qpos[t], np.float64)
-        mujoco.mj_kinematics(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        np.testing.assert_allclose(xpos[t], data.xpos[1:], atol=1e-5)
-        np.testing.assert_allclose(xmat[t].reshape(-1, 9), data.xmat[1:], atol=1e-5)
-
-    on_device = mjx.put_model(model)
-    at = jax.jit(lambda d, q: mjx.kinematics(on_device, d.replace(qpos=q)))
-    for t in range(2):
-        there = at(mjx.make_data(on_device), qpos[t])
-        np.testing.assert_allclose(xpos[t], there.xpos[1:], atol=1e-5)
-        np.testing.assert_allclose(xmat[t], there.xmat[1:].reshape(-1, 3, 3), atol=1e-5)
 
 
 # --- the gradient of the cost ---
@@ -477,17 +445,6 @@ def test_second_differences_span_gaps_and_end_with_the_frames_that_count():
     used = np.array([0, 1, 1, 0, 0, 1, 1, 0], bool)
     assert np.flatnonzero(bend_weights(np.arange(8) / 30, used).any(axis=1)).tolist() == [2, 3, 4, 5]
     assert not bend_weights(np.arange(8) / 30, np.zeros(8, bool)).any()
-
-
-def test_depth_counts_by_its_ratio():
-    c = jnp.ones(2)
-    model = jnp.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0]])
-    # Apart by 2 cm across and 6 cm along the camera's axis; centred, each point is off by half of it.
-    detected = model + jnp.array([[0.01, 0.0, 0.03], [-0.01, 0.0, -0.03]])
-    away = offset_m(model, detected, mean_weights(c, jnp.ones(2)))
-    for ratio in (1.0, 0.5):
-        got = square(residual_3d_cm(model - away, detected, ratio))
-        np.testing.assert_allclose(got, [1 + 9 * ratio**2] * 2, rtol=1e-3)
 
 
 def test_distance_in_pixels_of_a_moved_and_turned_camera():

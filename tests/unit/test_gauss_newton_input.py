@@ -35,10 +35,6 @@ def seen(k: Keypoints) -> tuple[int, ...]:
     return tuple(np.argwhere(k.confidence > 0)[50])
 
 
-def with_matrix(k: Keypoints, matrix: np.ndarray) -> Keypoints:
-    return dataclasses.replace(k, camera=dataclasses.replace(k.camera, matrix=matrix))
-
-
 def first(k: Keypoints, n: int) -> Keypoints:
     names = ("time_s", "xy_px", "xyz_cam_m", "confidence", "box_px")
     return dataclasses.replace(k, **{name: getattr(k, name)[:n] for name in names})
@@ -93,7 +89,11 @@ def test_too_few_frames(trial, n):
 
 @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.full((3, 3), np.nan), -np.eye(3)])
 def test_a_camera_that_cannot_be(trial, matrix):
-    assert code_of(lambda: SessionInput([with_matrix(trial, matrix)], ["a"], "handheld")) == "CAMERA_INVALID"
+    def with_matrix() -> SessionInput:
+        camera = dataclasses.replace(trial.camera, matrix=matrix)
+        return SessionInput([dataclasses.replace(trial, camera=camera)], ["a"], "handheld")
+
+    assert code_of(with_matrix) == "CAMERA_INVALID"
 
 
 def test_sessions_that_do_not_fit_together(trial):

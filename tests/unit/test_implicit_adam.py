@@ -191,14 +191,6 @@ def test_the_solver_begins_at_its_start(handheld):
     assert solution.loss_trace.shape == (0, 2)
 
 
-def packed_larger(monkeypatch, *trials, motion: str) -> Session:
-    """The same session with more frames, markers and trials of padding."""
-    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
-    monkeypatch.setattr(problem, "pad_markers", lambda n: 110)
-    monkeypatch.setattr(problem, "pad_trials", lambda n, coarse=False: 5)
-    return session_of(*trials, motion=motion)
-
-
 @pytest.mark.long
 def test_padding_changes_nothing(monkeypatch):
     motion = "handheld"  # which has all that a standing camera has
@@ -206,7 +198,10 @@ def test_padding_changes_nothing(monkeypatch):
     session = session_of(*trials, motion=motion)
     # One step moves every unknown by the learning rate, so a few show whatever differs before rounding adds up.
     params = quick(12, learning_rate_end=1e-3)
-    larger = packed_larger(monkeypatch, *trials, motion=motion)
+    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
+    monkeypatch.setattr(problem, "pad_markers", lambda n: 110)
+    monkeypatch.setattr(problem, "pad_trials", lambda n, coarse=False: 5)
+    larger = session_of(*trials, motion=motion)
     assert larger.problem.c_2d.shape != session.problem.c_2d.shape
     a, b = solve_implicit(session, params), solve_implicit(larger, params)
     for i in range(2):

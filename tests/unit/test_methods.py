@@ -306,8 +306,3 @@ def test_files_that_describe_no_method_are_refused(tmp_path, content):
     with pytest.raises(PblError, match="FILE_FORMAT") as caught:
         read_method(write(tmp_path / "mine.json", content))
     assert str(tmp_path / "mine.json") in caught.value.text()
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(PblError, match="FILE_MISSING"):
-        read_method(tmp_path / "mine.json")

@@ -89,12 +89,12 @@ def test_report_and_metrics_agree_on_the_outcome(
     monkeypatch.setattr("pbl_pipeline.visit.types.check_keypoints", lambda _: (seen,))
     monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
     monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
-    monkeypatch.setattr(pipeline, "write_report", lambda _, visit, *more: written.append((visit, *more)))
+    monkeypatch.setattr(pipeline, "write_report", lambda _, *shown, **__: written.append(shown))
     visit, _ = pipeline.run_visit([chain.small_video(tmp_path, "walk")], tmp_path / "out")
     pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
-    (shown, pictures, title, *_), *_ = written
-    page = page_of(shown, pictures, title, None)
+    ((shown, pictures),) = written
+    page = page_of(shown, pictures, "Gait report", None)
     assert visit.judged is not None
     assert content["outcome"] == page["verdict"]["outcome"] == visit.judged.outcome
     assert content["outcome"] == ("FAIL" if outcome == "FAIL" else "WARN")
@@ -130,7 +130,7 @@ def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
     monkeypatch.setattr(pipeline, "render_overlay", lambda path, *_, **__: used.append(path))
     monkeypatch.setattr(pipeline, "overlay_frames", lambda path, *_, **__: used.append(path) or [])
     monkeypatch.setattr(pipeline, "report_indices", lambda _: [])
-    monkeypatch.setattr(pipeline, "write_report", lambda *_: None)
+    monkeypatch.setattr(pipeline, "write_report", lambda *_, **__: None)
     recording = chain.small_video(tmp_path, "walk")
     pipeline.write_results(tmp_path / "out", pipeline.run_visit([recording], tmp_path / "out")[0])
     assert len(used) == 2
