@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import pbl_pipeline.tracking
 from pbl_pipeline import models
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     BlazePoseLandmarks,
     KeypointParams,
@@ -45,7 +44,7 @@ from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
 from pbl_pipeline.visit import Recording, Visit
-from tests import dot_models
+from tests import dot_models, refused
 from tests.command import pbl
 from tests.dot_models import NAMES, lens, person, picture, project, region
 from tests.unit.test_blazepose import BY_EYE, asset
@@ -352,8 +351,7 @@ def test_several_frames_in_one_call_are_the_same_as_one_by_one(tmp_path):
 
 
 def test_a_model_without_spread_has_no_confidence(tmp_path):
-    with pytest.raises(PblError, match=r"^USAGE: "):
-        detector(tmp_path, "crop3d", dot_models.crop3d(person()), 1)
+    refused("USAGE", detector, tmp_path, "crop3d", dot_models.crop3d(person()), 1)
 
 
 def test_another_model_than_the_method_froze(tmp_path):
@@ -364,8 +362,7 @@ def test_another_model_than_the_method_froze(tmp_path):
         ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2),
         ModelParams(spec.name, spec.sha256, "0" * 64, spec.licence, 2),
     ):
-        with pytest.raises(PblError, match=r"^MODEL_CHECKSUM: "):
-            OnnxKeypoints(params, "cpu", tmp_path)
+        refused("MODEL_CHECKSUM", OnnxKeypoints, params, "cpu", tmp_path)
 
 
 class BlazePoseAsCropModel:
@@ -528,8 +525,7 @@ def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
 
 def test_the_detector_onnx_without_a_model(video):
     path, tracking = video
-    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
-        detect_keypoints(path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
+    refused("SOLVER_UNKNOWN", detect_keypoints, path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
 
 
 def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered, tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
     METHODS,
@@ -28,6 +27,7 @@ from pbl_pipeline.tracking.associate import Associator, Trail
 from pbl_pipeline.tracking.reidentify import join_trails
 from pbl_pipeline.tracking.tiling import detect_in, merge, tile_starts, tiles
 from pbl_pipeline.video import probe
+from tests import refused
 from tests.videos import constant_rate, write_as_they_are, write_video
 
 HEIGHT = 400.0
@@ -297,8 +297,7 @@ def test_track_people_finds_nobody_in_noise(tmp_path):
 
 
 def test_unknown_detector_is_refused(spots_video):
-    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
-        track_people(spots_video, TrackingParams(detector="none"))
+    refused("SOLVER_UNKNOWN", track_people, spots_video, TrackingParams(detector="none"))
 
 
 def test_paramset_names_the_model():
@@ -409,8 +408,7 @@ def test_two_alike_need_a_choice_and_a_human_decides():
 def test_an_override_wins_over_a_clear_choice_but_must_exist():
     clear = video_of(track(1, x=500.0), track(2, x=lambda t: 100 + 130 * t))
     assert choose_subject(clear, override=1).person_id == 1
-    with pytest.raises(PblError, match=r"^SUBJECT_UNKNOWN_PERSON: "):
-        choose_subject(clear, override=3)
+    refused("SUBJECT_UNKNOWN_PERSON", choose_subject, clear, override=3)
 
 
 def test_who_is_in_view_for_under_a_second_is_no_candidate_beside_others():
@@ -435,5 +433,5 @@ def test_a_probe_of_another_video_is_refused(spots_video):
     info = probe(spots_video)
     known = track_people(spots_video, detector=Spots(), info=info)
     assert len(known.persons) == len(track_people(spots_video, detector=Spots()).persons)
-    with pytest.raises(PblError, match=r"^VIDEO_CHANGED: "):
-        track_people(spots_video, detector=Spots(), info=dataclasses.replace(info, n_frames=info.n_frames - 1))
+    other = dataclasses.replace(info, n_frames=info.n_frames - 1)
+    refused("VIDEO_CHANGED", track_people, spots_video, detector=Spots(), info=other)

@@ -24,15 +24,8 @@ from pbl_pipeline.tracking import (
 from pbl_pipeline.tracking.tiling import detect_in
 from pbl_pipeline.tracking.yolox import decode, grid
 from pbl_pipeline.video import read_frames
+from tests import refused
 from tests.videos import constant_rate, write_video
-
-
-def refused(code: str, call, *args, **kwargs) -> str:
-    with pytest.raises(PblError) as error:
-        call(*args, **kwargs)
-    assert error.value.code == code
-    return error.value.text()
-
 
 # --- decoding -----------------------------------------------------------------------------------------------------
 
@@ -112,8 +105,8 @@ def test_models_of_another_kind_or_shape_are_refused():
     def load(output, **kwargs):
         YoloxDetector(Fixed(output, **kwargs))  # type: ignore[arg-type]
 
-    assert "kind heatmap" in refused("MODEL_INVALID", load, rows(), kind="heatmap")
-    assert "one row for each grid cell" in refused("MODEL_INVALID", load, np.zeros((2100, 85), np.float32))
+    assert "kind heatmap" in refused("MODEL_INVALID", load, rows(), kind="heatmap").found
+    assert "one row for each grid cell" in refused("MODEL_INVALID", load, np.zeros((2100, 85), np.float32)).expected
     refused("MODEL_INVALID", load, np.zeros((3549, 5), np.float32))
 
 
@@ -209,7 +202,7 @@ def test_bad_folders_and_changed_models(folder, registry, shared_data):
     track_people(video, params)
     entry = json.loads((folder / "model.json").read_text())["input"] | {"colour": "RGB"}
     models.add(changed(folder, input=entry), replace=True)
-    assert "model.json" in refused("MODEL_CHECKSUM", track_people, video, params)
+    assert "model.json" in refused("MODEL_CHECKSUM", track_people, video, params).found
     models.remove("yolox-nano")
     refused("MODEL_MISSING", track_people, video, params)
     refused("MODEL_MISSING", detector_params, "yolox-nano")
