@@ -21,7 +21,7 @@ from tests.command import Done, pbl
 from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("points_seen_once")]
 
 EMPTY = "niemand ist da, früh.mp4"
 

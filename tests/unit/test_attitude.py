@@ -1,6 +1,5 @@
 """The phone's orientation: in the keypoints, and as the log of `--attitude`, against cases worked by hand."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -108,14 +107,6 @@ def test_a_log_in_the_cameras_frame_is_taken_as_it_is(tmp_path):
     log = load_attitude(path)
     np.testing.assert_allclose(log.time_s, [10, 10.02, 10.04])
     np.testing.assert_allclose(np.linalg.norm(log.quat_wxyz, axis=1), 1)
-
-
-def test_a_log_as_json(tmp_path):
-    path = csv_log(tmp_path / "a.csv", about(0, 75), {"frame": "device"})
-    content = {"frame": "device", "rotation_deg": 0, "time_s": [10, 10.02, 10.04]}
-    content |= {n: [q] * 3 for n, q in zip(("qw", "qx", "qy", "qz"), about(0, 75), strict=True)}
-    (tmp_path / "a.json").write_text(json.dumps(content))
-    np.testing.assert_allclose(load_attitude(tmp_path / "a.json").quat_wxyz, load_attitude(path).quat_wxyz)
 
 
 @pytest.mark.parametrize("quat", [about(0, -90), [0.5, -0.5, -0.5, -0.5]], ids=["inverted", "on its side"])

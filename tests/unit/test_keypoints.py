@@ -6,7 +6,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.keypoints import (
-    METHODS,
     KeypointParams,
     Keypoints,
     PersonKeypoints,
@@ -296,12 +295,6 @@ def test_unknown_person_detector_and_changed_video(case, tmp_path):
     refused("SOLVER_UNKNOWN", detect_keypoints, video, tracking, 1, SMALL, KeypointParams(detector="none"))
     shorter = write_as_they_are(tmp_path / "s.avi", [np.full((100, 200, 3), 128, np.uint8)] * 40)
     refused("VIDEO_CHANGED", detect_keypoints, shorter, tracking, 1, CAMERA, None, Cross())
-
-
-def test_paramset_names_the_model():
-    method = METHODS["blazepose-33"]
-    assert (method.stage, method.version) == ("keypoints", 3)
-    assert method.params.model_sha256 == KeypointParams().model_sha256
 
 
 # --- quality ----------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Model folders: what `model.json` must say, what the graph must be, the registry, `pbl models`."""
 
 import contextlib
+import copy
 import functools
 import hashlib
 import http.server
@@ -25,6 +26,7 @@ from pbl_pipeline.models import spec
 from pbl_pipeline.paramset import Paramset
 from tests import dot_models, refused
 from tests.command import pbl
+from tests.dot_models import changed
 
 
 @functools.cache
@@ -42,14 +44,6 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
     monkeypatch.delenv("PBL_ONNX_DEVICE", raising=False)
     return tmp_path / "models"
-
-
-def changed(folder: Path, **changes) -> Path:
-    """The folder with other fields in its `model.json`; None takes a field away."""
-    path = folder / "model.json"
-    content = {**json.loads(path.read_text()), **changes}
-    path.write_text(json.dumps({k: v for k, v in content.items() if v is not None}))
-    return folder
 
 
 # --- model.json
@@ -161,8 +155,7 @@ def test_a_sound_model_runs_for_any_batch(folder):
 
 
 def test_a_graph_of_a_fixed_batch_is_called_as_often_as_it_takes(folder, tmp_path):
-    fixed = onnx.ModelProto()
-    fixed.CopyFrom(graph())
+    fixed = copy.deepcopy(graph())
     for value in (*fixed.graph.input, *fixed.graph.output):
         value.type.tensor_type.shape.dim[0].dim_value = 2
     model = models.OnnxModel(dot_models.write(tmp_path / "fixed", fixed, dot_models.spec("crop3d", (64, 64))))
@@ -223,8 +216,7 @@ def test_a_wrong_checksum(folder):
 
 
 def test_an_opset_the_runtime_does_not_know(tmp_path):
-    new = onnx.ModelProto()
-    new.CopyFrom(graph())
+    new = copy.deepcopy(graph())
     new.opset_import[0].version = 9999
     folder = dot_models.write(tmp_path / "new", new, dot_models.spec("crop3d", (64, 64)))
     assert "onnxruntime loads" in refused("MODEL_INVALID", models.OnnxModel, folder).expected
@@ -342,12 +334,16 @@ def test_another_model_under_the_name(folder, registry):
     assert [p.name for p in registry.iterdir()] == ["dots-crop3d"]
 
 
+def packed(folder: Path, suffix: str) -> Path:
+    """An archive of the model in this folder."""
+    kind = {"zip": "zip", "tar.gz": "gztar", "tar.xz": "xztar"}[suffix]
+    return Path(shutil.make_archive(str(folder / "packed"), kind, folder, "dots"))
+
+
 @pytest.mark.parametrize("suffix", ["zip", "tar.gz"])
 def test_add_from_an_archive(folder, registry, tmp_path, suffix):
     (folder / "extra.py").write_text("raise SystemExit")
-    archive = Path(
-        shutil.make_archive(str(tmp_path / "packed"), {"zip": "zip", "tar.gz": "gztar"}[suffix], tmp_path, "dots")
-    )
+    archive = packed(tmp_path, suffix)
     spec, _ = models.add(archive, hashlib.sha256(archive.read_bytes()).hexdigest())
     assert spec.name == "dots-crop3d"
     assert not (registry / "dots-crop3d" / "extra.py").exists()
@@ -378,8 +374,7 @@ def test_an_archive_cannot_write_elsewhere(folder, registry, tmp_path):
 @pytest.mark.parametrize("suffix", ["zip", "tar.gz", "tar.xz"])
 def test_an_archive_with_wrong_bytes(folder, registry, tmp_path, suffix):
     """Whatever is wrong inside, it has a code, and nothing of it is registered."""
-    kind = {"zip": "zip", "tar.gz": "gztar", "tar.xz": "xztar"}[suffix]
-    data = Path(shutil.make_archive(str(tmp_path / "packed"), kind, tmp_path, "dots")).read_bytes()
+    data = packed(tmp_path, suffix).read_bytes()
     for place in np.linspace(20, len(data) - 20, 40).astype(int):
         spoiled = bytearray(data)
         spoiled[place : place + 4] = bytes(255 - b for b in data[place : place + 4])
@@ -397,7 +392,7 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 def test_add_from_an_address(folder, registry, tmp_path, monkeypatch):
     monkeypatch.delenv("PBL_OFFLINE", raising=False)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    archive = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path, "dots"))
+    archive = packed(tmp_path, "zip")
     sha256 = hashlib.sha256(archive.read_bytes()).hexdigest()
     handler = functools.partial(Quiet, directory=str(tmp_path))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:

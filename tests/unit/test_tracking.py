@@ -8,7 +8,6 @@ import pytest
 
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.tracking import (
-    METHODS,
     AssociationParams,
     Detection,
     JoinParams,
@@ -298,13 +297,6 @@ def test_track_people_finds_nobody_in_noise(tmp_path):
 
 def test_unknown_detector_is_refused(spots_video):
     refused("SOLVER_UNKNOWN", track_people, spots_video, TrackingParams(detector="none"))
-
-
-def test_paramset_names_the_model():
-    method = METHODS["blazepose-tiles"]
-    assert (method.stage, method.version) == ("tracking", 4)
-    assert method.params.model_sha256 == TrackingParams().model_sha256
-    assert len(method.hash) == 16
 
 
 @pytest.mark.slow

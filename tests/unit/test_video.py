@@ -15,6 +15,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.container import OutputContainer
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.video import (
@@ -54,6 +55,15 @@ def noise_frames(n: int) -> Iterator[np.ndarray]:
     rng = np.random.default_rng(1)
     for _ in range(n):
         yield rng.integers(0, 255, (64, 96, 3), np.uint8)
+
+
+def stream_in(
+    container: OutputContainer, codec: str, size: tuple[int, int], pixel_format: str = "yuv420p"
+) -> av.VideoStream:
+    stream = container.add_stream(codec, rate=30)
+    assert isinstance(stream, av.VideoStream)
+    (stream.width, stream.height), stream.pix_fmt = size, pixel_format
+    return stream
 
 
 def code_of(path: Path) -> str:
@@ -210,9 +220,7 @@ def with_edit_list(tmp_path) -> Path:
     """Stamps below zero become an edit list: a player begins at the 21st picture."""
     path = tmp_path / "v.mp4"
     with av.open(str(path), "w", options={"avoid_negative_ts": "disabled", "use_editlist": "1"}) as container:
-        stream = container.add_stream("libx264", rate=30)
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        stream = stream_in(container, "libx264", (96, 64))
         for i, image in enumerate([*numbered_frames(60), None]):
             frame = None
             if image is not None:
@@ -499,9 +507,7 @@ def test_damage_inside_is_not_passed_over(whole, tmp_path, name):
 def _with_stamps(path: Path, times_s: list[float]) -> Path:
     """An MKV whose packets carry these stamps, in any order."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("mjpeg", rate=30)
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuvj420p"
+        stream = stream_in(container, "mjpeg", (96, 64), "yuvj420p")
         for image, t in zip(numbered_frames(len(times_s)), times_s, strict=True):
             for packet in stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")):
                 packet.time_base = Fraction(1, 1000)
@@ -567,12 +573,8 @@ def test_pictures_that_are_too_large_are_refused_before_one_is_decoded(tmp_path)
 def test_of_two_video_streams_the_largest_is_taken_and_said(tmp_path, large_first):
     path = tmp_path / "two.mkv"
     with av.open(str(path), "w") as container:
-        streams = []
-        for side in (128, 64) if large_first else (64, 128):
-            stream = container.add_stream("libx264", rate=30)
-            assert isinstance(stream, av.VideoStream)
-            stream.width, stream.height, stream.pix_fmt = side, side, "yuv420p"
-            streams.append(stream)
+        sides = (128, 64) if large_first else (64, 128)
+        streams = [stream_in(container, "libx264", (side, side)) for side in sides]
         for i in range(5):
             for stream in streams:
                 frame = av.VideoFrame.from_ndarray(np.zeros((stream.height, stream.width, 3), np.uint8), format="bgr24")
