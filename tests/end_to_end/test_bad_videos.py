@@ -142,12 +142,6 @@ def test_standing_is_fitted_and_has_no_gait(status):
     assert ("GaitEvents", "standing.mp4") in {(e["table"], e["about"]) for e in status["empty"]}
 
 
-def test_a_second_populate_does_nothing(status):
-    again = pbl("populate")
-    assert again.code == 0
-    assert "nothing to do" in again.out
-
-
 def test_the_report_of_a_visit_without_walking(status, tmp_path):
     done = pbl("report", "--subject", "P001", "--session", "stands", "--out", tmp_path / "report")
     assert done.code == 0, done.err

@@ -154,41 +154,25 @@ def test_read_frames_selects_by_index_and_keeps_the_stamps_of_probe(tmp_path):
         read_frames(path, start=-1)
 
 
-def test_pictures_are_bgr(tmp_path):
-    image = next(read_frames(write_video(tmp_path / "v.mp4", numbered_frames(2), constant_rate(2)))).image
-    assert image.dtype == np.uint8
-    assert image.flags.c_contiguous
-    np.testing.assert_allclose(image[4, 4], (255, 0, 0), atol=12)  # blue
-    np.testing.assert_allclose(image[-4, -4], (0, 0, 255), atol=12)  # red
-
-
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("rotation", [0, 90, 180, 270])
-def test_rotation_flag_gives_the_upright_picture(tmp_path, rotation):
+def test_pictures_are_bgr_and_as_a_player_shows_them(tmp_path, rotation, mirrored):
     """The picture has a blue block top left and a red one bottom right, and OpenCV turns it the same way."""
-    path = write_video(tmp_path / "v.mp4", numbered_frames(3), constant_rate(3), rotation_deg=rotation)
+    path = write_video(tmp_path / "v.mp4", numbered_frames(3), constant_rate(3), rotation_deg=rotation, hflip=mirrored)
     with av.open(str(path)) as container:
         stored = next(container.decode(video=0))
         assert (stored.width, stored.height) == ((96, 64) if rotation % 180 == 0 else (64, 96))
     info = probe(path)
     assert (info.width_px, info.height_px, info.rotation_deg) == (96, 64, rotation)
+    assert any("mirrored" in note for note in info.notes) == mirrored
     image = next(read_frames(path)).image
-    assert image.shape == (64, 96, 3)
-    np.testing.assert_allclose(image[4, 4], (255, 0, 0), atol=12)
-    np.testing.assert_allclose(image[-4, -4], (0, 0, 255), atol=12)
-    assert cv2.VideoCapture(str(path)).read()[1].shape == image.shape
-    assert np.abs(image.astype(float) - cv2.VideoCapture(str(path)).read()[1]).mean() < 4
-
-
-@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
-def test_mirrored_picture_is_shown_mirrored_and_said(tmp_path, rotation):
-    path = write_video(tmp_path / "v.mp4", numbered_frames(3), constant_rate(3), rotation_deg=rotation, hflip=True)
-    info = probe(path)
-    image = next(read_frames(path)).image
-    assert image.shape == (64, 96, 3)
-    np.testing.assert_allclose(image[4, -4], (255, 0, 0), atol=12)
-    np.testing.assert_allclose(image[-4, 4], (0, 0, 255), atol=12)
-    assert info.rotation_deg == rotation
-    assert any("mirrored" in note for note in info.notes)
+    assert (image.shape, image.dtype, image.flags.c_contiguous) == ((64, 96, 3), np.uint8, True)
+    blue, red = (-4, 4) if mirrored else (4, -4)
+    np.testing.assert_allclose(image[4, blue], (255, 0, 0), atol=12)
+    np.testing.assert_allclose(image[-4, red], (0, 0, 255), atol=12)
+    if not mirrored:
+        assert cv2.VideoCapture(str(path)).read()[1].shape == image.shape
+        assert np.abs(image.astype(float) - cv2.VideoCapture(str(path)).read()[1]).mean() < 4
 
 
 def test_metadata_of_a_phone(tmp_path):
