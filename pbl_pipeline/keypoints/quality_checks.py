@@ -107,7 +107,6 @@ def confidence_text(keypoints: Keypoints) -> str:
     )
 
 
-_CUT_SHARES = 0.1, 0.5
 _LEGS_HIDDEN = "the legs are hidden or hard to see: film the whole body from the side, in light"
 #: Check -> value beyond which it warns, value beyond which it fails (values are to be above both, or below), advice.
 _LIMITS: dict[str, tuple[float, float, str]] = {
@@ -123,8 +122,8 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
         "in more light, and follow the walk",
     ),
     # Fraction of the frames in which feet or head are beyond the lower or upper border.
-    "feet_cut_share": (*_CUT_SHARES, "the feet leave the picture below: tilt the phone or step back"),
-    "head_cut_share": (*_CUT_SHARES, "the head leaves the picture above: tilt the phone or step back"),
+    "feet_cut_share": (0.1, 0.5, "the feet leave the picture below: tilt the phone or step back"),
+    "head_cut_share": (0.1, 0.5, "the head leaves the picture above: tilt the phone or step back"),
     # Head to feet in the picture.
     "body_height_px": (
         100.0,
@@ -132,11 +131,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
         "the person is too small in the picture: film from nearer, or in a higher resolution; do not zoom digitally",
     ),
     # Brightness (0..255) of the brightest twentieth of the person. At about half of it people are no longer found.
-    "picture_brightness": (
-        60.0,
-        15.0,
-        "the person is too dark: switch lights on, and do not film against a window",
-    ),
+    "picture_brightness": (60.0, 15.0, "the person is too dark: switch lights on, and do not film against a window"),
     # Finest detail as a fraction of the person's size.
     "picture_detail_share": (
         0.04,
