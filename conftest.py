@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +22,7 @@ import pytest
 
 from tests import SHARED
 from tests.database import installation, leave_nothing_of_the_developer
-from tests.remembered import remembered
+from tests.remembered import points_kept_in, remembered
 
 #: How to have what the browser tests need, "" on a machine that has it.
 _CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -101,6 +102,19 @@ def phases_predicted_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(phase, "predict", remembered(phase.predict))
+        yield
+
+
+@pytest.fixture(scope="session")
+def points_seen_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """For files that measure the same recordings: in a run the networks of points look at each crop once."""
+    from pbl_pipeline.models import Network
+
+    run = tmp_path_factory.getbasetemp()
+    folder = (run.parent if "PYTEST_XDIST_WORKER" in os.environ else run) / "points"
+    folder.mkdir(exist_ok=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Network, "__call__", points_kept_in(folder, Network.__call__))
         yield
 
 

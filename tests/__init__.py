@@ -1,7 +1,12 @@
 """Tests of the product."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import pytest
+
+from pbl_pipeline.errors import PblError
 
 T = TypeVar("T")
 
@@ -13,3 +18,11 @@ def not_none(value: T | None) -> T:
     """Return what has to be there."""
     assert value is not None
     return value
+
+
+def refused(code: str, call: Callable[..., object], *arguments: Any, **named: Any) -> PblError:
+    """Call a function and return its error, which has this code."""
+    with pytest.raises(PblError) as error:
+        call(*arguments, **named)
+    assert error.value.code == code, error.value.text()
+    return error.value

@@ -124,6 +124,10 @@ class Graph:
         self.nodes.append(helper.make_node(op, list(inputs), [out], **attributes))
         return out
 
+    def one(self, value: str, i: int) -> str:
+        """The part `i` of a value along its second axis."""
+        return self("Slice", value, *(self.const([n], np.int64) for n in (i, i + 1, 1)))
+
     def build(self, inputs: list[Any], outputs: list[Any], opset: int = 17) -> onnx.ModelProto:
         graph = helper.make_graph(self.nodes, "dots", inputs, outputs, self.constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)])
@@ -135,10 +139,7 @@ class Graph:
 def _dot_weights(g: Graph, size: tuple[int, int]) -> str:
     """(N, J, H, W): how much each pixel belongs to each dot."""
     width, height = size
-    channels = [
-        g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64))
-        for i in range(3)
-    ]
+    channels = [g.one("image", i) for i in range(3)]
     columns = g.const(np.tile(np.arange(width), (height, 1))[None, None])
     parts = []
     for names, rgb in DOTS.items():
@@ -184,7 +185,7 @@ def crop3d(
     a, b = NAMES.index("head"), NAMES.index("base")
     norm = np.linalg.norm(xyz_m, axis=1)
     cos2 = float((xyz_m[a] @ xyz_m[b] / norm[a] / norm[b]) ** 2)
-    p1, p2 = (g("Slice", p, g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64)) for i in (a, b))
+    p1, p2 = g.one(p, a), g.one(p, b)
 
     def dot(u: str, v: str) -> str:
         return g("ReduceSum", g("Mul", u, v), g.const([2], np.int64), keepdims=1)
@@ -206,20 +207,11 @@ def crop3d(
     shift = np.zeros((1, len(NAMES), 3))
     for name, value in (drift_mm or {}).items():
         shift[0, NAMES.index(name), 2] = value
-    channels = [
-        g("Slice", "image", g.const([i], np.int64), g.const([i + 1], np.int64), g.const([1], np.int64))
-        for i in range(3)
-    ]
-    grey = g("ReduceMax", g("Min", *channels), axes=[2, 3], keepdims=0)  # (N, 1)
+    grey = g("ReduceMax", g("Min", *(g.one("image", i) for i in range(3))), axes=[2, 3], keepdims=0)  # (N, 1)
     drift = g("Mul", g.const(shift), g("Unsqueeze", grey, g.const([2], np.int64)))
     # A network gives a shape, not a place: any shift may be added, another one in each picture.
     g("Add", g("Sub", xyz, g("ReduceMean", xyz, axes=[1], keepdims=1)), drift, out="coords3d")
-    n = len(NAMES)
-    outputs = [
-        helper.make_tensor_value_info("coords2d", TensorProto.FLOAT, ["N", n, 2]),
-        helper.make_tensor_value_info("coords3d", TensorProto.FLOAT, ["N", n, 3]),
-    ]
-    return g.build([_image(size)], outputs)
+    return g.build([_image(size)], [_floats("coords2d", len(NAMES), 2), _floats("coords3d", len(NAMES), 3)])
 
 
 def simcc(size: tuple[int, int] = (192, 256)) -> onnx.ModelProto:
@@ -231,11 +223,7 @@ def simcc(size: tuple[int, int] = (192, 256)) -> onnx.ModelProto:
         # Each bin is a Gaussian mean of the pixels around it, as wide as the labels such a model is trained with.
         kernel = np.exp(-((np.arange(n)[:, None] - np.arange(2 * n) / 2) ** 2) / (2 * 1.5**2))
         g("MatMul", profile, g.const(kernel / kernel.sum(axis=0)), out=name)
-    n = len(NAMES)
-    outputs = [
-        helper.make_tensor_value_info("simcc_x", TensorProto.FLOAT, ["N", n, 2 * size[0]]),
-        helper.make_tensor_value_info("simcc_y", TensorProto.FLOAT, ["N", n, 2 * size[1]]),
-    ]
+    outputs = [_floats(name, len(NAMES), 2 * n) for name, n in zip(("simcc_x", "simcc_y"), size, strict=True)]
     return g.build([_image(size)], outputs)
 
 
@@ -244,12 +232,16 @@ def heatmap(size: tuple[int, int] = (192, 256), stride: int = 2) -> onnx.ModelPr
     g = Graph()
     weight = g("Div", _dot_weights(g, size), g.const(1 - _FLOOR))
     g("AveragePool", weight, kernel_shape=[stride, stride], strides=[stride, stride], out="heatmap")
-    shape = ["N", len(NAMES), size[1] // stride, size[0] // stride]
-    return g.build([_image(size)], [helper.make_tensor_value_info("heatmap", TensorProto.FLOAT, shape)])
+    return g.build([_image(size)], [_floats("heatmap", len(NAMES), size[1] // stride, size[0] // stride)])
 
 
 def _image(size: tuple[int, int]) -> Any:
-    return helper.make_tensor_value_info("image", TensorProto.FLOAT, ["N", 3, size[1], size[0]])
+    return _floats("image", 3, size[1], size[0])
+
+
+def _floats(name: str, *shape: int) -> Any:
+    """An input or output of float32 for any number of pictures."""
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", *shape])
 
 
 def spec(kind: str, size: tuple[int, int] = (256, 256), **changes: Any) -> dict[str, Any]:
@@ -285,4 +277,12 @@ def write(folder: Path, model: onnx.ModelProto, fields: dict[str, Any]) -> Path:
     (folder / "model.onnx").write_bytes(data)
     content = {"sha256": hashlib.sha256(data).hexdigest(), **fields}
     (folder / "model.json").write_text(json.dumps(content, indent=2))
+    return folder
+
+
+def changed(folder: Path, **changes: Any) -> Path:
+    """The folder with other fields in its `model.json`; None takes a field away."""
+    path = folder / "model.json"
+    content = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in content.items() if v is not None}))
     return folder

@@ -66,7 +66,7 @@ def verify(names: tuple[str, ...], device: str | None) -> None:
     failed: list[PblError] = []
     for name in names or [m.name for m in library.registered()]:
         try:
-            model = library.verify(name, device)
+            model = library.OnnxModel(library.find(name), device)
         except PblError as error:
             click.echo(f"{name}: {error.code}, {error.found}")
             failed.append(error)

@@ -17,17 +17,21 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.resources import cores
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
 from .crops import Regions, smooth_rois
 from .flips import exchange_sides, exchanged, lowered
 from .methods import METHODS
-from .passes import BatchDetector, BatchedInference, ParallelInference, n_workers, two_passes
+from .passes import BatchDetector, BatchedInference, ParallelInference, two_passes
 from .picture import Picture, PictureMeter
 from .protocol import Inspection, KeypointDetector, KeypointParams, MirrorDetector
 from .quality_checks import confidence_curve
 from .types import Keypoints, PersonKeypoints
+
+#: More detectors than this are hardly faster and take memory.
+MAX_DETECTORS = 8
 
 
 def detect_keypoints(
@@ -92,7 +96,7 @@ def _detectors(method: Method[KeypointParams]) -> list[KeypointDetector]:
     shared = getattr(first, "side_by_side", 1)
     if shared > 1:
         return [first] * shared
-    more = n_workers() - 1 if getattr(first, "per_core", False) else 0
+    more = min(cores(), MAX_DETECTORS) - 1 if getattr(first, "per_core", False) else 0
     return [first, *(method.function(method.params) for _ in range(more))]
 
 

@@ -73,24 +73,20 @@ class MultiView:
         return self.views[0].marker_set
 
     @classmethod
-    def from_calibration(
-        cls, views: Sequence[Keypoints], calibration: str | Path, cameras: Sequence[str] | None = None
-    ) -> MultiView:
+    def from_calibration(cls, views: Sequence[Keypoints], calibration: str | Path, cameras: Sequence[str]) -> MultiView:
         """Views with lens and pose from a calibration file of several cameras (Pose2Sim's TOML).
 
-        `cameras` names each view's camera in the file; None: the views are in the file's order and number. The lens of
-        the calibration replaces that of the keypoints.
+        `cameras` names each view's camera in the file. The lens of the calibration replaces that of the keypoints.
 
         Raises `PblError` FIT_INPUT, CAMERA_INVALID (see `load_camera` and `load_camera_poses`).
         """
         poses = load_camera_poses(calibration)
-        names = list(poses if cameras is None else cameras)
-        unknown = [n for n in names if n not in poses]
-        if unknown or len(names) != len(views):
-            raise _calibration_error(calibration, list(poses), [str(n) for n in unknown or names], len(views))
-        lenses = [load_camera(calibration, v.image_size_px, n) for v, n in zip(views, names, strict=True)]
+        unknown = [n for n in cameras if n not in poses]
+        if unknown or len(cameras) != len(views):
+            raise _calibration_error(calibration, list(poses), [str(n) for n in unknown or cameras], len(views))
+        lenses = [load_camera(calibration, v.image_size_px, n) for v, n in zip(views, cameras, strict=True)]
         seen = [dataclasses.replace(v, camera=lens) for v, lens in zip(views, lenses, strict=True)]
-        return cls(tuple(seen), tuple(poses[n] for n in names), tuple(names))
+        return cls(tuple(seen), tuple(poses[n] for n in cameras), tuple(cameras))
 
 
 def check_same_times(times_s: Sequence[np.ndarray], key: object = None) -> None:

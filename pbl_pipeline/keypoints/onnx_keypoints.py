@@ -90,7 +90,7 @@ def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndar
     the position of the largest value, refined by the parabola along each axis; its value, 0 to 1, is the score.
 
     Cell i is at i * width / w: cells and pixels count from the centre of the first, or both from its edge less half a
-    cell (`edge_shift`)."""
+    cell."""
     n, j, h, w = heatmap.shape
     best = heatmap.reshape(n, j, -1).argmax(axis=2)
     row, column = best // w, best % w
@@ -99,11 +99,6 @@ def from_heatmap(heatmap: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndar
     at_y, _ = _peak(heatmap[a, b, :, column])
     points = np.stack([at_x * size_px[0] / w, at_y * size_px[1] / h], axis=-1)
     return points, np.clip(top, 0.0, 1.0)
-
-
-def edge_shift(shape: tuple[int, ...], size_px: tuple[int, int]) -> np.ndarray:
-    """Half a cell (2,) of a heat map of `shape` (..., h, w) in px: from its edge to its centre."""
-    return np.array([size_px[0] / shape[-1], size_px[1] / shape[-2]]) / 2
 
 
 def _peak(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,22 +153,6 @@ class ModelKeypointParams(KeypointParams):
         """Those of the registered model. Raises `PblError` MODEL_MISSING, MODEL_INVALID."""
         spec = load_spec(find(self.model.name))
         return spec.marker_set, root_relative(spec)
-
-
-def model_params(name: str) -> ModelParams:
-    """Return the parameters of a registered model as it is now: 10 augmentations if it returns 3D, the picture and its
-    mirror image if only 2D. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN, USAGE."""
-    spec = load_spec(find(name))
-    if not spec.joint_names:
-        raise PblError(
-            "MODEL_INVALID",
-            found=f"a model of kind {spec.kind}",
-            expected="a keypoint model (crop3d, simcc or heatmap)",
-            next_step="choose another one of `pbl models list`",
-            key=name,
-        )
-    n = 10 if spec.kind == "crop3d" else 2
-    return ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n, half_root_m=HALF_M)
 
 
 class OnnxKeypoints:
@@ -281,7 +260,8 @@ class OnnxKeypoints:
         heatmap = output["heatmap"]
         points, score = from_heatmap(heatmap, size)
         if spec.pixel_origin == "edge":
-            points = points + edge_shift(heatmap.shape, size) - 0.5
+            cell = np.array([size[0] / heatmap.shape[-1], size[1] / heatmap.shape[-2]])
+            points = points + cell / 2 - 0.5
         return points, score, None
 
 
@@ -291,9 +271,21 @@ def root_relative(spec: ModelSpec) -> bool:
 
 
 def model_keypoint_params(name: str) -> ModelKeypointParams:
-    """Return the parameters of the keypoint method of a registered model. Raises as `model_params`."""
-    model = model_params(name)
-    return ModelKeypointParams(model_sha256=model.sha256, model=model)
+    """Return the parameters of the keypoint method of a registered model as it is now: 10 augmentations if it returns
+    3D, the picture and its mirror image if only 2D. Raises `PblError` MODEL_MISSING, MODEL_INVALID, MARKER_SET_UNKNOWN,
+    USAGE."""
+    spec = load_spec(find(name))
+    if not spec.joint_names:
+        raise PblError(
+            "MODEL_INVALID",
+            found=f"a model of kind {spec.kind}",
+            expected="a keypoint model (crop3d, simcc or heatmap)",
+            next_step="choose another one of `pbl models list`",
+            key=name,
+        )
+    n = 10 if spec.kind == "crop3d" else 2
+    model = ModelParams(name, spec.sha256, spec.spec_sha256, spec.licence, n, half_root_m=HALF_M)
+    return ModelKeypointParams(model_sha256=spec.sha256, model=model)
 
 
 def onnx(params: ModelKeypointParams) -> OnnxKeypoints:

@@ -17,7 +17,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pbl_pipeline.resources import cores
 from pbl_pipeline.video import Camera, Frame
 
 from .crops import Regions
@@ -96,15 +95,6 @@ class BatchedInference:
             return
         for item, person in zip(batch, found, strict=True):
             item[3].set_result(person)
-
-
-#: More detectors than this are hardly faster and take memory.
-_MAX_WORKERS = 8
-
-
-def n_workers() -> int:
-    """Number of detectors to run in parallel: the cores this process may use, at most 8."""
-    return min(cores(), _MAX_WORKERS)
 
 
 class Inference(Protocol):

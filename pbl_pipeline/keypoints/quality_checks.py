@@ -107,24 +107,54 @@ def confidence_text(keypoints: Keypoints) -> str:
     )
 
 
-#: Seconds in view: about three strides; least for a fit.
-SECONDS_WARN, SECONDS_FAIL = 3.0, 1.0
-#: Fraction of the frames between the first and the last sight of the person in which she is not found.
-ABSENT_WARN, ABSENT_FAIL = 0.05, 0.5
-#: Fraction of the frames in which feet or head are beyond the lower or upper border.
-CUT_WARN, CUT_FAIL = 0.1, 0.5
-#: Head to feet in the picture.
-HEIGHT_WARN_PX, HEIGHT_FAIL_PX = 100.0, 50.0
-#: Brightness (0..255) of the brightest twentieth of the person. At about half of it people are no longer found.
-BRIGHT_WARN, BRIGHT_FAIL = 60.0, 15.0
-#: Finest detail as a fraction of the person's size.
-DETAIL_WARN, DETAIL_FAIL = 0.04, 0.06
-#: Frames a second.
-RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 10.0
-#: Mean stated confidence of the legs' points; fraction of them within the bound of the detector's curve.
-LEGS_CONFIDENCE_WARN, LEGS_RIGHT_WARN = 0.6, 0.9
-#: Fraction of the frames in which left and right were exchanged back; if large, the others may be the wrong ones.
-EXCHANGED_WARN, EXCHANGED_FAIL = 0.02, 0.3
+_LEGS_HIDDEN = "the legs are hidden or hard to see: film the whole body from the side, in light"
+#: Check -> value beyond which it warns, value beyond which it fails (values are to be above both, or below), advice.
+_LIMITS: dict[str, tuple[float, float, str]] = {
+    # About three strides.
+    "frames_seen_s": (3.0, 0.0, "fewer than about three strides are in view: film a longer walk"),
+    # The same, and the least for a fit.
+    "whole_person_s": (3.0, 1.0, "keep head and feet in the picture, step back or film a longer walk"),
+    # Fraction of the frames between the first and the last sight of the person in which she is not found.
+    "frames_without_person_share": (
+        0.05,
+        0.5,
+        "the person is lost again and again between the first and the last frame: film without others in between, "
+        "in more light, and follow the walk",
+    ),
+    # Fraction of the frames in which feet or head are beyond the lower or upper border.
+    "feet_cut_share": (0.1, 0.5, "the feet leave the picture below: tilt the phone or step back"),
+    "head_cut_share": (0.1, 0.5, "the head leaves the picture above: tilt the phone or step back"),
+    # Head to feet in the picture.
+    "body_height_px": (
+        100.0,
+        50.0,
+        "the person is too small in the picture: film from nearer, or in a higher resolution; do not zoom digitally",
+    ),
+    # Brightness (0..255) of the brightest twentieth of the person. At about half of it people are no longer found.
+    "picture_brightness": (60.0, 15.0, "the person is too dark: switch lights on, and do not film against a window"),
+    # Finest detail as a fraction of the person's size.
+    "picture_detail_share": (
+        0.04,
+        0.06,
+        "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
+        "the lens, and let it focus on the person",
+    ),
+    "frame_rate_hz": (
+        20.0,
+        10.0,
+        "too few frames a second for fast movements and the moment of a step: film with 30 or 60",
+    ),
+    # Mean stated confidence of the legs' points; fraction of them within the bound of the detector's curve.
+    "leg_confidence": (0.6, 0.0, _LEGS_HIDDEN),
+    "leg_points_right_share": (0.9, 0.0, _LEGS_HIDDEN),
+    # Fraction of the frames in which left and right were exchanged back; if large, the others may be the wrong ones.
+    "sides_exchanged_share": (
+        0.02,
+        0.3,
+        "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
+        "the movement now: look at the overlay, film in better light or more from the side",
+    ),
+}
 #: Turn between neighbouring frames (deg) that no person makes; single frames of noise stay below.
 _TURN_DEG = 90.0
 _LONGEST_STEP_S = 0.2
@@ -152,30 +182,10 @@ def _time(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     shown = visibility(keypoints)
     first, last = np.flatnonzero(seen)[[0, -1]]
     absent = 1.0 - float(np.mean(seen[first : last + 1]))
-    return [
-        _limit_check(
-            "frames_seen_s",
-            seconds,
-            SECONDS_WARN,
-            0.0,
-            "fewer than about three strides are in view: film a longer walk",
-        ),
-        _limit_check(
-            "whole_person_s",
-            shown.counts_s,
-            SECONDS_WARN,
-            SECONDS_FAIL,
-            f"{shown.text()}: keep head and feet in the picture, step back or film a longer walk",
-        ),
-        _limit_check(
-            "frames_without_person_share",
-            absent,
-            ABSENT_WARN,
-            ABSENT_FAIL,
-            "the person is lost again and again between the first and the last frame: film without others in between, "
-            "in more light, and follow the walk",
-        ),
-    ]
+    whole = _limit_check("whole_person_s", shown.counts_s)
+    if whole is not None and whole.advice:
+        whole = dataclasses.replace(whole, advice=f"{shown.text()}: {whole.advice}")
+    return [_limit_check("frames_seen_s", seconds), whole, _limit_check("frames_without_person_share", absent)]
 
 
 def _cut(keypoints: Keypoints) -> list[Check | None]:
@@ -187,27 +197,15 @@ def _cut(keypoints: Keypoints) -> list[Check | None]:
     seen = found.mean(axis=1) >= SEEN_SHARE * given.mean()
     checks: list[Check | None] = []
     (feet, low), (head, high) = ends(keypoints)
-    for name, points, at_border, advice in (
-        ("feet_cut_share", feet, low, "the feet leave the picture below: tilt the phone or step back"),
-        ("head_cut_share", head, high, "the head leaves the picture above: tilt the phone or step back"),
-    ):
+    for name, points, at_border in (("feet_cut_share", feet, low), ("head_cut_share", head, high)):
         if points.any() and seen.any():
             cut = at_border & ~found[:, points].all(axis=1)
-            checks.append(_limit_check(name, float(np.mean(cut[seen])), CUT_WARN, CUT_FAIL, advice))
+            checks.append(_limit_check(name, float(np.mean(cut[seen]))))
     whole = found[:, feet].any(axis=1) & found[:, head].any(axis=1)
     if whole.any():
         points = np.where(found[whole][..., None], xy[whole], np.nan)
         extent = np.nanmax(points, axis=1) - np.nanmin(points, axis=1)
-        checks.append(
-            _limit_check(
-                "body_height_px",
-                float(np.median(extent.max(axis=1))),
-                HEIGHT_WARN_PX,
-                HEIGHT_FAIL_PX,
-                "the person is too small in the picture: film from nearer, or in a higher resolution; do not zoom "
-                "digitally",
-            )
-        )
+        checks.append(_limit_check("body_height_px", float(np.median(extent.max(axis=1)))))
     return checks
 
 
@@ -216,31 +214,14 @@ def _picture(keypoints: Keypoints) -> list[Check | None]:
     if picture is None or not len(picture.time_s):
         return []
     return [
-        _limit_check(
-            "picture_brightness",
-            picture.bright,
-            BRIGHT_WARN,
-            BRIGHT_FAIL,
-            "the person is too dark: switch lights on, and do not film against a window",
-        ),
-        _limit_check(
-            "picture_detail_share",
-            picture.detail_share,
-            DETAIL_WARN,
-            DETAIL_FAIL,
-            "the picture of the person is blurred: film in more light (a shorter exposure), hold the phone still, wipe "
-            "the lens, and let it focus on the person",
-        ),
+        _limit_check("picture_brightness", picture.bright),
+        _limit_check("picture_detail_share", picture.detail_share),
     ]
 
 
 def _rate(time_s: np.ndarray) -> Check | None:
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    if not interval_s > 0:
-        return None
-    rate = 1.0 / interval_s
-    advice = "too few frames a second for fast movements and the moment of a step: film with 30 or 60"
-    return _limit_check("frame_rate_hz", rate, RATE_WARN_HZ, RATE_FAIL_HZ, advice)
+    return _limit_check("frame_rate_hz", 1.0 / interval_s) if interval_s > 0 else None
 
 
 def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
@@ -248,29 +229,22 @@ def _legs(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     legs = [i for i, n in enumerate(keypoints.names) if n.startswith(("left_", "right_")) and n.endswith(_LEGS)]
     if not legs:
         return []
-    advice = "the legs are hidden or hard to see: film the whole body from the side, in light"
-    mean = float(keypoints.confidence[seen][:, legs].mean())
-    found = [_limit_check("leg_confidence", mean, LEGS_CONFIDENCE_WARN, 0.0, advice)]
+    found = [_limit_check("leg_confidence", float(keypoints.confidence[seen][:, legs].mean()))]
     probability = probability_within(keypoints)
     if probability is not None:
-        fraction = float(probability[seen][:, legs].mean())
-        found.append(_limit_check("leg_points_right_share", fraction, LEGS_RIGHT_WARN, 0.0, advice))
+        found.append(_limit_check("leg_points_right_share", float(probability[seen][:, legs].mean())))
     return found
 
 
 def _sides(keypoints: Keypoints, seen: np.ndarray) -> list[Check | None]:
     if not {"left_hip", "right_hip"} <= set(keypoints.names):
         return []
-    changes = float(len(side_changes(keypoints)))
     advice = "left and right change places between frames: look at the overlay; film from the side"
-    found = [_limit_check("side_changes", changes, 0.0, 0.02 * float(seen.sum()), advice)]
+    limits = 0.0, 0.02 * float(seen.sum()), advice
+    found = [_limit_check("side_changes", float(len(side_changes(keypoints))), limits)]
     if keypoints.sides_changed is not None:
         fraction = float(keypoints.sides_changed[seen].any(axis=1).mean())
-        advice = (
-            "the detector took left for right, or could not tell them, in this share of the frames; their names follow "
-            "the movement now: look at the overlay, film in better light or more from the side"
-        )
-        found.append(_limit_check("sides_exchanged_share", fraction, EXCHANGED_WARN, EXCHANGED_FAIL, advice))
+        found.append(_limit_check("sides_exchanged_share", fraction))
     return found
 
 
@@ -287,10 +261,11 @@ def side_changes(keypoints: Keypoints) -> np.ndarray:
     return rows[1:][turned & (np.diff(keypoints.time_s[rows]) <= _LONGEST_STEP_S)]
 
 
-def _limit_check(check: str, value: float, warn: float, fail: float, advice: str) -> Check | None:
-    """Check of a value that should be high (`warn` above `fail`) or low (`warn` below it); None if it is not known."""
+def _limit_check(check: str, value: float, limits: tuple[float, float, str] | None = None) -> Check | None:
+    """Check of a value by its `_LIMITS`, or by others; None if the value is not known."""
     if not np.isfinite(value):
         return None
+    warn, fail, advice = limits or _LIMITS[check]
     sign = 1.0 if warn > fail else -1.0
     outcome = FAIL if sign * value < sign * fail else WARN if sign * value < sign * warn else PASS
     return Check(check, outcome, value, fail if outcome == FAIL else warn, "" if outcome == PASS else advice)

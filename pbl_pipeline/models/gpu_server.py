@@ -23,7 +23,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from .network import NetworkSpec, receive, receive_line, send_line
+from .network import NetworkSpec, batches, receive, receive_line, send_line
 from .tflite import LiteModel, read_network
 
 #: Pictures in one call of a network, and the least if the GPU's memory does not suffice.
@@ -74,18 +74,12 @@ class Program:
         """Return the outputs (N, sum of sizes) of pictures (N, H, W, 3) uint8."""
         while True:
             try:
-                parts = [self._run(self._weights, part) for part in self._parts(images)]
+                parts = [self._run(self._weights, part) for part in batches(images, self.batch)]
                 return np.concatenate([np.asarray(p) for p in parts])[: len(images)]
             except RuntimeError as error:
                 if "RESOURCE_EXHAUSTED" not in str(error) or self.batch <= LEAST_BATCH:
                     raise
                 self.batch //= 2
-
-    def _parts(self, images: np.ndarray) -> list[np.ndarray]:
-        short = -len(images) % self.batch
-        if short:
-            images = np.concatenate([images, np.zeros((short, *images.shape[1:]), images.dtype)])
-        return [images[i : i + self.batch] for i in range(0, len(images), self.batch)]
 
     def _check(self, spec: NetworkSpec) -> None:
         picture = np.random.default_rng(0).integers(0, 256, self.image_shape, np.uint8)

@@ -156,6 +156,14 @@ class _Remote:
                 self._waiting.popleft().set_exception(self._broken)
 
 
+def batches(values: np.ndarray, size: int) -> list[np.ndarray]:
+    """Split values (N, ...) into batches of `size`, the last one filled with zeros."""
+    short = -len(values) % size
+    if short:
+        values = np.concatenate([values, np.zeros((short, *values.shape[1:]), values.dtype)])
+    return [values[i : i + size] for i in range(0, len(values), size)]
+
+
 def send_line(connection: socket.socket, value: object) -> None:
     """Send a value as one line of JSON."""
     connection.sendall(json.dumps(value).encode() + b"\n")

@@ -12,6 +12,7 @@ from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.resources import cores
 
 from .devices import asked_device, device_of, providers_for, unavailable
+from .network import batches
 from .spec import GRAPH_FILE, SPEC_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
 
 _DTYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -77,15 +78,11 @@ class OnnxModel:
         A graph with a fixed batch is called several times if necessary.
         """
         inputs = self._inputs(crops, gamma)
-        size = self.fixed_batch or len(inputs)
-        parts: list[list[Any]] = []
-        for start in range(0, len(inputs), size):
-            part = inputs[start : start + size]
-            short = size - len(part)
-            padded = np.concatenate([part, np.zeros((short, *part.shape[1:]), part.dtype)]) if short else part
-            got: list[Any] = list(self._session.run(self._outputs, {self.spec.input.name: padded}))
-            parts.append([np.asarray(g)[: len(part)] for g in got])
-        joined = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
+        parts: list[Any] = [
+            self._session.run(self._outputs, {self.spec.input.name: part})
+            for part in batches(inputs, self.fixed_batch or len(inputs))
+        ]
+        joined = (np.concatenate(p)[: len(inputs)].astype(np.float32) for p in zip(*parts, strict=True))
         return dict(zip(self.spec.outputs, joined, strict=True))
 
     def _inputs(self, crops: np.ndarray, gamma: np.ndarray | None) -> np.ndarray:

@@ -233,11 +233,6 @@ def remove(name: str) -> Path:
     return folder
 
 
-def verify(name: str, device: str | None = None) -> OnnxModel:
-    """Load a registered model and run it once: checksum, graph, shapes. Raises as `OnnxModel`."""
-    return OnnxModel(find(name), device)
-
-
 def _status(name: str, folder: Path) -> ModelStatus:
     try:
         spec = load_spec(folder)

@@ -23,6 +23,9 @@ from scipy.optimize import linear_sum_assignment
 
 from .types import Detection
 
+#: Distance (body heights) below which two states are of one person.
+SAME_BODY = 0.25
+
 
 @dataclasses.dataclass(frozen=True)
 class AssociationParams:
@@ -58,6 +61,20 @@ class Trail:
     def of(cls, frame: int, time_s: float, detection: Detection) -> Trail:
         """Begin a trail, at rest."""
         return cls([frame], [time_s], [detection], np.zeros(3))
+
+    @classmethod
+    def of_parts(cls, *parts: Trail) -> Trail:
+        """Concatenate trails that follow each other; the velocity is that of the last."""
+        return cls(
+            [f for p in parts for f in p.frames],
+            [t for p in parts for t in p.times],
+            [d for p in parts for d in p.detections],
+            parts[-1].velocity,
+        )
+
+    def part(self, rows: slice) -> Trail:
+        """The trail with some of its sightings."""
+        return Trail(self.frames[rows], self.times[rows], self.detections[rows], self.velocity)
 
     @property
     def last_time(self) -> float:
@@ -115,6 +132,16 @@ def measure(detection: Detection) -> np.ndarray:
         return np.array([x, y, np.log(side)])
     x0, y0, x1, y1 = detection.box_px
     return np.array([(x0 + x1) / 2, (y0 + y1) / 2, np.log(max(y1 - y0, 1.0))])
+
+
+def heights_apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Distance of two states (`measure`) in body heights."""
+    return float(np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2))
+
+
+def same_body(a: np.ndarray, b: np.ndarray) -> bool:
+    """True if two states (`measure`) of one frame are so close that both are of one person."""
+    return heights_apart(a, b) < SAME_BODY
 
 
 class Associator:
@@ -188,9 +215,7 @@ class Associator:
 def pair_cost(trail: Trail, time_s: float, detection: Detection, params: AssociationParams) -> float:
     """Cost of continuing a trail with a detection at `time_s`, in body heights."""
     predicted, seen = trail.predict(time_s), measure(detection)
-    size = np.exp((predicted[2] + seen[2]) / 2)
-    distance = float(np.hypot(*(seen[:2] - predicted[:2]))) / size
     turn = detection.roi_px[3] - trail.detections[-1].roi_px[3]
     turned = 1.0 - float(np.cos(turn)) if np.isfinite(turn) else 0.0
     grown = abs(float(seen[2] - predicted[2]))
-    return distance + params.size_weight * grown + params.turn_weight * turned
+    return heights_apart(seen, predicted) + params.size_weight * grown + params.turn_weight * turned

@@ -93,7 +93,7 @@ def _exchange_fits(a: Trail, b: Trail, begin: float, end: float, params: Uncross
 
 def _part(trail: Trail, low: float, high: float) -> Trail:
     rows = slice(int(np.searchsorted(trail.times, low, "right")), int(np.searchsorted(trail.times, high)))
-    return Trail(trail.frames[rows], trail.times[rows], trail.detections[rows], trail.velocity)
+    return trail.part(rows)
 
 
 def _cost(before: Trail, after: Trail, params: UncrossParams) -> float:
@@ -120,14 +120,8 @@ def _appearance_near(trail: Trail, at_s: float) -> np.ndarray:
 
 
 def _exchanged(a: Trail, b: Trail, at_s: float) -> tuple[Trail, Trail]:
-    def cut(first: Trail, second: Trail) -> Trail:
-        i = int(np.searchsorted(first.times, at_s))
-        j = int(np.searchsorted(second.times, at_s))
-        return Trail(
-            [*first.frames[:i], *second.frames[j:]],
-            [*first.times[:i], *second.times[j:]],
-            [*first.detections[:i], *second.detections[j:]],
-            second.velocity,
-        )
-
-    return cut(a, b), cut(b, a)
+    i, j = (int(np.searchsorted(t.times, at_s)) for t in (a, b))
+    return (
+        Trail.of_parts(a.part(slice(i)), b.part(slice(j, None))),
+        Trail.of_parts(b.part(slice(j)), a.part(slice(i, None))),
+    )

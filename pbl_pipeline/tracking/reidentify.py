@@ -18,7 +18,7 @@ import numpy as np
 from pbl_pipeline.video import Frame
 
 from .appearance import appearance_similarity, mean_appearance, with_appearance
-from .associate import AssociationParams, Trail, measure, pair_cost
+from .associate import AssociationParams, Trail, measure, pair_cost, same_body
 from .detection_schedule import window_around
 from .identity_swaps import line_near
 from .tiling import detect_in
@@ -108,7 +108,7 @@ def _with_sightings(
         at = sign * time_s
         found = detect_in(detector, scene, [window_around(more.predict(at), window_sizes)])
         others = taken(index, time_s)
-        free = [d for d in found if not any(_same(measure(d), o) for o in others)]
+        free = [d for d in found if not any(same_body(measure(d), o) for o in others)]
         # As in `Associator`: the gate widens with time, but not for detections that are not sure.
         wider = params.gate_per_s * (at - more.last_time)
         gates = [params.gate + (wider if d.score >= params.sure_score else 0.0) for d in free]
@@ -121,23 +121,16 @@ def _with_sightings(
         misses += 1
         if misses > MAX_MISSES:
             break
-    frames, times, seen = more.frames[1:], [sign * t for t in more.times[1:]], more.detections[1:]
+    seen = Trail(more.frames, [sign * t for t in more.times], more.detections, trail.velocity)
     if sign > 0:
-        return Trail([*trail.frames, *frames], [*trail.times, *times], [*trail.detections, *seen], trail.velocity)
-    velocity = -more.velocity if len(trail.frames) == 1 else trail.velocity
-    return Trail(
-        [*frames[::-1], *trail.frames], [*times[::-1], *trail.times], [*seen[::-1], *trail.detections], velocity
-    )
+        return Trail.of_parts(trail, seen.part(slice(1, None)))
+    whole = Trail.of_parts(seen.part(slice(None, 0, -1)), trail)
+    return dataclasses.replace(whole, velocity=-more.velocity) if len(trail.frames) == 1 else whole
 
 
 def _at(trail: Trail, index: int) -> slice:
     row = int(np.searchsorted(trail.frames, index))
     return slice(row, row + 1) if row < len(trail.frames) and trail.frames[row] == index else slice(0, 0)
-
-
-def _same(here: np.ndarray, there: np.ndarray) -> bool:
-    """True if two states (`measure`) of one frame are of one person: nearer than a quarter of a body."""
-    return bool(np.hypot(*(here[:2] - there[:2])) < 0.25 * np.exp((here[2] + there[2]) / 2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,7 +172,7 @@ def _join_by_movement(trails: Sequence[Trail], size_px: tuple[int, int], params:
         if not sole:
             return rest
         a, b = sole[0]
-        rest = [_whole(a, b) if t is a else t for t in rest if t is not b]
+        rest = [Trail.of_parts(a, b) if t is a else t for t in rest if t is not b]
 
 
 def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]:
@@ -214,7 +207,7 @@ def _join_by_clothes(trails: Sequence[Trail], params: JoinParams) -> list[Trail]
             best.append(trail)
         else:
             people.append([trail])
-    return [_whole(*p) for p in people]
+    return [Trail.of_parts(*p) for p in people]
 
 
 def _appearance(parts: Sequence[Trail], params: JoinParams) -> np.ndarray:
@@ -227,15 +220,6 @@ def _alike_in_size(a: Trail, b: Trail, params: JoinParams) -> bool:
     if before is None or after is None:
         return False
     return abs(float(np.log(before[2] / after[2]))) <= np.log(params.return_growth)
-
-
-def _whole(*parts: Trail) -> Trail:
-    return Trail(
-        [f for p in parts for f in p.frames],
-        [t for p in parts for t in p.times],
-        [d for p in parts for d in p.detections],
-        parts[-1].velocity,
-    )
 
 
 def _one_person(a: Trail, b: Trail, size_px: tuple[int, int], p: JoinParams) -> bool:

@@ -27,16 +27,15 @@ _JPEG_QUALITY = 85
 _COLOURS = ((80, 220, 80), (60, 120, 255), (255, 160, 40), (220, 80, 220), (60, 220, 255), (200, 200, 200))
 
 
-def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int] | None = None) -> np.ndarray:
+def contact_sheet(video_path: str | Path, tracking: Tracking, persons: Sequence[int]) -> np.ndarray:
     """Draw a few frames in order of time (H, W, 3) uint8 BGR, all of `persons` boxed and numbered.
 
-    `persons` (default: all people) in order of interest: the frame that shows each best, for as many as there is room,
-    then frames spread over the video in which most of them are in view.
+    `persons` in order of interest: the frame that shows each best, for as many as there is room, then frames spread
+    over the video in which most of them are in view.
 
     Raises `ValueError` if no one was tracked, and the `PblError`s of `video.read_frames`.
     """
-    wanted = list(persons) if persons is not None else [p.person_id for p in tracking.persons]
-    people = [p for k in wanted for p in tracking.persons if p.person_id == k]
+    people = [p for k in persons for p in tracking.persons if p.person_id == k]
     if not people:
         raise ValueError("a contact sheet needs at least one person")
     moments = _moments(people, tracking)
@@ -57,7 +56,7 @@ def contact_sheet_jpeg(video_path: str | Path, tracking: Tracking, choice: Subje
 
 
 def save_contact_sheet(
-    video_path: str | Path, tracking: Tracking, out_path: str | Path, persons: Sequence[int] | None = None
+    video_path: str | Path, tracking: Tracking, out_path: str | Path, persons: Sequence[int]
 ) -> Path:
     """Write the `contact_sheet` as PNG or JPEG, by the suffix of `out_path`.
 

@@ -18,7 +18,7 @@ from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from .appearance import with_appearance
-from .associate import Associator, Trail, interpolate, measure
+from .associate import Associator, Trail, interpolate, measure, same_body
 from .blazepose import body_box
 from .detection_schedule import Watch, window_around
 from .identity_swaps import undo_swaps
@@ -28,9 +28,8 @@ from .reidentify import backtrack, join_trails, with_exact_ends
 from .tiling import detect_in
 from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking, WindowDetector
 
-#: Least overlap of the boxes in a second detection of a new person, and distance (body heights) from a known person's
-#: predicted position below which it is a poor view of that person.
-CONFIRM_IOU, SAME_BODY = 0.3, 0.25
+#: Least overlap of the boxes in a second detection of a new person.
+CONFIRM_IOU = 0.3
 #: Rotation (rad) beyond which a body is upside down, and the fraction of such sightings beyond which a video is.
 UPSIDE_DOWN_RAD, UPSIDE_DOWN_SHARE = 0.75 * np.pi, 0.5
 #: Frames decoded ahead while the detector runs, which takes as long as decoding some.
@@ -139,7 +138,7 @@ def _confirmed(
     it. A window around the person must find her again, at about the same position, away from known people.
     """
     known = [t.predict(time_s) for t in live]
-    if any(_near(measure(new), k) for k in known):
+    if any(same_body(measure(new), k) for k in known):
         return None
     window = window_around(measure(new), params.watch.window_sizes)
     again = [d for d in detect_in(detector, scene, [window]) if d.score >= params.association.sure_score]
@@ -147,15 +146,9 @@ def _confirmed(
         return None
     overlap = box_iou(new.box_px, np.array([d.box_px for d in again]))
     best = again[int(np.argmax(overlap))]
-    if overlap.max() < CONFIRM_IOU or any(_near(measure(best), k) for k in known):
+    if overlap.max() < CONFIRM_IOU or any(same_body(measure(best), k) for k in known):
         return None
     return with_appearance(best, scene)
-
-
-def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    """True if two states (`measure`) are so close that both are of one person."""
-    apart = np.hypot(*(a[:2] - b[:2])) / np.exp((a[2] + b[2]) / 2)
-    return bool(apart < SAME_BODY)
 
 
 def _is_real(trail: Trail, params: TrackingParams) -> bool:

@@ -205,9 +205,14 @@ def different_views(views: Sequence[View], image_size_px: tuple[int, int], most:
 
 def covered(views: Sequence[View], image_size_px: tuple[int, int]) -> float:
     """Fraction of the picture's cells in which a corner was seen."""
+    return len(_cells(views, image_size_px)) / (CELLS[0] * CELLS[1])
+
+
+def _cells(views: Sequence[View], image_size_px: tuple[int, int]) -> set[tuple[int, ...]]:
+    """Columns and rows of the cells in which a corner was seen."""
     xy = np.concatenate([v.xy_px for v in views])
     cell = np.clip((xy + 0.5) / image_size_px * CELLS, 0, np.array(CELLS) - 1).astype(int)
-    return len(np.unique(cell, axis=0)) / (CELLS[0] * CELLS[1])
+    return set(map(tuple, cell.tolist()))
 
 
 # ------------------------------------------------------------------------------------------------------------ the fit
@@ -322,15 +327,10 @@ def draw_calibration(found: Calibration) -> np.ndarray:
     scale = _SIDE_PX / max(found.image_size_px)
     width, height = (round(n * scale) for n in found.image_size_px)
     picture = np.full((height, width, 3), 255, np.uint8)
-    xy = np.concatenate([v.xy_px for v in found.views])
-    cell = np.clip((xy + 0.5) / found.image_size_px * CELLS, 0, np.array(CELLS) - 1).astype(int)
-    seen = {(int(a), int(b)) for a, b in cell}
-    for i in range(CELLS[0]):
-        for j in range(CELLS[1]):
-            if (i, j) not in seen:
-                low = (round(i * width / CELLS[0]), round(j * height / CELLS[1]))
-                high = (round((i + 1) * width / CELLS[0]), round((j + 1) * height / CELLS[1]))
-                cv2.rectangle(picture, low, high, (235, 235, 250), -1)
+    for i, j in set(np.ndindex(CELLS)) - _cells(found.views, found.image_size_px):
+        low = (round(i * width / CELLS[0]), round(j * height / CELLS[1]))
+        high = (round((i + 1) * width / CELLS[0]), round((j + 1) * height / CELLS[1]))
+        cv2.rectangle(picture, low, high, (235, 235, 250), -1)
     _draw_grid(picture, found, scale)
     for view, residual in zip(found.views, found.residual_px, strict=True):
         for place, off in zip(view.xy_px, residual, strict=True):

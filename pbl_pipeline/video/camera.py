@@ -117,7 +117,11 @@ _OTHER_SIZE, _ALIKE = 0.2, 0.05
 #: Largest factor by which the distortion of a lens may move a corner outwards.
 _MOST_STRETCH = 2.0
 
-_NEXT = "correct the file, or leave it out: then a phone's field of view is assumed, and the result states that"
+_invalid = functools.partial(
+    PblError,
+    "CAMERA_INVALID",
+    next_step="correct the file, or leave it out: then a phone's field of view is assumed, and the result states that",
+)
 
 
 def guess_camera(video: VideoInfo | tuple[int, int]) -> Camera:
@@ -212,10 +216,10 @@ def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int,
         raise _invalid(f"no field {name}", expected, key=path)
     try:
         value = np.asarray(fields[name], dtype=np.float64).ravel()
-    except (TypeError, ValueError, OverflowError) as error:
-        raise _invalid(f"{name} = {_shown(fields[name])}", expected, key=path) from error
+    except (TypeError, ValueError, OverflowError):
+        value = np.array([])
     if len(value) not in lengths or not np.isfinite(value).all():
-        raise _invalid(f"{name} = {_shown(fields[name])}", expected, key=path)
+        raise _invalid(f"{name} = {repr(fields[name])[:200]}", expected, key=path)
     return value
 
 
@@ -324,14 +328,6 @@ def _to_corner(
     turns = np.flatnonzero(np.diff(distorted) <= 0)
     end = int(turns[0]) + 1 if len(turns) else len(r)
     return corner, r[:end], distorted[:end]
-
-
-def _shown(value: object) -> str:
-    """The first 200 characters of a field's value as it stands in the file."""
-    return repr(value)[:200]
-
-
-_invalid = functools.partial(PblError, "CAMERA_INVALID", next_step=_NEXT)
 
 
 def viewing_ray(xy_px: np.ndarray, camera: Camera) -> np.ndarray:

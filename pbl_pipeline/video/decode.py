@@ -30,6 +30,8 @@ FFMPEG_ERRORS = (FFmpegError, MemoryError)
 #: Largest decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 reference pictures, and one for
 #: each thread; 16 of 5.3K with 5 threads take 760 MiB.
 _MAX_PICTURE, _MAX_IN_THREADS = 26 << 20, 128 << 20
+#: More threads cost memory and gain nothing.
+_MAX_THREADS = 8
 #: Most pixels of a picture, in the format with the fewest bytes for each (8 bits, colour at half the resolution).
 _MAX_PIXELS = {"max_pixels": str(_MAX_PICTURE * 2 // 3)}
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file", **_MAX_PIXELS}
@@ -71,11 +73,6 @@ def check_file(path: str | Path) -> Path:
     return path
 
 
-def decode_threads() -> int:
-    """Number of threads for decoding: the cores this process may use, at most 8 (more cost memory and gain nothing)."""
-    return min(cores(), 8)
-
-
 class Decoder:
     """Iterate over `(pts, frame)` once; `time_base` converts a stamp to seconds, `notes` are complete at the end.
 
@@ -95,7 +92,7 @@ class Decoder:
         self.stream = self._pick_stream()
         self.stream.thread_type = "SLICE" if exact else "AUTO"
         room = max(1, _MAX_IN_THREADS // max(1, _picture_bytes(self.stream)))
-        self.stream.codec_context.thread_count = min(threads or decode_threads(), room)
+        self.stream.codec_context.thread_count = min(threads or min(cores(), _MAX_THREADS), room)
         self.stream.codec_context.options = _MAX_PIXELS  # also refuses pictures that are larger than announced
         self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
         self.n_frames = 0

@@ -205,7 +205,7 @@ def load_lens_calibration(path: str | Path, like: str | Path | None = None) -> L
     return LensCalibration(lens, load_camera(path, size), size, rotation)
 
 
-def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Camera:
+def calibrated_camera(file: str | Path, video: FirstPicture) -> Camera:
     """Return the intrinsics in a calibration file, for the upright picture of a video.
 
     If the file states the rotation flag (`pbl calibrate` does) and the video has the other format (portrait,
@@ -224,7 +224,7 @@ def calibrated_camera(file: str | Path, video: VideoInfo | FirstPicture) -> Came
     return turned_camera(camera, size, turn)
 
 
-def _turn_between(content: Mapping[str, Any], video: VideoInfo | FirstPicture) -> int:
+def _turn_between(content: Mapping[str, Any], video: FirstPicture) -> int:
     """Angle (deg, clockwise) from the calibrated picture to the video's. Flags that differ by a quarter turn in
     pictures of one format are those of a copy whose pictures were turned."""
     filmed, size = content.get("video"), content.get("image_size_px")
@@ -240,7 +240,7 @@ def _whole(size: object) -> TypeGuard[list[int]]:
     return isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) for n in size)
 
 
-def _check_same_phone(content: Mapping[str, Any], video: VideoInfo | FirstPicture) -> None:
+def _check_same_phone(content: Mapping[str, Any], video: FirstPicture) -> None:
     measured = content.get("phone")
     if not isinstance(measured, Mapping):
         return

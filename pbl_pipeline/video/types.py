@@ -65,7 +65,17 @@ def square(matrix: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class FirstPicture:
-    """Facts of a video that are known from its first picture; fields as in `VideoInfo`."""
+    """Facts of a video that are known from its first picture. Sizes are as it plays, after the rotation flag.
+
+    Attributes
+    ----------
+    rotation_deg
+        Clockwise rotation of the stored picture to stand upright: 0, 90, 180 or 270.
+    make, model, lens
+        As the phone wrote them, or None: "Apple", "iPhone 13", "iPhone 13 back dual wide camera 5.1mm f/1.6".
+    focal_35mm
+        Focal length (mm) of the same view on 35 mm film, or None.
+    """
 
     path: str
     width_px: int
@@ -73,13 +83,13 @@ class FirstPicture:
     rotation_deg: int
     make: str | None
     model: str | None
-    lens: str | None
-    focal_35mm: float | None
+    lens: str | None = None
+    focal_35mm: float | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class VideoInfo:
-    """A probed video. Sizes are after the rotation flag is applied, as it plays.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VideoInfo(FirstPicture):
+    """A probed video.
 
     Attributes
     ----------
@@ -89,8 +99,6 @@ class VideoInfo:
         1 / median frame interval; for display only: computations use `time_s`.
     n_frames_announced
         Number of frames in the container's header (0 if not stated). Only decoded frames count.
-    rotation_deg
-        Clockwise rotation of the stored picture to stand upright: 0, 90, 180 or 270.
     duration_s
         From the first frame to the end of the last (its length taken as the median interval); NaN for a single frame
         whose container announces no rate, as is `fps`.
@@ -98,10 +106,6 @@ class VideoInfo:
         True if an interval differs from the median by more than a tenth and more than the rounding of the stamps.
     recorded_utc
         "2026-01-31T09:15:00Z", or None if not stated.
-    make, model, lens
-        As the phone wrote them, or None: "Apple", "iPhone 13", "iPhone 13 back dual wide camera 5.1mm f/1.6".
-    focal_35mm
-        Focal length (mm) of the same view on 35 mm film, or None.
     capture_fps
         Frames per second at which the phone recorded, or None if not stated. Above `fps` for slow motion, whose stamps
         are slower than the movement.
@@ -109,15 +113,11 @@ class VideoInfo:
         Remarks for the reader: frames hidden by an edit list, repeated stamps, a mirrored picture.
     """
 
-    path: str
     sha256: str
     size_bytes: int
     container: str
     codec: str
     pixel_format: str
-    width_px: int
-    height_px: int
-    rotation_deg: int
     time_s: np.ndarray
     fps: float
     duration_s: float
@@ -125,11 +125,7 @@ class VideoInfo:
     n_frames_announced: int
     variable_frame_rate: bool
     recorded_utc: str | None
-    make: str | None
-    model: str | None
     notes: tuple[str, ...] = ()
-    lens: str | None = None
-    focal_35mm: float | None = None
     capture_fps: float | None = None
 
 

@@ -21,7 +21,7 @@ from tests.command import Done, pbl
 from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("points_seen_once")]
 
 EMPTY = "niemand ist da, früh.mp4"
 
@@ -140,12 +140,6 @@ def test_standing_is_fitted_and_has_no_gait(status):
     assert pd.isna(visit["session_cadence"])
     assert visit["fit_residual_2d"] < 10
     assert ("GaitEvents", "standing.mp4") in {(e["table"], e["about"]) for e in status["empty"]}
-
-
-def test_a_second_populate_does_nothing(status):
-    again = pbl("populate")
-    assert again.code == 0
-    assert "nothing to do" in again.out
 
 
 def test_the_report_of_a_visit_without_walking(status, tmp_path):

@@ -16,7 +16,7 @@ from tests import notebook
 from tests.command import pbl
 from tests.rows import remove_all
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("points_seen_once")]
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "notebooks"
 _NUMBER, _TAG = r"-?\d+(?:\.\d+)?", r"<style.*?</style>|<[^>]*>"

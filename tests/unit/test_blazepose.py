@@ -23,6 +23,7 @@ from pbl_pipeline.tracking import BlazePoseDetector
 from pbl_pipeline.tracking.blazepose import LAYOUT
 from pbl_pipeline.tracking.tiling import detect_in, tiles
 from pbl_pipeline.video import Camera, Frame, cut_image, read_frames
+from tests import refused
 
 CAMERA = Camera(np.array([[2520.0, 0, 884], [0, 2520.0, 497], [0, 0, 1]]), np.zeros(5), "Calib_demo.toml of Sports2D")
 
@@ -98,15 +99,12 @@ def test_weighted_suppression_by_hand():
 
 def test_another_file_than_the_pinned_model_is_refused(tmp_path):
     (tmp_path / "model.tflite").write_bytes(b"not the model")
-    with pytest.raises(PblError, match=r"^ASSET_CHECKSUM: "):
-        BlazePoseDetector(tmp_path / "model.tflite")
+    refused("ASSET_CHECKSUM", BlazePoseDetector, tmp_path / "model.tflite")
 
 
 def test_a_network_that_this_version_does_not_know_is_refused():
     params = KeypointParams(model_sha256="0" * 64)
-    with pytest.raises(PblError, match="blazepose_landmarks_heavy") as error:
-        METHODS.find(params).function(params)
-    assert error.value.code == "SOLVER_UNKNOWN"
+    assert "blazepose_landmarks_heavy" in refused("SOLVER_UNKNOWN", METHODS.find(params).function, params).expected
 
 
 # --- with the models --------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from pbl_pipeline.body import MARKER_SETS, load_body, load_marker_set, marker_positions, marker_set
+from pbl_pipeline.body import MARKER_SETS, MarkerSet, load_body, load_marker_set, marker_positions, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MarkerAugmenter
 
@@ -27,8 +27,8 @@ BODY_25B = (
 BML_MIDLINE = {"backneck", "upperback", "clavicle", "sternum", "umbilicus", "Head", "mhip", "CHip", "Neck"}
 
 
-def neutral(name: str) -> dict[str, np.ndarray]:
-    markers = marker_set(name)
+def neutral(markers: MarkerSet) -> dict[str, np.ndarray]:
+    """Where the points of a set are on the unscaled body in its neutral pose (m)."""
     x = np.asarray(marker_positions(load_body(), markers, np.zeros(40), np.ones(8), np.zeros((len(markers), 3))))
     return dict(zip(markers.names, x, strict=True))
 
@@ -106,7 +106,7 @@ def test_symmetric_pose_gives_mirrored_markers(name):
 @pytest.mark.parametrize("name", ["blazepose_33", "mpi_inf_3dhp_17"])
 def test_markers_by_anatomy_agree_with_the_published_sites(name):
     """Joint centres lie near the published sites that name the same joint, on the inside of the skin markers."""
-    ours, published = neutral(name), neutral("bml_movi_87")
+    ours, published = (neutral(marker_set(n)) for n in (name, "bml_movi_87"))
     near = {"knee": "Knee", "ankle": "Ankle", "elbow": "Elbow", "wrist": "Wrist"}
     for joint, site in near.items():
         assert np.linalg.norm(ours[f"right_{joint}"] - published[f"R{site}"]) < 0.012
@@ -123,13 +123,13 @@ def test_markers_by_anatomy_agree_with_the_published_sites(name):
 
 
 def test_face_and_feet():
-    x = neutral("blazepose_33")
+    x = neutral(marker_set("blazepose_33"))
     assert x["nose"][0] > x["left_eye"][0] > x["left_ear"][0]
     assert x["left_eye"][2] > x["nose"][2] > x["mouth_left"][2]
     assert 0.05 < x["left_eye"][1] - x["right_eye"][1] < 0.075
     assert 0.13 < x["left_ear"][1] - x["right_ear"][1] < 0.17
     assert 0.24 < x["right_foot_index"][0] - x["right_heel"][0] < 0.29
-    assert neutral("mpi_inf_3dhp_17")["head_top"][2] == pytest.approx(1.79, abs=0.03)
+    assert neutral(marker_set("mpi_inf_3dhp_17"))["head_top"][2] == pytest.approx(1.79, abs=0.03)
 
 
 def test_unknown_set_names_the_known_ones():

@@ -1,6 +1,7 @@
 """Whose intrinsics a video gets, and what its file says of lens and time; on files made with known content."""
 
 import dataclasses
+import functools
 import json
 import re
 
@@ -30,6 +31,11 @@ FOCAL = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
 def small(path, **options):
     return write_video(path, numbered_frames(6), constant_rate(6), **options)
+
+
+def preset(**facts) -> Camera:
+    """The published camera of a phone's video with these facts."""
+    return not_none(preset_camera(video_info(**facts)))
 
 
 # --- what the file says
@@ -139,10 +145,8 @@ def test_focal_length_from_film():
 
 
 def test_film_and_published_calibration_agree_on_one_phone():
-    film, known = (
-        find_camera(video_info(model="iPhone 13", focal_35mm=27.0)),
-        find_camera(video_info(model="iPhone 13")),
-    )
+    film = find_camera(video_info(model="iPhone 13", focal_35mm=27.0))
+    known = find_camera(video_info(model="iPhone 13"))
     assert film.focal_px == pytest.approx(known.focal_px, rel=film.focal_rel_sd)
     np.testing.assert_array_equal(film.distortion, known.distortion)
     assert "distortion of that model" in film.source
@@ -158,22 +162,16 @@ def test_presets_are_those_published(shared_data):
     assert build(published) == presets()
     for key, entry in published.items():
         height, width = (int(row[0]) for row in entry["imageSize"])
-        camera = not_none(preset_camera(video_info(model=key.split("/")[0], width_px=width, height_px=height)))
+        camera = preset(model=key.split("/")[0], width_px=width, height_px=height)
         np.testing.assert_allclose(camera.matrix, entry["intrinsicMat"], atol=1e-3)
         np.testing.assert_allclose(camera.distortion, entry["distortion"][0], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["iPhone 11", "iphone12,1", " iPhone  11 "])
 def test_a_preset_by_name_or_identifier(name):
-    small_one, large = (
-        not_none(preset_camera(video_info(model=name))),
-        not_none(preset_camera(video_info(model=name, width_px=2160, height_px=3840))),
-    )
     # Of this phone both formats are published, and differ.
-    assert (small_one.matrix[0, 0], large.matrix[0, 0]) == (
-        pytest.approx(912.2, abs=0.1),
-        pytest.approx(2702.8, abs=0.1),
-    )
+    assert preset(model=name).matrix[0, 0] == pytest.approx(912.2, abs=0.1)
+    assert preset(model=name, width_px=2160, height_px=3840).matrix[0, 0] == pytest.approx(2702.8, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -192,33 +190,32 @@ def test_no_preset(model, lens):
 
 
 def test_a_preset_scales_and_turns_with_the_recording():
-    portrait = not_none(preset_camera(video_info(model="iPhone 11")))
+    of_phone = functools.partial(preset, model="iPhone 11")
+    portrait = of_phone()
     points = np.array([[0.3, -0.2, 2.0], [-0.4, 0.6, 2.5], [0.1, 0.9, 3.0]])
     seen = _project(points, portrait)
     # 1080p portrait: the same view, 1.5 times as many pixels.
-    larger = not_none(preset_camera(video_info(model="iPhone 11", width_px=1080, height_px=1920)))
+    larger = of_phone(width_px=1080, height_px=1920)
     np.testing.assert_allclose(_project(points, larger) + 0.5, 1.5 * (seen + 0.5), atol=1e-6)
     # The phone turned counter-clockwise (flag 0): right in the portrait picture is up, so (x, y) -> (y, W - 1 - x).
-    level = not_none(preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=0)))
+    level = of_phone(width_px=1280, height_px=720, rotation_deg=0)
     np.testing.assert_allclose(
         _project(points @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), level),
         np.stack([seen[:, 1], 719 - seen[:, 0]], 1),
         atol=1e-6,
     )
-    on_its_head = not_none(preset_camera(video_info(model="iPhone 11", width_px=1280, height_px=720, rotation_deg=180)))
+    on_its_head = of_phone(width_px=1280, height_px=720, rotation_deg=180)
     np.testing.assert_allclose(
         _project(points @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]]), on_its_head),
         np.stack([1279 - seen[:, 1], seen[:, 0]], 1),
         atol=1e-6,
     )
     # Upright, the phone on its head (flag 270): half a turn.
-    upside_down = not_none(preset_camera(video_info(model="iPhone 11", rotation_deg=270)))
+    upside_down = of_phone(rotation_deg=270)
     np.testing.assert_allclose(_project(points * [-1, -1, 1], upside_down), [719, 1279] - seen, atol=1e-6)
     # Copies whose pictures were turned: the shape tells more than the flag.
-    for size, flag, same in (((720, 1280), 0, portrait), ((1280, 720), 90, level)):
-        copy = not_none(
-            preset_camera(video_info(model="iPhone 11", width_px=size[0], height_px=size[1], rotation_deg=flag))
-        )
+    for width, height, flag, same in ((720, 1280, 0, portrait), (1280, 720, 90, level)):
+        copy = of_phone(width_px=width, height_px=height, rotation_deg=flag)
         np.testing.assert_array_equal(copy.matrix, same.matrix)
 
 
@@ -234,9 +231,7 @@ def test_four_quarter_turns_are_none():
 def test_every_preset_holds_over_the_whole_picture():
     for model in presets()["names"]:
         for width, height, turned in ((720, 1280, 90), (1920, 1080, 0), (1440, 1080, 180)):
-            camera = not_none(
-                preset_camera(video_info(model=model, width_px=width, height_px=height, rotation_deg=turned))
-            )
+            camera = preset(model=model, width_px=width, height_px=height, rotation_deg=turned)
             assert reaches_corners(camera.matrix, camera.distortion, (width, height))
 
 

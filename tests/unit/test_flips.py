@@ -40,17 +40,14 @@ def spoil(n_frames: int, what: str, first: int, length: int) -> Exchange:
     return Exchange(rows if what != "rest" else none, rows if what != "legs" else none, none)
 
 
-@pytest.mark.parametrize("fps", [30.0, 60.0])
-@pytest.mark.parametrize("view", ["sagittal", "frontal", "oblique"])
-def test_a_walk_whose_legs_cross_is_left_alone(view, fps):
-    found = judged(seen(view=view, fps=fps))
-    assert not found.legs.any()
-    assert not found.rest.any()
+WALKS = [("walk", view, fps) for fps in (30.0, 60.0) for view in ("sagittal", "frontal", "oblique")]
 
 
-@pytest.mark.parametrize("task", ["sit_to_stand", "tug"])
-def test_so_are_sitting_down_and_turning(task):
-    found = judged(seen(task))
+@pytest.mark.parametrize(
+    ("task", "view", "fps"), [*WALKS, ("sit_to_stand", "sagittal", 30.0), ("tug", "sagittal", 30.0)]
+)
+def test_legs_that_cross_sitting_down_and_turning_are_left_alone(task, view, fps):
+    found = judged(seen(task, view, fps))
     assert not found.legs.any()
     assert not found.rest.any()
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pbl_pipeline import assets
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS
 from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_visible
 from pbl_pipeline.models.gpu_server import Server
@@ -21,6 +20,7 @@ from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
 from research.benchmarks.many_videos import differences
 from research.clip_keypoints import clip_keypoints
+from tests import refused
 from tests.videos import write_video
 
 LANDMARKS = (195, 117, 1)
@@ -77,9 +77,7 @@ def test_unknown_operation_is_named() -> None:
 
     builder = flatbuffers.Builder(1 << 20)
     builder.Finish(content.Pack(builder), b"TFL3")
-    with pytest.raises(PblError, match="operation SOFTMAX") as caught:
-        read_model(bytes(builder.Output()))
-    assert caught.value.code == "MODEL_INVALID"
+    assert refused("MODEL_INVALID", read_model, bytes(builder.Output())).found == "operation SOFTMAX"
 
 
 def test_without_a_gpu_litert_computes() -> None:
@@ -132,8 +130,7 @@ def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monk
     assert "the GPU does not compute it" in network.note
     assert all(np.allclose(before[s].ravel(), after[s].ravel(), atol=0.01) for s in after)
     monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
-    with pytest.raises(PblError, match=r"^DEVICE_UNAVAILABLE: "):
-        asked(picture)
+    refused("DEVICE_UNAVAILABLE", asked, picture)
 
 
 def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(

@@ -5,9 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
-    METHODS,
     KeypointParams,
     Keypoints,
     PersonKeypoints,
@@ -23,6 +21,7 @@ from pbl_pipeline.keypoints.detect import _detect_all
 from pbl_pipeline.keypoints.virtual_camera import crop_matrix
 from pbl_pipeline.tracking import PersonTrack, Tracking, body_box
 from pbl_pipeline.video import Camera, read_frames, viewing_ray
+from tests import refused
 from tests.videos import constant_rate, write_as_they_are
 
 CAMERA = Camera(np.array([[1300.0, 0, 960], [0, 1300.0, 540], [0, 0, 1]]), np.zeros(5), "test")
@@ -273,10 +272,9 @@ def test_under_a_second_in_view_is_too_short(case):
     roi = tracking.persons[0].roi_px.copy()
     roi[25:] = np.nan
     short = PersonTrack(1, body_box(roi), roi, np.zeros(90), np.isfinite(roi[:, 0]))
-    with pytest.raises(PblError) as error:
-        detect_keypoints(video, Tracking(tracking.time_s, (200, 100), (short,), "test", ""), 1, CAMERA, None, Cross())
-    assert error.value.code == "TRACK_TOO_SHORT"
-    assert error.value.found == "person 1 is in view for 0.50 s"
+    found = Tracking(tracking.time_s, (200, 100), (short,), "test", "")
+    error = refused("TRACK_TOO_SHORT", detect_keypoints, video, found, 1, CAMERA, None, Cross())
+    assert error.found == "person 1 is in view for 0.50 s"
 
 
 def test_a_clip_under_a_second_is_named_as_one(case):
@@ -285,28 +283,18 @@ def test_a_clip_under_a_second_is_named_as_one(case):
     first = slice(0, 30)
     short = PersonTrack(1, *(getattr(person, f)[first] for f in ("box_px", "roi_px", "score", "observed")))
     clip = Tracking(tracking.time_s[first], (200, 100), (short,), "test", "")
-    with pytest.raises(PblError) as error:
-        detect_keypoints(video, clip, 1, CAMERA, None, Cross())
     lasts = tracking.time_s[29] - tracking.time_s[0]
     assert lasts < 1.0
-    assert (error.value.code, error.value.found) == ("TRACK_TOO_SHORT", f"the whole video lasts {lasts:.2f} s")
+    error = refused("TRACK_TOO_SHORT", detect_keypoints, video, clip, 1, CAMERA, None, Cross())
+    assert error.found == f"the whole video lasts {lasts:.2f} s"
 
 
 def test_unknown_person_detector_and_changed_video(case, tmp_path):
     video, tracking = case
-    with pytest.raises(PblError, match=r"^SUBJECT_UNKNOWN_PERSON: "):
-        detect_keypoints(video, tracking, 7, CAMERA, None, Cross())
-    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
-        detect_keypoints(video, tracking, 1, SMALL, KeypointParams(detector="none"))
+    refused("SUBJECT_UNKNOWN_PERSON", detect_keypoints, video, tracking, 7, CAMERA, None, Cross())
+    refused("SOLVER_UNKNOWN", detect_keypoints, video, tracking, 1, SMALL, KeypointParams(detector="none"))
     shorter = write_as_they_are(tmp_path / "s.avi", [np.full((100, 200, 3), 128, np.uint8)] * 40)
-    with pytest.raises(PblError, match=r"^VIDEO_CHANGED: "):
-        detect_keypoints(shorter, tracking, 1, CAMERA, None, Cross())
-
-
-def test_paramset_names_the_model():
-    method = METHODS["blazepose-33"]
-    assert (method.stage, method.version) == ("keypoints", 3)
-    assert method.params.model_sha256 == KeypointParams().model_sha256
+    refused("VIDEO_CHANGED", detect_keypoints, shorter, tracking, 1, CAMERA, None, Cross())
 
 
 # --- quality ----------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 import pbl_pipeline.tracking
 from pbl_pipeline import models
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     BlazePoseLandmarks,
     KeypointParams,
@@ -45,7 +44,7 @@ from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import Camera, Frame, probe, read_frames, viewing_ray
 from pbl_pipeline.visit import Recording, Visit
-from tests import dot_models
+from tests import dot_models, refused
 from tests.command import pbl
 from tests.dot_models import NAMES, lens, person, picture, project, region
 from tests.unit.test_blazepose import BY_EYE, asset
@@ -54,6 +53,9 @@ from tests.unit.test_blazepose import region as demo_region
 from tests.videos import constant_rate, write_video
 
 CAMERA = lens()
+#: A person, and where she is in the picture.
+XYZ = person()
+XY = project(XYZ, CAMERA)
 PLACES = {"left edge": (-1.5, 0.1, 4.0), "middle": (0.0, 0.0, 4.0), "right, near": (1.0, 0.1, 3.2)}
 
 
@@ -268,31 +270,25 @@ def test_crop_model_brings_the_points_back(tmp_path, place, n):
 
 
 def test_pixels_may_count_from_the_edge(tmp_path):
-    xyz = person()
-    xy = project(xyz, CAMERA)
-    model = detector(tmp_path, "crop3d", dot_models.crop3d(xyz, origin_px=0.5), pixel_origin="edge")
-    assert np.abs(model.detect(picture(xy), region(xy), CAMERA).xy_px - xy).max() < 0.1
+    model = detector(tmp_path, "crop3d", dot_models.crop3d(XYZ, origin_px=0.5), pixel_origin="edge")
+    assert np.abs(model.detect(picture(XY), region(XY), CAMERA).xy_px - XY).max() < 0.1
 
 
 def test_without_exchanging_sides_the_mirrored_points_would_be_wrong(tmp_path):
     """What the test above would see: the pairs are declared to be no pairs."""
-    xyz = person()
-    xy = project(xyz, CAMERA)
     swap = {"left": "a", "right": "b"}
     names = [swap.get(n.split("_")[0], n.split("_")[0]) + "".join(n.partition("_")[1:]) for n in NAMES]
-    model = detector(tmp_path, "crop3d", dot_models.crop3d(xyz), joint_names=names)
-    found = model.detect(picture(xy), region(xy), CAMERA)
+    model = detector(tmp_path, "crop3d", dot_models.crop3d(XYZ), joint_names=names)
+    found = model.detect(picture(XY), region(XY), CAMERA)
     sides = [i for i, n in enumerate(NAMES) if "_" in n]
-    assert np.linalg.norm(found.xy_px - xy, axis=1)[sides].min() > 5
+    assert np.linalg.norm(found.xy_px - XY, axis=1)[sides].min() > 5
     assert found.confidence[sides].max() < 0.2
 
 
 def test_noise_gives_the_confidence_that_the_formula_says(tmp_path):
     """Depths that grow with the grey of the background, which gamma makes another in each augmentation."""
-    xyz = person()
-    xy = project(xyz, CAMERA)
     drift = {"left_hip": 300.0, "right_knee": 900.0, "head": 600.0, "base": 300.0}
-    found = detector(tmp_path, "crop3d", dot_models.crop3d(xyz, drift_mm=drift)).detect(picture(xy), region(xy), CAMERA)
+    found = detector(tmp_path, "crop3d", dot_models.crop3d(XYZ, drift_mm=drift)).detect(picture(XY), region(XY), CAMERA)
     grey = np.array([(dot_models.GREY / 255) ** a.gamma for a in augmentations(10)])
     # Mirrored pictures show the other side: half of the answers of a pair are the partner's, which does not drift.
     for j, name in enumerate(NAMES):
@@ -312,15 +308,13 @@ def test_noise_gives_the_confidence_that_the_formula_says(tmp_path):
 
 @pytest.mark.parametrize(("kind", "graph"), [("simcc", dot_models.simcc), ("heatmap", dot_models.heatmap)])
 def test_models_without_depth(tmp_path, kind, graph):
-    xyz = person()
-    xy = project(xyz, CAMERA)
-    found = detector(tmp_path, kind, graph(), 2, (192, 256)).detect(picture(xy), region(xy), CAMERA)
-    assert np.linalg.norm(found.xy_px - xy, axis=1).max() < 0.5
+    found = detector(tmp_path, kind, graph(), 2, (192, 256)).detect(picture(XY), region(XY), CAMERA)
+    assert np.linalg.norm(found.xy_px - XY, axis=1).max() < 0.5
     assert np.isnan(found.xyz_cam_m).all()
     # The graph's own score, 1 at a dot's centre: dots are there, and smaller in the crop than a cell is wide.
     assert found.confidence.min() > 0.7
     black = detector(tmp_path, kind, graph(), 2, (192, 256)).detect(
-        np.zeros((720, 960, 3), np.uint8), region(xy), CAMERA
+        np.zeros((720, 960, 3), np.uint8), region(XY), CAMERA
     )
     assert black.confidence.max() == 0
     assert black.presence == 0
@@ -328,12 +322,11 @@ def test_models_without_depth(tmp_path, kind, graph):
 
 def test_scores_of_the_mirrored_picture_go_to_their_own_side(tmp_path):
     """The left knee is half as clear as the right one."""
-    xy = project(person(), CAMERA)
-    image = picture(xy)
-    x, y = np.round(xy[NAMES.index("left_knee")]).astype(int)
+    image = picture(XY)
+    x, y = np.round(XY[NAMES.index("left_knee")]).astype(int)
     patch = image[y - 20 : y + 21, x - 20 : x + 21]
     patch[:] = (patch.astype(int) + dot_models.GREY) // 2
-    found = detector(tmp_path, "simcc", dot_models.simcc(), 2, (192, 256)).detect(image, region(xy), CAMERA)
+    found = detector(tmp_path, "simcc", dot_models.simcc(), 2, (192, 256)).detect(image, region(XY), CAMERA)
     left, right = (found.confidence[NAMES.index(f"{side}_knee")] for side in ("left", "right"))
     assert left < 0.4
     assert right > 0.7
@@ -352,8 +345,7 @@ def test_several_frames_in_one_call_are_the_same_as_one_by_one(tmp_path):
 
 
 def test_a_model_without_spread_has_no_confidence(tmp_path):
-    with pytest.raises(PblError, match=r"^USAGE: "):
-        detector(tmp_path, "crop3d", dot_models.crop3d(person()), 1)
+    refused("USAGE", detector, tmp_path, "crop3d", dot_models.crop3d(person()), 1)
 
 
 def test_another_model_than_the_method_froze(tmp_path):
@@ -364,8 +356,7 @@ def test_another_model_than_the_method_froze(tmp_path):
         ModelParams(spec.name, "0" * 64, spec.spec_sha256, spec.licence, 2),
         ModelParams(spec.name, spec.sha256, "0" * 64, spec.licence, 2),
     ):
-        with pytest.raises(PblError, match=r"^MODEL_CHECKSUM: "):
-            OnnxKeypoints(params, "cpu", tmp_path)
+        refused("MODEL_CHECKSUM", OnnxKeypoints, params, "cpu", tmp_path)
 
 
 class BlazePoseAsCropModel:
@@ -528,8 +519,7 @@ def test_a_video_through_detect_keypoints(video, registered, tmp_path, name):
 
 def test_the_detector_onnx_without_a_model(video):
     path, tracking = video
-    with pytest.raises(PblError, match=r"^SOLVER_UNKNOWN: "):
-        detect_keypoints(path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
+    refused("SOLVER_UNKNOWN", detect_keypoints, path, tracking, 1, CAMERA, KeypointParams(detector="onnx"))
 
 
 def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered, tmp_path, monkeypatch):

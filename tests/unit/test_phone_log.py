@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import check_trial
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
 from pbl_pipeline.video.attitude import held_deg
 from pbl_pipeline.video.clock import match_pictures
+from tests import refused
 from tests.inputs import csv_log
 from tests.inputs import video_info as video
 from tests.phone_film import EPOCH_NS, as_json, as_zip, device_quat, film, hand, sensor_logger
@@ -37,13 +37,6 @@ def recorded(info, seconds: float, zone_h: float = 0.0):
     when = int(EPOCH_NS / 1e9 + seconds) + int(3600 * zone_h)
     text = str(np.datetime64(when, "s")) + "Z"
     return dataclasses.replace(info, recorded_utc=text)
-
-
-def error_of(call, *arguments) -> PblError:
-    with pytest.raises(PblError) as error:
-        call(*arguments)
-    assert error.value.code == "PHONE_LOG"
-    return error.value
 
 
 def worst_deg(attitude: Attitude, begin_s: float = BEGIN_S, until_s: float = SECONDS) -> float:
@@ -96,7 +89,7 @@ def test_a_real_row_of_an_android_phone(tmp_path):
     assert np.arctan2(matrix[0, 1], matrix[1, 1]) == pytest.approx(1.0739440, abs=1e-5)
     turned_back = path.read_text().replace("0.8362834453582764", "-0.8362834453582764")
     path.write_text(turned_back)
-    assert "pitch" in error_of(read_phone_log, path).found
+    assert "pitch" in refused("PHONE_LOG", read_phone_log, path).found
 
 
 def test_our_own_schema(tmp_path):
@@ -131,7 +124,7 @@ def test_our_own_schema(tmp_path):
 @pytest.mark.parametrize("utc", ["yesterday", "2026-03-01T09:15:30"])
 def test_a_start_that_is_no_moment(tmp_path, utc):
     path = csv_log(tmp_path / "a.csv", [0.7071, 0.7071, 0, 0], {"frame": "device", "start_utc": utc})
-    assert "start_utc" in error_of(read_phone_log, path).found
+    assert "start_utc" in refused("PHONE_LOG", read_phone_log, path).found
 
 
 def test_gravity_that_contradicts_the_orientation(tmp_path, folder):
@@ -139,20 +132,19 @@ def test_gravity_that_contradicts_the_orientation(tmp_path, folder):
     swapped = [text[0], *(",".join([*(c := r.split(","))[:2], c[3], c[2], c[4]]) for r in text[1:])]
     copy = edited(folder, tmp_path, lambda rows: rows)
     (copy / "Gravity.csv").write_text("\n".join(swapped))
-    assert "accelerometer" in error_of(read_phone_log, copy).found
+    assert "accelerometer" in refused("PHONE_LOG", read_phone_log, copy).found
 
 
 def test_broken_exports(tmp_path, folder):
     empty = tmp_path / "empty"
     empty.mkdir()
-    assert "no orientation" in error_of(read_phone_log, empty).found
+    assert "no orientation" in refused("PHONE_LOG", read_phone_log, empty).found
     (tmp_path / "a.zip").write_bytes(b"PK no zip")
-    error_of(read_phone_log, tmp_path / "a.zip")
+    refused("PHONE_LOG", read_phone_log, tmp_path / "a.zip")
     for text in ('[{"sensor": "Orientation", "time": "x"', '[{"sensor":' * 20_000, '{"a":' * 20_000):
         (tmp_path / "b.json").write_text(text)
-        error_of(read_phone_log, tmp_path / "b.json")
-    with pytest.raises(PblError, match=r"^FILE_MISSING: "):
-        read_phone_log(tmp_path / "none.zip")
+        refused("PHONE_LOG", read_phone_log, tmp_path / "b.json")
+    refused("FILE_MISSING", read_phone_log, tmp_path / "none.zip")
 
 
 def test_an_archive_with_wrong_bytes(folder, tmp_path):
@@ -165,7 +157,7 @@ def test_an_archive_with_wrong_bytes(folder, tmp_path):
         spoiled = data.copy()
         spoiled[place : place + 4] ^= 0xFF
         (tmp_path / "spoiled.zip").write_bytes(spoiled.tobytes())
-        error_of(read_phone_log, tmp_path / "spoiled.zip")
+        refused("PHONE_LOG", read_phone_log, tmp_path / "spoiled.zip")
 
 
 # --- stamps and quaternions
@@ -197,7 +189,7 @@ def test_a_repeated_row_is_left_out_and_said(tmp_path, folder):
     ids=["every stamp twice", "backwards", "zero", "text", "time", "one"],
 )
 def test_rows_that_cannot_be(tmp_path, folder, change, found):
-    assert found in error_of(read_phone_log, edited(folder, tmp_path, change)).found
+    assert found in refused("PHONE_LOG", read_phone_log, edited(folder, tmp_path, change)).found
 
 
 # --- how the phone was held
@@ -227,12 +219,12 @@ def test_how_the_phone_was_held_is_seen(tmp_path, size, flag, turned):
     assert (found.inv() * level).magnitude().max() < 1e-9
     if flag:  # a log of the phone held in another way contradicts the flag
         other = dataclasses.replace(probed, rotation_deg=(flag + 90) % 360 or 360)
-        assert "against gravity" in error_of(load_attitude, tmp_path / "log.csv", other).found
+        assert "against gravity" in refused("PHONE_LOG", load_attitude, tmp_path / "log.csv", other).found
 
 
 def test_the_front_camera_is_refused(folder, info):
     front = dataclasses.replace(info, lens="iPhone 13 front camera 2.71mm f/2.2")
-    assert "front camera" in error_of(load_attitude, folder, front).found
+    assert "front camera" in refused("PHONE_LOG", load_attitude, folder, front).found
 
 
 # --- the clock
@@ -258,7 +250,7 @@ def test_a_log_on_the_videos_clock_is_not_moved(tmp_path, info):
     late = dataclasses.replace(info, time_s=np.arange(400) / 30)
     np.testing.assert_allclose(load_attitude(path, late).time_s, [10, 10.02, 10.04])
     # The stamps of a sensor that counts from the phone's start, or in milliseconds.
-    error = error_of(load_attitude, path, info)
+    error = refused("PHONE_LOG", load_attitude, path, info)
     assert error.found == "a log from 10 to 10.04 s, without start_utc"
     assert "start_utc" in error.next_step
 
@@ -278,7 +270,7 @@ def test_the_pictures_bring_a_log_that_is_nearly_on_the_videos_clock(tmp_path, i
     assert stays.time_s[0] == at[0] + late_s
     assert np.isnan(stays.clock_sd_s)
     path.write_text(json.dumps(log | {"clock": "sun"}))
-    assert "sun" in error_of(load_attitude, path, info).found
+    assert "sun" in refused("PHONE_LOG", load_attitude, path, info).found
 
 
 def test_a_log_in_another_time_zone(tmp_path, folder, info):
@@ -287,7 +279,7 @@ def test_a_log_in_another_time_zone(tmp_path, folder, info):
     assert "5.5 h from the time of recording in the file" in log.source
     assert worst_deg(log) < 0.3
     other = sensor_logger(tmp_path / "other", 12.0, begin_s=100.0)
-    error = error_of(load_attitude, other, recorded(info, BEGIN_S, zone_h=-5.5))
+    error = refused("PHONE_LOG", load_attitude, other, recorded(info, BEGIN_S, zone_h=-5.5))
     assert "5.5 h apart" in error.next_step
     assert "UTC" in error.found
 
@@ -297,14 +289,14 @@ def test_a_log_of_another_day(tmp_path, folder, info):
     """A converted file states when it was converted."""
     assert "3.0 days from" in load_attitude(folder, recorded(info, BEGIN_S + 3 * 86400)).source
     other = sensor_logger(tmp_path / "other", 12.0, begin_s=100.0)
-    error = error_of(load_attitude, other, recorded(info, BEGIN_S + 3 * 86400))
+    error = refused("PHONE_LOG", load_attitude, other, recorded(info, BEGIN_S + 3 * 86400))
     assert "apart" not in error.next_step
 
 
 def test_a_log_shorter_than_the_video(tmp_path, info):
     short = sensor_logger(tmp_path / "short", 3.0, begin_s=BEGIN_S)
-    assert "a log of 3.0 s" in error_of(load_attitude, short, info).found
-    error_of(load_attitude, short, recorded(info, 0.0))
+    assert "a log of 3.0 s" in refused("PHONE_LOG", load_attitude, short, info).found
+    refused("PHONE_LOG", load_attitude, short, recorded(info, 0.0))
 
 
 def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
@@ -314,7 +306,7 @@ def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
     used, _ = check_trial(whole, "walk")
     assert used.all()
     half = dataclasses.replace(walk, phone_time_s=np.array([0, 1.0, 2.0]), phone_quat_wxyz=quat)
-    assert "from 0.00 to 2.00 s" in error_of(check_trial, half, "walk").found
+    assert "from 0.00 to 2.00 s" in refused("PHONE_LOG", check_trial, half, "walk").found
 
 
 def test_a_phone_on_a_stand(tmp_path):
@@ -332,7 +324,7 @@ def test_a_phone_on_a_stand(tmp_path):
 def test_a_log_of_another_hand_is_not_matched(tmp_path, info):
     """The same time, other movement: the time of recording alone does not do, where a log could lie in two places."""
     other = sensor_logger(tmp_path / "other", 30.0, begin_s=100.0)
-    error = error_of(load_attitude, other, recorded(info, 15.0))
+    error = refused("PHONE_LOG", load_attitude, other, recorded(info, 15.0))
     assert "cannot be found" in error.found
     log = read_phone_log(other)
     turns = hand(100.013 + log.time_s).as_quat(scalar_first=True)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import load_body, marker_set
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, CostParams, fit_session
 from pbl_pipeline.fit.units import (
     CROP,
@@ -24,6 +23,7 @@ from pbl_pipeline.keypoints import Keypoints
 from research.benchmarks.picture_size import multiplied
 from research.walker.observe import observe
 from research.walker.walk import person, walk_qpos
+from tests import refused
 
 TIME_S = np.arange(60) / 30
 
@@ -34,12 +34,6 @@ def seen(marker_set: str = "blazepose_33", **options) -> Keypoints:
     return observe(
         qpos, TIME_S, marker_set=marker_set, scale=scale, site_offset_m=offset, seed=3, view="oblique", **options
     ).keypoints
-
-
-def refusal(call, *args, **kwargs) -> PblError:
-    with pytest.raises(PblError) as error:
-        call(*args, **kwargs)
-    return error.value
 
 
 # --- what a pixel is
@@ -93,15 +87,13 @@ def test_points_that_say_nothing_of_the_size_leave_the_pictures():
 @pytest.mark.parametrize(("field", "value"), [("pixel", "4K"), ("metre", "yard")])
 def test_an_unknown_unit_is_refused(field, value):
     cost = dataclasses.replace(CostParams(), **{field: value})
-    assert refusal(check_units, cost).code == "FIT_INPUT"
+    refused("FIT_INPUT", check_units, cost)
     params = dataclasses.replace(METHODS["blazepose"].params, cost=cost)
-    assert value in refusal(fit_session, [seen()], ["a"], params).text()
+    assert value in refused("FIT_INPUT", fit_session, [seen()], ["a"], params).text()
 
 
 def test_a_crop_of_no_size_is_refused():
-    error = refusal(dataclasses.replace, seen(), crop_px=np.full(60, 0.0))
-    assert error.code == "FILE_FORMAT"
-    assert "crop_px" in error.text()
+    assert "crop_px" in refused("FILE_FORMAT", dataclasses.replace, seen(), crop_px=np.full(60, 0.0)).text()
 
 
 def test_the_crop_is_kept_in_the_file(tmp_path):
@@ -115,8 +107,7 @@ def test_the_crop_is_kept_in_the_file(tmp_path):
 def test_a_matrix_of_another_picture_is_refused():
     """That of a picture of 2160 x 3840 with points of 1080 x 1920."""
     k = seen()
-    error = refusal(dataclasses.replace, k, camera=multiplied(k, 2.0).camera)
-    assert error.code == "CAMERA_INVALID"
+    error = refused("CAMERA_INVALID", dataclasses.replace, k, camera=multiplied(k, 2.0).camera)
     assert "2158x3838" in error.text()
 
 

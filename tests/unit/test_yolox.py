@@ -24,15 +24,9 @@ from pbl_pipeline.tracking import (
 from pbl_pipeline.tracking.tiling import detect_in
 from pbl_pipeline.tracking.yolox import decode, grid
 from pbl_pipeline.video import read_frames
+from tests import refused
+from tests.dot_models import changed
 from tests.videos import constant_rate, write_video
-
-
-def refused(code: str, call, *args, **kwargs) -> str:
-    with pytest.raises(PblError) as error:
-        call(*args, **kwargs)
-    assert error.value.code == code
-    return error.value.text()
-
 
 # --- decoding -----------------------------------------------------------------------------------------------------
 
@@ -112,8 +106,8 @@ def test_models_of_another_kind_or_shape_are_refused():
     def load(output, **kwargs):
         YoloxDetector(Fixed(output, **kwargs))  # type: ignore[arg-type]
 
-    assert "kind heatmap" in refused("MODEL_INVALID", load, rows(), kind="heatmap")
-    assert "one row for each grid cell" in refused("MODEL_INVALID", load, np.zeros((2100, 85), np.float32))
+    assert "kind heatmap" in refused("MODEL_INVALID", load, rows(), kind="heatmap").found
+    assert "one row for each grid cell" in refused("MODEL_INVALID", load, np.zeros((2100, 85), np.float32)).expected
     refused("MODEL_INVALID", load, np.zeros((3549, 5), np.float32))
 
 
@@ -126,37 +120,33 @@ def registry(tmp_path, monkeypatch) -> Path:
     return tmp_path / "models"
 
 
+SPEC = {
+    "name": "yolox-nano",
+    "kind": "person_detector",
+    "licence": "Apache-2.0",
+    "source": "YOLOX nano, Megvii; Kazuhito00/YOLOX-ONNX-TFLite-Sample 3d4f111",
+    "input": {
+        "name": "images",
+        "width": 416,
+        "height": 416,
+        "layout": "NCHW",
+        "colour": "BGR",
+        "mean": [0, 0, 0],
+        "std": [1, 1, 1],
+    },
+    "outputs": {"boxes": "output"},
+}
+
+
 @pytest.fixture
 def folder(shared_data, tmp_path) -> Path:
     """YOLOX nano as a model's folder, as docs/models.md describes it."""
     path = tmp_path / "yolox"
     path.mkdir()
     shutil.copyfile(shared_data / "real" / "models" / "yolox_nano.onnx", path / "model.onnx")
-    spec = {
-        "name": "yolox-nano",
-        "kind": "person_detector",
-        "sha256": hashlib.sha256((path / "model.onnx").read_bytes()).hexdigest(),
-        "licence": "Apache-2.0",
-        "source": "YOLOX nano, Megvii; Kazuhito00/YOLOX-ONNX-TFLite-Sample 3d4f111",
-        "input": {
-            "name": "images",
-            "width": 416,
-            "height": 416,
-            "layout": "NCHW",
-            "colour": "BGR",
-            "mean": [0, 0, 0],
-            "std": [1, 1, 1],
-        },
-        "outputs": {"boxes": "output"},
-    }
-    (path / "model.json").write_text(json.dumps(spec))
+    sha256 = hashlib.sha256((path / "model.onnx").read_bytes()).hexdigest()
+    (path / "model.json").write_text(json.dumps(SPEC | {"sha256": sha256}))
     return path
-
-
-def changed(folder: Path, **fields) -> Path:
-    spec = json.loads((folder / "model.json").read_text()) | fields
-    (folder / "model.json").write_text(json.dumps(spec))
-    return folder
 
 
 @pytest.mark.long
@@ -199,17 +189,14 @@ def test_bad_folders_and_changed_models(folder, registry, shared_data):
     refused("MODEL_INVALID", models.add, changed(folder, sha256=good, outputs={"boxes": "rows"}))
     refused("MODEL_INVALID", models.add, changed(folder, outputs={"heatmap": "output"}))
     refused("MODEL_INVALID", models.add, changed(folder, outputs={"boxes": "output"}, joint_names=["hip"]))
-    spec = json.loads((folder / "model.json").read_text())
-    del spec["joint_names"]
-    (folder / "model.json").write_text(json.dumps(spec))
-    models.add(folder)
+    models.add(changed(folder, joint_names=None))
     params = detector_params("yolox-nano")
     # The lab registers another spec under the name: the old method does not run on it.
     models.add(changed(folder, comment="the same numbers"), replace=True)
     track_people(video, params)
-    entry = json.loads((folder / "model.json").read_text())["input"] | {"colour": "RGB"}
+    entry = SPEC["input"] | {"colour": "RGB"}
     models.add(changed(folder, input=entry), replace=True)
-    assert "model.json" in refused("MODEL_CHECKSUM", track_people, video, params)
+    assert "model.json" in refused("MODEL_CHECKSUM", track_people, video, params).found
     models.remove("yolox-nano")
     refused("MODEL_MISSING", track_people, video, params)
     refused("MODEL_MISSING", detector_params, "yolox-nano")
