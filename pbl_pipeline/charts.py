@@ -184,7 +184,7 @@ def cycle_chart(
     for side, curves in cycles.items():
         if not curves:
             continue
-        axes.curve(percent, mean_curve(curves), SIDE_COLOUR[side], 2.4, opacity[side], _DASH[side])
+        axes.curve(percent, np.mean(curves, axis=0, dtype=float), SIDE_COLOUR[side], 2.4, opacity[side], _DASH[side])
         off = foot_off_percent.get(side, np.nan)
         if np.isfinite(off):
             x = float(axes.x(off))
@@ -373,11 +373,6 @@ def nice_ticks(low: float, high: float, n: int = 5) -> list[float]:
     step = next(float(m * power) for m in (1, 2, 5, 10) if span / (m * power) <= n + 1e-9)
     first, last = int(np.floor(low / step + 1e-9)), int(np.ceil(high / step - 1e-9))
     return [round(i * step, 10) for i in range(first, max(last, first + 1) + 1)]
-
-
-def mean_curve(curves: Sequence[np.ndarray]) -> np.ndarray:
-    """Mean (P,) of curves (P,), NaN where any of them is unknown."""
-    return np.mean(np.stack([np.asarray(c, float) for c in curves]), axis=0)
 
 
 def _inside(ticks: list[float], stop: float) -> list[float]:

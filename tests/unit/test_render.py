@@ -412,14 +412,14 @@ def test_the_track_of_the_body_puts_its_capsules_where_they_are_drawn() -> None:
     track, drawn = body_track(fit), capsules(body, fit.qpos, fit.scale)
     assert np.isnan(track.root_m[[0, 2, 28]]).all()
     turned = rotation_matrix(track.quat_wxyz[3:28])
-    at = np.zeros((25, len(track.names), 3))
+    at = np.zeros((25, len(body.body_names), 3))
     for b, parent in enumerate(track.parent):
         carried = np.einsum("tij,j->ti", turned[:, parent], track.offset_m[b])
         at[:, b] = track.root_m[3:28] if parent < 0 else at[:, parent] + carried
     own = track.shapes.body
     start = at[:, own] + np.einsum("tgij,gj->tgi", turned[:, own], track.shapes.start)
     np.testing.assert_allclose(start, drawn.start[3:28], atol=1e-9)
-    assert {n for n, leg in zip(track.names, track.leg, strict=True) if leg} == {
+    assert {n for n, leg in zip(body.body_names, track.leg, strict=True) if leg} == {
         f"{part}_{side}" for part in ("femur", "tibia", "talus", "calcn", "toes") for side in "lr"
     }
     assert (np.sum(track.quat_wxyz[4:28] * track.quat_wxyz[3:27], axis=2) > 0).all()

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import load_body
-from pbl_pipeline.charts import cycle_chart, mean_curve, nice_ticks
+from pbl_pipeline.charts import cycle_chart, nice_ticks
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
-from pbl_pipeline.report.words import check_name, plural, sentence, size
+from pbl_pipeline.report.words import plural, sentence, size
 from pbl_pipeline.texts import LANGUAGES, catalogue, library_words
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
 from pbl_pipeline.visit import Recording, Solution, Visit
-from pbl_pipeline.words import number, significant
+from pbl_pipeline.words import check_words, number, significant
 from tests import not_none
 from tests.html_page import Page, commands_in
 from tests.inputs import video_info
@@ -313,11 +313,6 @@ def test_norm_band_is_the_norm() -> None:
     np.testing.assert_allclose((lower[:, 1] - upper[:, 1]) / per_degree / 2, curve["sd_deg"], atol=0.3)
 
 
-def test_mean_curve_is_unknown_where_a_cycle_is() -> None:
-    mean = mean_curve([np.array([1.0, 2.0]), np.array([3.0, np.nan])])
-    np.testing.assert_array_equal(mean, [2.0, np.nan])
-
-
 @pytest.mark.parametrize(
     ("low", "high", "ticks"),
     [
@@ -341,8 +336,8 @@ def test_words() -> None:
     assert significant(0.5) == "0.5"
     assert significant(0.0) == "0"
     assert significant(None) == ""
-    assert check_name(Check("residual_3d_cm", PASS, 1.0, 2.0)) == "Residual 3D (cm)"
-    assert check_name(Check("gdi_cycles", PASS, 1.0, 2.0)) == "GDI cycles"
+    assert check_words("residual_3d_cm") == "Residual 3D (cm)"
+    assert check_words("gdi_cycles") == "GDI cycles"
     assert plural(1, "cycle") == "1 cycle"
     assert plural(0, "cycle") == "0 cycles"
     assert size(999) == "999 bytes"

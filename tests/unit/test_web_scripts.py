@@ -106,7 +106,7 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
     )
     body, numbers = body_json(Recording.of("walk", markers))
     assert body["camera"] is None
-    assert body["known"] == [[5, 79]]
+    assert body["known"] == [(5, 79)]
     assert len(numbers) == 2 * 90 * (3 + 4 * len(body["sides"]) + 4)
     nobody = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
     sent = json.loads(Movement.of(Recording.of("walk", nobody)).movement)
