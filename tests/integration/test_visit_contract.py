@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 import pbl_pipeline.fit
 import pbl_pipeline.gait.metrics as metrics
@@ -41,7 +40,7 @@ from tests.integration import chain, test_markers, test_rigs, web
 from tests.rows import register, remove_all
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, leaves
 from workers.populate import populate
-from workers.web import Options, ResultsFolder, create_app
+from workers.web import ResultsFolder
 
 NORM = "gillette-166-three-angles"
 MASS_KG = 70.0
@@ -259,19 +258,13 @@ def test_exports_are_the_same(both: Both, tmp_path: Path) -> None:
     assert_same_exports(of_both(both.of_tables), of_both(both.of_files), formats, tmp_path, float32=True)
 
 
-def pages_of(options: Options) -> TestClient:
-    app = create_app(options)
-    browser = TestClient(app, base_url=web.BASE, raise_server_exceptions=False)
-    browser.get("/enter", params={"key": app.state.sessions.new_link("R. Viewer", "reader")})
-    return browser
-
-
 def test_pages_are_the_same(both: Both) -> None:
     """As JSON, up to the rounding of the files, without what only the tables know."""
-    browsers = [pages_of(Options()), pages_of(Options(folder=ResultsFolder(both.folder)))]
+    browsers = [web.client("reader", folder=folder) for folder in (None, ResultsFolder(both.folder))]
     visits = [b.get("/visits/1.json").json()["about"] for b in browsers]
     of_tables, of_files = (common_of_visit(v, both.kind) for v in visits)
     assert_same(of_tables, of_files, "visit", ROUNDED[Gdi])
+    assert all(bool(of_files["filming"][name]) == (both.kind == "single") for name in ("cameras", "pictures"))
     for recording in both.of_files.fitted:
         lead = both.of_tables.recording(recording.name).number
         number = sorted(p.name for p in both.folder.glob("*.fit.npz")).index(f"{recording.name}.fit.npz") + 1

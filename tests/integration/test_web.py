@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from pbl_pipeline.errors import PblError
 from schemas import gdi, lab, qc, session, study
 from schemas.reading import visit_list
 from schemas.reading.shown import shown_visit
@@ -74,11 +73,11 @@ def test_pages_of_the_list_hold_every_visit_once(four_visits: None):
 def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for day in ("2026-01-10", "2026-04-10"):
         register(small_video(tmp_path, f"walk {day}"), session_label=day)
-    nobody = register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")[0]
-    waits = register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")[0]
+    register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")
+    register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")
     broken = tmp_path / "gone.mp4"
     broken.write_bytes(small_video(tmp_path, "gone").read_bytes() + b"x")
-    gone = register(broken, subject="P003", session_label="2026-02-02")[0]
+    register(broken, subject="P003", session_label="2026-02-02")
     broken.unlink()
     populate()
     for number, index in ((1, 80.0), (2, 90.0)):
@@ -96,15 +95,8 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert [rows[k].state for k in ("P0022026-02-01", "P0032026-02-02")] == ["waiting", "failed"]
     assert rows["P0032026-02-02"].problem == "VIDEO_MISSING"
     by_state = {s: numbers(Filter(state=s)) for s in visit_list.STATES}
-    counts = {s: len(n) for s, n in by_state.items()}
-    assert counts == {
-        "computed": 2,
-        "pending": 0,
-        "waiting": 1,
-        "failed": 1,
-        "empty": 1,
-        "unusable": 0,
-    }
+    counts = {s: len(n) for s, n in by_state.items() if n}
+    assert counts == {"computed": 2, "waiting": 1, "failed": 1, "empty": 1}
     assert sorted(numbers(Filter(quality=later.result.outcome))) == [1, 2]
     page = web.client().get("/visits").text
     assert "+10.0 since 2026-01-10: more than chance" in page
@@ -127,7 +119,6 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert not any("walk" in n or "P001" in n for n in names)
     assert web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}/export").status_code == 404
     assert rows["P0042026-02-03"].state == "empty"
-    assert len({waits, gone, nobody}) == 3
 
 
 def visit_list_key(number: int) -> dict[str, str]:
@@ -167,17 +158,6 @@ def test_a_session_ends_and_is_never_taken_from_the_browser():
     browser.get("/enter", params={"key": sessions.new_link("A", "reader")}, follow_redirects=False)
     assert sessions.find("planted") is None
     assert web.TestClient(app, base_url=web.BASE, cookies={"pbl_session": "planted"}).get("/visits").status_code == 401
-
-
-def test_leaving_ends_the_session():
-    browser = web.client()
-    assert browser.get("/nothing").status_code == 404
-    token = re.search(r'name="token" value="([^"]+)"', browser.get("/nothing").text)
-    assert token
-    kept = browser.cookies["pbl_session"]
-    browser.post("/leave", data={"token": token[1]}, follow_redirects=False)
-    browser.cookies.set("pbl_session", kept)
-    assert browser.get("/nothing").status_code == 401
 
 
 @pytest.mark.parametrize(
@@ -315,10 +295,3 @@ def test_german_by_the_browser_and_by_choice(four_visits: None):
     web.post(browser, "/language", language="de", back="/visits/1")
     assert "Alle Termine dieser Person" in browser.get("/visits/1").text
     assert web.post(browser, "/language", language="de", back="//evil").headers["location"] == "/"
-
-
-def test_a_page_for_other_machines_without_tls_is_refused():
-    from workers.web import Where, serve
-
-    with pytest.raises(PblError, match="without TLS"):
-        serve(Where("0.0.0.0", 0))

@@ -6,7 +6,6 @@ import json
 import random
 import re
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,6 @@ from schemas.transactions import in_transaction
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.integration.compute_target import nothing
-from tests.integration.test_web_accounts import running
 from tests.rows import register
 from workers import incoming, phone_uploads, queue
 from workers.populate import populate
@@ -290,10 +288,8 @@ def test_torn_down_a_hundred_times_every_recording_arrives_once(visit: int, tmp_
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
 
-@contextlib.contextmanager
-def serving() -> Iterator[int]:
-    with running(create_app(Options(target=nothing)), Where()) as port:
-        yield port
+def serving() -> contextlib.AbstractContextManager[int]:
+    return web.running(create_app(Options(target=nothing)), Where())
 
 
 def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tmp_path: Path):

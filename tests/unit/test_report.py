@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pbl_pipeline.body import load_body
 from pbl_pipeline.charts import cycle_chart, nice_ticks
 from pbl_pipeline.code_version import code_version
-from pbl_pipeline.fit import SessionFit, TrialFit
+from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
@@ -18,11 +17,12 @@ from pbl_pipeline.report.words import plural, sentence, size
 from pbl_pipeline.texts import LANGUAGES, catalogue, library_words
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import VideoInfo
-from pbl_pipeline.visit import Recording, Solution, Visit
+from pbl_pipeline.visit import Recording, Visit
 from pbl_pipeline.words import check_words, number, significant
 from tests import not_none
 from tests.html_page import Page, commands_in
 from tests.inputs import video_info
+from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit
 
 N, FPS = 200, 30.0
@@ -58,12 +58,7 @@ def _visit(*recordings: Recording, measures: GaitMetrics | None = None) -> Visit
     fits = tuple(r.fit for r in recordings if r.fit is not None)
     solution = None
     if fits:
-        f, trace = fits[0], np.array([[0.0, 99.0], [100.0, 9.0]])
-        solution = Solution.of(
-            SessionFit(
-                fits, f.scale, f.site_offset_m, trace, 7, True, f.solver, f.params_hash, 31.2, 12.0, "cpu", FIT_CHECKS
-            )
-        )
+        solution = solution_of(fits[0])
     visit = Visit(
         recordings,
         solution,
@@ -77,14 +72,12 @@ def _visit(*recordings: Recording, measures: GaitMetrics | None = None) -> Visit
 
 @pytest.fixture(scope="module")
 def walk() -> TrialFit:
-    body = load_body()
-    return walking_fit(body.joint_names, body.sha256, n_frames=N, seen=(10, 190), speed_m_s=0.5)  # her feet slide
+    return walking_fit(n_frames=N, seen=(10, 190), speed_m_s=0.5)  # her feet slide
 
 
 @pytest.fixture(scope="module")
 def stand() -> TrialFit:
-    body = load_body()
-    return walking_fit(body.joint_names, body.sha256, n_frames=N, walks=False, name="stand")
+    return walking_fit(n_frames=N, walks=False, name="stand")
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,11 @@
-"""A visit written to its folder and read back: equal in every field, and so are its report and its exports."""
+"""A visit written to its folder and read back: equal in every field, and so are its exports.
+
+The report and the pages of both: tests/integration/test_visit_contract.py."""
 
 import dataclasses
 import functools
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import TrialFit
@@ -38,7 +38,7 @@ from tests import not_none
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit
 from tests.inputs import video_info
-from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, fields, leaves
+from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, fields, leaves
 from tests.unit.visits import solution_of
 from tests.walking_fit import walking_fit
 
@@ -61,9 +61,7 @@ def walk(name: str, *, n: int = 200, hidden: slice | None = None, seed: int = 0)
 
 
 def stand(name: str) -> TrialFit:
-    body = load_body()
-    fit = walking_fit(body.joint_names, body.sha256, n_frames=120, walks=False, name=name)
-    return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=fit.qpos)
+    return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=walking_fit(n_frames=120, walks=False).qpos)
 
 
 def video_of(name: str, time_s: np.ndarray) -> VideoInfo:
@@ -228,19 +226,6 @@ def test_files_name_no_folder(visit: Visit, folder: Path) -> None:
     assert [p.name for p in folder.iterdir() if b"secret" in p.read_bytes()] == []
     names = {f"{r.name}.mp4" for r in visit.recordings if r.video is not None}
     assert all(name in (folder / "session.json").read_text() for name in names)
-
-
-def test_the_report_of_the_loaded_visit_is_the_same(visit: Visit, folder: Path) -> None:
-    one, other = (list(leaves(page_of(v, {}, "Visit", None))) for v in (visit, load_visit(folder)))
-    assert len(one) > 40
-    assert [where for where, _ in one] == [where for where, _ in other]
-    for (where, a), (_, b) in zip(one, other, strict=True):
-        assert_same_text(a, b, where)
-
-
-def test_the_tables_of_the_loaded_visit_are_the_same(visit: Visit, folder: Path, tmp_path: Path) -> None:
-    """Up to the rounding of metrics.json and events.csv."""
-    assert_same_exports(visit, load_visit(folder), ["csv"], tmp_path)
 
 
 @pytest.mark.parametrize("name", ["two trials", "markers"])
@@ -596,15 +581,10 @@ def test_keypoints_of_another_recording_are_not_those_of_a_fit(saved: Path) -> N
 
 
 def test_fits_alone_are_a_visit_without_checks(tmp_path: Path) -> None:
-    shutil.copyfile(saved_fit(tmp_path / "a"), tmp_path / "walk.fit.npz")
+    walk("walk").save(tmp_path / "walk.fit.npz")
     found = visit_of_fits([tmp_path / "walk.fit.npz"])
     assert [c.check for c in found.fit_checks] == ["fit_checks_known"]
     assert [(r.name, r.fitted, r.keypoints, r.measured) for r in found.recordings] == [("walk", True, None, None)]
-
-
-def saved_fit(folder: Path) -> Path:
-    save_visit(visit_of(walk("walk")), folder)
-    return folder / "walk.fit.npz"
 
 
 def test_a_visit_that_was_never_fitted_is_saved_and_read(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jinja2
@@ -27,6 +28,8 @@ from schemas.reading.shown import ShownVisit
 from .access import HEADERS, HOURS, Session
 from .address import JSON
 
+#: Fields of a form that no one has filled in, and their errors.
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 #: The folders of an absolute path in a text.
 _FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
 _unforeseen = functools.partial(
