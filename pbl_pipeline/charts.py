@@ -124,7 +124,6 @@ class Axes:
             )
 
     def box(self, x0: float, x1: float, y0: float, y1: float, colour: str, opacity: float = 1.0) -> None:
-        """A filled rectangle in view-box units."""
         self.add(
             Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity="{}"/>').format(
                 min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0), colour, opacity
@@ -132,7 +131,6 @@ class Axes:
         )
 
     def dot(self, x: float, y: float, colour: str, radius: float = 3.2, hollow: bool = False) -> None:
-        """A dot in view-box units."""
         self.add(
             Markup('<circle cx="{:.1f}" cy="{:.1f}" r="{}" fill="{}" stroke="{}" stroke-width="1.4"/>').format(
                 x, y, radius, "#fff" if hollow else colour, colour

@@ -146,7 +146,6 @@ class Deidentified:
 
     @property
     def n_uncertain(self) -> int:
-        """Number of frames that are not certain."""
         return sum(bool(r) for r in self.reasons)
 
 

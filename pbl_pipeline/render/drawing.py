@@ -64,7 +64,7 @@ SIDE_COLOUR: dict[str, str] = {"right": "#0072b2", "left": "#d55e00", "middle": 
 
 
 def bgr(colour: str) -> tuple[int, int, int]:
-    """Convert a "#rrggbb" colour to OpenCV's order."""
+    """Return a "#rrggbb" colour in OpenCV's order."""
     value = int(colour.lstrip("#"), 16)
     return value & 255, (value >> 8) & 255, value >> 16
 

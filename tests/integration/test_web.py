@@ -1,5 +1,6 @@
 """The review page over tables: finding visits, and what must not work."""
 
+import datetime
 import html
 import io
 import re
@@ -9,14 +10,13 @@ from typing import Any
 
 import pytest
 
-from schemas import gdi, lab, qc, session, study
+from schemas import fit, gdi, qc, study
 from schemas.reading import visit_list
 from schemas.reading.shown import shown_visit
 from schemas.reading.visit_list import Filter, visit_page
-from schemas.rows import utc_now
 from tests.integration import web
 from tests.integration.chain import small_video
-from tests.rows import register
+from tests.rows import new_visit, register
 from workers.populate import populate
 from workers.web import Options, create_app, export
 from workers.web.access import HOURS, Sessions
@@ -25,13 +25,9 @@ from workers.web.access import HOURS, Sessions
 @pytest.fixture
 def four_visits(tables: None) -> None:
     """P001 with three visits and P002 with one, no videos: numbers 1 to 4."""
-    people = ({"subject": s, "population": "patient", "subject_created": utc_now()} for s in ("P001", "P002"))
-    lab.Subject.insert(people)
-    days = {1: ("P001", "2026-01-10"), 2: ("P001", "2026-04-10"), 3: ("P001", None), 4: ("P002", "2026-02-01")}
-    session.Session.insert(
-        {"session_id": i, "subject": s, "session_label": d or "later", "session_date": d, "session_created": utc_now()}
-        for i, (s, d) in days.items()
-    )
+    for label in ("2026-01-10", "2026-04-10", "later"):
+        new_visit(label)
+    new_visit("2026-02-01", "P002")
     study.Visit.insert({"session_id": i, "visit_role": r} for i, r in ((1, "pre"), (2, "3_months"), (4, "pre")))
     study.Cohort.insert1({"cohort": "spine"})
     members = (("P001", True), ("P002", False))
@@ -43,8 +39,6 @@ def numbers(wanted: Filter, **more: Any) -> list[int]:
 
 
 def test_filters_of_the_list_and_their_order(four_visits: None):
-    import datetime
-
     assert numbers(Filter()) == [2, 4, 1, 3]  # the newest day first, no day last
     assert numbers(Filter(search="p001")) == [2, 1, 3]
     assert numbers(Filter(search="LATE")) == [3]
@@ -122,8 +116,6 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
 
 
 def visit_list_key(number: int) -> dict[str, str]:
-    from schemas import fit
-
     return {"fit_set": (fit.FitSet & {"session_id": number}).fetch1("fit_set")}
 
 

@@ -18,9 +18,8 @@ from click.testing import CliRunner
 from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
-from schemas import lab, session
-from schemas.rows import utc_now
 from tests.integration.web import post, running
+from tests.rows import new_visit
 from workers.cli.web import web
 from workers.web import Options, Where, accounts, certificates, connections, create_app, serve
 from workers.web.access import IDLE_HOURS, Sessions
@@ -627,13 +626,11 @@ def test_who_counts_as_one_address(one: str, other: str, same: bool):
 
 
 def test_no_name_of_a_person_gets_into_a_path_or_a_log(known: Accounts, tables: None, caplog: pytest.LogCaptureFixture):
-    lab.Subject.insert1({"subject": "P-SECRET", "population": "patient", "subject_created": utc_now()})
-    row = {"session_id": 1, "subject": "P-SECRET", "session_label": "x", "session_created": utc_now()}
-    session.Session.insert1(row)
+    number = new_visit("x", "P-SECRET")
     client = browser(known)
     sign_in(client, "my password by mistake", "A")
     sign_in(client)
-    assert "P-SECRET" in client.get("/visits/1").text
+    assert "P-SECRET" in client.get(f"/visits/{number}").text
     assert "a failed sign-in from" in caplog.text
     assert "mistake" not in caplog.text
     assert WORDS not in caplog.text

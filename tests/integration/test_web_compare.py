@@ -309,7 +309,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
           const v = f.querySelector("video"), c = f.querySelector("select").selectedOptions[0].dataset;
           const phase = +document.querySelector(".together").dataset.phase;
           return v.seeking ? 9 : (v.currentTime - +c.start) / (+c.end - +c.start) - phase; })"""
-        _until(page, f"({off})().every((d) => Math.abs(d) < 0.002)")
+        web.until(lambda: page.evaluate(f"({off})().every((d) => Math.abs(d) < 0.002)"))
         assert page.locator("#phase-now").inner_text() == "37 %"
         line = page.locator(".phase-line").first
         assert float(line.get_attribute("x1")) == pytest.approx(36 + 0.37 * 236)
@@ -326,19 +326,10 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
         assert len(worst) > 10
         assert float(np.median(np.abs(worst))) < 0.06
         page.get_by_role("button", name="Pause").click()
-        _until(page, "[...document.querySelectorAll('video')].every((v) => v.paused)")
+        web.until(lambda: page.evaluate("[...document.querySelectorAll('video')].every((v) => v.paused)"))
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # For the record: what is printed has curves and no buttons or videos.
         page.emulate_media(media="print")
         assert page.locator(".charts figure > svg").first.is_visible()
         assert not page.locator(".together").is_visible()
         assert not page.locator(".top").is_visible()
-
-
-def _until(page: Any, holds: str) -> None:
-    """Wait until an expression holds. Playwright's own wait evaluates texts in the page, which its policy forbids."""
-    for _ in range(1200):
-        if page.evaluate(holds):
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError(holds)

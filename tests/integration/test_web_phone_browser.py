@@ -20,7 +20,8 @@ from schemas.intake import phone_recordings
 from schemas.intake.protocols import Step, add_protocol
 from tests.integration import web
 from tests.integration.compute_target import nothing
-from tests.integration.test_web_phone import link_of, new_visit
+from tests.integration.test_web_phone import link_of
+from tests.rows import new_visit
 from tests.videos import numbered_frames
 from workers import phone_uploads
 from workers.web import Options, Where, certificates, create_app, phone

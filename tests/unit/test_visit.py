@@ -37,9 +37,8 @@ from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_o
 from tests import not_none
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit
-from tests.inputs import video_info
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, fields, leaves
-from tests.unit.visits import solution_of
+from tests.unit.visits import solution_of, video_of
 from tests.walking_fit import walking_fit
 
 FPS = 30.0
@@ -64,21 +63,10 @@ def stand(name: str) -> TrialFit:
     return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=walking_fit(n_frames=120, walks=False).qpos)
 
 
-def video_of(name: str, time_s: np.ndarray) -> VideoInfo:
-    return video_info(
-        path=f"/somewhere/secret/{name}.mp4",
-        sha256="ab" * 32,
-        size_bytes=3_456_789,
-        container="mp4",
-        width_px=640,
-        height_px=360,
-        time_s=time_s,
-        duration_s=float("nan"),
-        recorded_utc="2026-03-01T10:00:00Z",
-        make="Acme",
-        notes=("two stamps repeat",),
-        capture_fps=240.0,  # slow motion: a check that FAILs, of the recording
-    )
+def slow_motion(name: str, time_s: np.ndarray) -> VideoInfo:
+    """A video with a check that FAILs, of the recording."""
+    day, notes = "2026-03-01T10:00:00Z", ("two stamps repeat",)
+    return video_of(name, time_s, duration_s=float("nan"), recorded_utc=day, notes=notes, capture_fps=240.0)
 
 
 def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: Any) -> Visit:
@@ -89,7 +77,7 @@ def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: An
             f,
             keypoints_of(f),
             path=Path(f"/somewhere/secret/{f.name}.mp4"),
-            video=video_of(f.name, f.time_s),
+            video=slow_motion(f.name, f.time_s),
             choice=CHOICE,
             condition=Condition("walking", "self_selected"),
         )
@@ -100,7 +88,7 @@ def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: An
 
 
 def dark() -> Recording:
-    video = video_of("dark", np.arange(50) / FPS)
+    video = slow_motion("dark", np.arange(50) / FPS)
     return Recording("dark", Path(video.path), video, NOBODY, problem="TRACK_NO_PERSON: nobody was found")
 
 

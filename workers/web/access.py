@@ -161,7 +161,6 @@ class Sessions:
         return session.ends > now and (self._idle is None or now - session.seen < 3600 * self._idle)
 
     def leave(self, cookie: str) -> None:
-        """End a session."""
         self._sessions.pop(hashed(cookie), None)
 
 
@@ -188,7 +187,6 @@ class Cookie:
         )
 
     def forget(self, response: Response) -> None:
-        """Have a browser forget it."""
         response.delete_cookie(self.name, path="/", httponly=True, samesite="strict", secure=self.secure)
 
 

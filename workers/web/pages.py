@@ -170,7 +170,6 @@ class Pages:
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
-        """Return the answer to a coded error."""
         return self.show(request, "error.html", status, error=error)
 
     def missing(self, request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:
