@@ -155,7 +155,8 @@ def test_each_address_opens_for_its_roles_and_leaves_its_row(browsers: dict[str,
                 assert (status, "P001" in answer.text) == (403, False), (name, role)
                 assert looks() == [], (name, role)
     Viewing().delete_quick()
-    assert rows() == before
+    changed = {table for table, found in rows().items() if found != before[table]}
+    assert changed <= {"pbl_lab.numbered"}  # of the looks
 
 
 @pytest.mark.parametrize("name", [n for n in EXPECTED if EXPECTED[n][0] != "*"])
