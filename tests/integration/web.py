@@ -93,7 +93,7 @@ def one_query_at_a_time() -> Iterator[None]:
 
 @contextlib.contextmanager
 def running(app: Any, where: Where) -> Iterator[int]:
-    """The page by a server of its own; its port."""
+    """Serve the page; yields its port."""
     listening = socket.create_server((where.host, 0))
     server = uvicorn.Server(config(app, where))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)

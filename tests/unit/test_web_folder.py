@@ -106,7 +106,7 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
 
 
 def test_what_is_not_there_is_said(browser, monkeypatch: pytest.MonkeyPatch):
-    # There is no recording beside the second visit.
+    # The second visit has no recording beside it.
     assert "copy the recording beside its results" in browser.get("/recordings/2").text
     assert browser.get("/recordings/2/video").status_code == 404
     for path in ("/visits/9", "/recordings/9", "/recordings/9/movement", "/recordings/2/overlay"):
