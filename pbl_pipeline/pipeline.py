@@ -220,7 +220,7 @@ def write_visit_report(path: Path, visit: Visit, title: str = "Gait report", lan
     """
     with _as_shown(visit) as shown:
         pictures = {r.name: _pictures(r, r.fit) for r in shown.fitted if r.fit is not None}
-        return write_report(path, shown, pictures, title, None, language)
+        return write_report(path, shown, pictures, title, language)
 
 
 @contextlib.contextmanager

@@ -42,10 +42,9 @@ _UNCHOSEN = {"NEEDS_CHOICE": NEEDS_CHOICE, "NO_PERSON": FAIL}
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
 
-def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str, norm: NormativeSet | None) -> dict:
-    """Return everything that the template shows. `norm`: as in `write_report`."""
-    shipped = _norm(visit)
-    norm = shipped if norm is None else norm
+def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str) -> dict:
+    """Return everything that the template shows."""
+    norm = _norm(visit)
     recordings = visit.fitted or visit.recordings
     checks = _checks(visit, recordings)
     metrics = visit.measures
@@ -90,7 +89,7 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["bands"] = {"words": bands.words(), "source": bands.source}
         page["far_leg"] = far_leg_of(cycles)
-        people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
+        people = "the norm" if norm is None else f"the norm's {norm.n} typically developing children"
         page["index"] = _index(metrics.gdi, cycles, people)
         page["forces"] = forces_section(visit)
     return page
@@ -396,7 +395,6 @@ def write_report(
     visit: Visit,
     pictures: Mapping[str, Sequence[Picture]] | None = None,
     title: str = "Gait report",
-    norm: NormativeSet | None = None,
     language: str = LANGUAGES[0],
 ) -> Path:
     """Write the report of a visit as one HTML file and return its path.
@@ -405,14 +403,14 @@ def write_report(
     from a folder. Every text is escaped. The page of a visit without gait states that and shows the angles over time.
     The file appears when it is complete.
 
-    `pictures`: by the name of the recording. `norm`: the set of the index; None for the one that the measures name, if
-    it is included. `language`: one of `texts.LANGUAGES`. Raises as `Recording.fit` and `Recording.keypoints`.
+    `pictures`: by the name of the recording. `language`: one of `texts.LANGUAGES`. Raises as `Recording.fit` and
+    `Recording.keypoints`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     template = shipped_page("report/templates/report.html")
     css = Markup(shipped_text("report/templates/report.css"))  # noqa: S704  our own file
-    page = page_of(visit, pictures or {}, title, norm)
+    page = page_of(visit, pictures or {}, title)
     part = path.with_name(f"{path.name}.part{os.getpid()}")
     try:
         html = template.render(page=page, css=css, language=language)

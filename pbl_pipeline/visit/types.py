@@ -189,13 +189,6 @@ class Visit:
         """Subject and label, for lists."""
         return " ".join(t for t in (self.subject if self.subject != "-" else "", self.label or self.date) if t)
 
-    def recording(self, name: str) -> Recording:
-        """Return the recording of that name. Raises KeyError."""
-        found = next((r for r in self.recordings if r.name == name), None)
-        if found is None:
-            raise KeyError(name)
-        return found
-
     def with_measures(self, measures: GaitMetrics) -> Visit:
         """Return the visit with these measures.
 

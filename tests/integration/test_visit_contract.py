@@ -243,7 +243,7 @@ def test_a_visit_of_the_tables_comes_back_from_its_folder(both: Both, tmp_path: 
 
 
 def test_the_report_is_the_same(both: Both) -> None:
-    pages = [list(leaves(page_of(of_both(v), {}, "Visit", None))) for v in (both.of_tables, both.of_files)]
+    pages = [list(leaves(page_of(of_both(v), {}, "Visit"))) for v in (both.of_tables, both.of_files)]
     assert len(pages[0]) > 40
     assert [where for where, _ in pages[0]] == [where for where, _ in pages[1]]
     for (where, a), (_, b) in zip(*pages, strict=True):
@@ -265,8 +265,9 @@ def test_pages_are_the_same(both: Both) -> None:
     of_tables, of_files = (common_of_visit(v, both.kind) for v in visits)
     assert_same(of_tables, of_files, "visit", ROUNDED[Gdi])
     assert all(bool(of_files["filming"][name]) == (both.kind == "single") for name in ("cameras", "pictures"))
+    numbers = {r.name: r.number for r in both.of_tables.recordings}
     for recording in both.of_files.fitted:
-        lead = both.of_tables.recording(recording.name).number
+        lead = numbers[recording.name]
         number = sorted(p.name for p in both.folder.glob("*.fit.npz")).index(f"{recording.name}.fit.npz") + 1
         pages = [f"/recordings/{n}" for n in (lead, number)]
         shown = [b.get(f"{p}.json").json()["about"] for b, p in zip(browsers, pages, strict=True)]

@@ -205,7 +205,7 @@ def test_what_names_an_option_on_the_command_line_is_said_otherwise(visit: Visit
     named = ("camera_orientation_known", "lengths_scale", "camera_intrinsics_measured")
     checks = [Check(name, WARN, None, None, advice) for name, advice in zip(named, advised, strict=True)]
     asking = visit.with_measures(not_none(visit.measures).with_checks([*visit.checks, *checks]))
-    page = write_report(tmp_path / "report.html", asking, PICTURES, "Visit 1", None, language).read_text("utf-8")
+    page = write_report(tmp_path / "report.html", asking, PICTURES, "Visit 1", language).read_text("utf-8")
     assert not commands_in(page)
     for advice in advised:
         told = library_words(language, advice)[1:].replace("'", "&#39;")

@@ -134,6 +134,10 @@ VISITS: dict[str, Callable[[], Visit]] = {
 }
 
 
+def recording_of(visit: Visit, name: str) -> Recording:
+    return next(r for r in visit.recordings if r.name == name)
+
+
 @functools.cache
 def visit_called(name: str) -> Visit:
     return VISITS[name]()
@@ -380,8 +384,8 @@ def test_a_folder_of_an_older_version_is_read_and_says_what_it_lacks(two: Visit,
         events = [dataclasses.replace(e, bout=0) for e in not_none(before.events).events]
         assert_same(tuple(events), not_none(recording.measured).events.events)
         assert_same(before.fit, recording.fit)
-    page = dict(leaves(page_of(found, {}, "Visit", None)))
-    assert page["/measures/0/mean"] == dict(leaves(page_of(two, {}, "Visit", None)))["/measures/0/mean"]
+    page = dict(leaves(page_of(found, {}, "Visit")))
+    assert page["/measures/0/mean"] == dict(leaves(page_of(two, {}, "Visit")))["/measures/0/mean"]
 
 
 def test_tables_of_an_older_folder_are_refused_until_its_cycles_are_there(saved: Path, tmp_path: Path) -> None:
@@ -429,19 +433,19 @@ def test_a_folder_half_written_shows_what_is_there(two: Visit, saved: Path, file
     found = load_visit(saved)
     (lack,) = found.lacks
     assert lack.startswith(lacks)
-    walked = found.recording("walk")
-    assert_same(fields(as_stored(two).recording("walk"))["fit"], walked.fit)
+    walked = recording_of(found, "walk")
+    assert_same(fields(recording_of(as_stored(two), "walk"))["fit"], walked.fit)
     assert_same(keypoints_of(walk("walk")), walked.keypoints)
     assert [r.name for r in found.fitted] == (["walk"] if gone == "fit" else ["walk", "back"])
     assert (found.measures is None) is (gone == "measures")
     if gone in ("measures", "fit"):
         assert {c.check for c in found.checks} >= {"residual_3d_cm"}
         return
-    back = found.recording("back")
+    back = recording_of(found, "back")
     assert (back.keypoints is None) is (gone == "keypoints")
     assert (back.events is not None and back.events.events == ()) is (gone == "events")
-    assert [bool(c.curves) for c in back.cycles] == [gone != "curves"] * len(two.recording("back").cycles)
-    assert page_of(found, {}, "Visit", None)["measures"]
+    assert [bool(c.curves) for c in back.cycles] == [gone != "curves"] * len(recording_of(two, "back").cycles)
+    assert page_of(found, {}, "Visit")["measures"]
 
 
 @pytest.mark.parametrize(("file", "what"), [("back.events.csv", "gait events"), ("back.cycles.npz", "gait cycles")])
@@ -491,7 +495,7 @@ def test_a_value_of_another_type_never_ends_without_a_code(tmp_path: Path, file:
                 found = load_visit(tmp_path)
                 assert not_none(found.measures).table()
                 if i == j:  # a page takes ten times as long
-                    page_of(found, {}, "Visit", None)
+                    page_of(found, {}, "Visit")
             except PblError:
                 refused += 1
             except Exception as error:
@@ -561,7 +565,7 @@ def test_a_session_file_of_another_fit_says_nothing_of_this_one(saved: Path, cha
 
 def test_keypoints_of_another_recording_are_not_those_of_a_fit(saved: Path) -> None:
     keypoints_of(walk("walk", n=90)).save(saved / "walk.keypoints.npz")
-    found = load_visit(saved).recording("walk")
+    found = recording_of(load_visit(saved), "walk")
     assert found.keypoints is None
     assert found.video is not None
     assert np.isnan(found.video.time_s).all()
