@@ -124,7 +124,6 @@ class Axes:
             )
 
     def box(self, x0: float, x1: float, y0: float, y1: float, colour: str, opacity: float = 1.0) -> None:
-        """A filled rectangle in view-box units."""
         self.add(
             Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}" fill-opacity="{}"/>').format(
                 min(x0, x1), min(y0, y1), abs(x1 - x0), abs(y1 - y0), colour, opacity
@@ -132,7 +131,6 @@ class Axes:
         )
 
     def dot(self, x: float, y: float, colour: str, radius: float = 3.2, hollow: bool = False) -> None:
-        """A dot in view-box units."""
         self.add(
             Markup('<circle cx="{:.1f}" cy="{:.1f}" r="{}" fill="{}" stroke="{}" stroke-width="1.4"/>').format(
                 x, y, radius, "#fff" if hollow else colour, colour
@@ -184,7 +182,7 @@ def cycle_chart(
     for side, curves in cycles.items():
         if not curves:
             continue
-        axes.curve(percent, mean_curve(curves), SIDE_COLOUR[side], 2.4, opacity[side], _DASH[side])
+        axes.curve(percent, np.mean(curves, axis=0, dtype=float), SIDE_COLOUR[side], 2.4, opacity[side], _DASH[side])
         off = foot_off_percent.get(side, np.nan)
         if np.isfinite(off):
             x = float(axes.x(off))
@@ -373,11 +371,6 @@ def nice_ticks(low: float, high: float, n: int = 5) -> list[float]:
     step = next(float(m * power) for m in (1, 2, 5, 10) if span / (m * power) <= n + 1e-9)
     first, last = int(np.floor(low / step + 1e-9)), int(np.ceil(high / step - 1e-9))
     return [round(i * step, 10) for i in range(first, max(last, first + 1) + 1)]
-
-
-def mean_curve(curves: Sequence[np.ndarray]) -> np.ndarray:
-    """Mean (P,) of curves (P,), NaN where any of them is unknown."""
-    return np.mean(np.stack([np.asarray(c, float) for c in curves]), axis=0)
 
 
 def _inside(ticks: list[float], stop: float) -> list[float]:

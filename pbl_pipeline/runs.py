@@ -13,3 +13,8 @@ def runs(values: ArrayLike) -> list[slice]:
     numbers = np.asarray(values, float)
     edges = np.flatnonzero(np.diff(numbers, prepend=0.0, append=0.0))
     return [slice(int(a), int(b)) for a, b in pairwise(edges) if numbers[a]]
+
+
+def ranges(flags: ArrayLike) -> list[tuple[int, int]]:
+    """Return the first and last index of each run of True."""
+    return [(run.start, run.stop - 1) for run in runs(flags)]

@@ -16,7 +16,7 @@ def marked_fit(
 ) -> TrialFit:
     """`walking_fit` in a scaled body with displaced markers; every joint moves."""
     body, places, rng = load_body(), marker_set(markers), np.random.default_rng(seed)
-    fit = walking_fit(body.joint_names, body.sha256, n_frames=n_frames, seen=seen, marker_names=places.names)
+    fit = walking_fit(n_frames=n_frames, seen=seen, marker_names=places.names)
     scale, offset = rng.uniform(0.9, 1.1, 8), rng.normal(0, 0.005, (len(places), 3))
     time = np.asarray(fit.time_s)[:, None]
     sway = np.radians(4.0) * np.sin(2 * np.pi * time * rng.uniform(0.3, 0.9, 40) + rng.uniform(0, 6, 40))

@@ -9,7 +9,9 @@ from pathlib import Path
 from pbl_pipeline import settings
 from schemas import connection
 from schemas.intake import Registered, VisitRecord, ingest
+from schemas.intake.records import session_ids
 from schemas.operations import backup_files, catalog
+from schemas.transactions import in_transaction
 
 
 def outcomes(results: Iterable[Registered]) -> list[str]:
@@ -24,6 +26,12 @@ def register(*paths: Path, **visit) -> list[int]:
     results = ingest(paths, VisitRecord(subject=visit.pop("subject", "P001"), **visit))
     assert outcomes(results) == ["registered"] * len(paths), results
     return [r.video_id or 0 for r in results]
+
+
+def new_visit(label: str, subject: str = "P001") -> int:
+    """Register a visit without recordings; its `session_id`."""
+    (number,) = in_transaction(lambda: session_ids([VisitRecord(subject, label)])).values()
+    return number
 
 
 def everything() -> dict[str, list[tuple]]:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from pbl_pipeline.body import load_body
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Camera
@@ -13,8 +14,8 @@ CYCLE_S, STANCE = 1.1, 0.61
 
 
 def walking_fit(
-    joint_names: tuple[str, ...],
-    body_sha256: str,
+    joint_names: tuple[str, ...] | None = None,
+    body_sha256: str | None = None,
     *,
     name: str = "walk",
     n_frames: int = 150,
@@ -26,7 +27,7 @@ def walking_fit(
     walks: bool = True,
     marker_names: tuple[str, ...] = ("nose",),
 ) -> TrialFit:
-    """A person who walks across the picture from right to left.
+    """A person who walks across the picture from right to left, in the installed body where no other is named.
 
     `start_m` is the pelvis in the world at time 0; frames outside `seen` are NaN; `walks=False` stands still.
     """
@@ -49,7 +50,7 @@ def walking_fit(
     return TrialFit(
         name=name,
         time_s=time,
-        joint_names=tuple(joint_names),
+        joint_names=joint_names or load_body().joint_names,
         qpos=qpos,
         qpos_sd=np.full_like(qpos, np.nan),
         marker_set="blazepose_33",
@@ -72,7 +73,7 @@ def walking_fit(
         phone_clock_offset_s=float("nan"),
         solver="gauss-newton",
         params_hash="0123456789abcdef",
-        body_sha256=body_sha256,
+        body_sha256=body_sha256 or load_body().sha256,
         loss=9.5,
         seconds=12.0,
     )

@@ -1,7 +1,7 @@
 """Videos without faces: heads found, held over gaps and covered (docs/privacy.md)."""
 
 from .heads_of_video import find_heads
-from .types import REASONS, Head, HeadParams, Heads, ranges
+from .types import REASONS, Head, HeadParams, Heads
 from .video_copy import (
     HOW,
     SPREAD_S,

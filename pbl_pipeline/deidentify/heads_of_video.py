@@ -24,14 +24,9 @@ from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 from .types import BODY, DISAGREE, FACE, HELD, KEYPOINTS, NONE, Head, HeadParams, Heads
 
 #: Points that make the face in the marker set `blazepose_33`.
-FACE_WORDS = ("nose", "eye", "ear", "mouth")
+FACE_WORDS = frozenset({"nose", "eye", "ear", "mouth"})
 #: Frames before and after one whose heads show where its head should be.
 _AROUND = 3
-
-
-def is_face(name: str) -> bool:
-    """True for a keypoint of the face."""
-    return any(word in name.split("_") for word in FACE_WORDS)
 
 
 def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams) -> Head:
@@ -61,7 +56,7 @@ def head_of_person(track: PersonTrack, keypoints: Keypoints, params: HeadParams)
 def head_circle(keypoints: Keypoints, params: HeadParams) -> np.ndarray:
     """(T, 3) circle of the head by the keypoints, NaN if no point of the face is in the picture."""
     names = keypoints.names
-    face = np.array([is_face(n) for n in names])
+    face = np.array([not FACE_WORDS.isdisjoint(n.split("_")) for n in names])
     ears = np.array(["ear" in n.split("_") for n in names])
     xy = keypoints.xy_px.astype(float)
     centre = np.where(np.isfinite(mean(xy[:, ears])), mean(xy[:, ears]), mean(xy[:, face]))
@@ -201,7 +196,6 @@ class FaceDetector:
     def __init__(self, min_score: float = 0.5) -> None:
         self._full = _load("face_detector", FULL_RANGE, min_score)
         self._short = _load("face_detector_near", SHORT_RANGE, min_score)
-        self.models = {"face_detector": self._full.sha256, "face_detector_near": self._short.sha256}
 
     def detect(self, image: np.ndarray, windows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
         """Find faces in the `windows` (x0, y0, x1, y1) of `image` (H, W, 3) uint8 BGR: boxes (N, 4) x0, y0, x1, y1 in

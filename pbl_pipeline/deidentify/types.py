@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbl_pipeline.keypoints import KeypointParams
-from pbl_pipeline.runs import runs
 from pbl_pipeline.tracking import AssociationParams, TrackingParams, WatchParams
 
 
@@ -52,10 +51,9 @@ class HeadParams:
     hold_most: float = 2.0  # and its largest size
 
 
-#: Origins of the circle of a head in a frame, by number in `Head.source`: keypoints and faces are certain enough not to
-#: be reviewed.
-SOURCES = ("none", "keypoints", "face", "disagree", "body", "held")
-NONE, KEYPOINTS, FACE, DISAGREE, BODY, HELD = range(len(SOURCES))
+#: Origins of the circle of a head in a frame, as numbers in `Head.source`. Keypoints and faces are certain enough not
+#: to be reviewed.
+NONE, KEYPOINTS, FACE, DISAGREE, BODY, HELD = range(6)
 #: Reason why a frame is not certain -> its text.
 REASONS: dict[str, str] = {
     "no_head": "no head was found in the frame",
@@ -72,7 +70,7 @@ class Head:
 
     #: (T, 3) centre x, y and radius in px of the upright frame, around the whole head with hair and margin, or NaN
     circle_px: np.ndarray
-    source: np.ndarray  # (T,) uint8 numbers of `SOURCES`
+    source: np.ndarray  # (T,) uint8: `NONE`, `KEYPOINTS`, ...
     box_px: np.ndarray  # (T, 4) x0, y0, x1, y1 of the person, or NaN
     body_px: np.ndarray | None = None  # (T, J, 2) the person's keypoints, for drawing; None for a face without a body
     body_names: tuple[str, ...] = ()  # J
@@ -134,8 +132,3 @@ def overlapping(heads: Sequence[Head]) -> np.ndarray:
                 x0, y0, x1, y1 = other.box_px.T
                 found |= (x > x0) & (x < x1) & (y > y0) & (y < y1)
     return found
-
-
-def ranges(flags: Sequence[bool] | np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and last index of each run of True."""
-    return [(run.start, run.stop - 1) for run in runs(flags)]

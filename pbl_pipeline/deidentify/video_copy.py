@@ -20,11 +20,12 @@ from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_out_file
 from pbl_pipeline.render import draw_skeleton
+from pbl_pipeline.runs import ranges
 from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, sha256_of, write_h264
 
 from .heads_of_video import find_heads
-from .types import REASONS, HeadParams, Heads, ranges
+from .types import REASONS, HeadParams, Heads
 
 #: Standard deviation of the Gaussian, in radii of the circle: a face is about 0.75 of a radius wide.
 BLUR_RADII = 0.4
@@ -115,8 +116,6 @@ KEEP: Mapping[str, tuple[str, ...]] = {
 }
 #: Always kept: it shows slow motion, and nothing about a person.
 _ALWAYS = ("com.android.capture.fps", "com.apple.quicktime.capture.fps")
-#: Status of a result: every frame certain; some to be reviewed; nothing was covered.
-STATUSES = ("CERTAIN", "REVIEW", "NO_HEAD")
 SIDECAR_VERSION = 1
 #: The positions of the head in the frames within this time (s) are also covered.
 SPREAD_S = 0.05
@@ -131,7 +130,7 @@ class Deidentified:
     sidecar: Path
     how: str  # one of `HOW`
     n_heads: int
-    status: str  # one of `STATUSES`
+    status: str  # "CERTAIN" (every frame), "REVIEW" (look at some) or "NO_HEAD" (nothing was covered)
     reason: str  # of the status, a sentence
     reasons: tuple[tuple[str, ...], ...]  # (T,) why each frame is not certain, names of `REASONS`; empty if it is
 
@@ -147,7 +146,6 @@ class Deidentified:
 
     @property
     def n_uncertain(self) -> int:
-        """Number of frames that are not certain."""
         return sum(bool(r) for r in self.reasons)
 
 

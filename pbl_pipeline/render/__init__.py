@@ -1,6 +1,6 @@
 """Drawing of the fitted body over the recording."""
 
-from pbl_pipeline.render.body_poses import BodyTrack, body_track, uncertain_sides
+from pbl_pipeline.render.body_poses import BodyTrack, body_track, uncertain_sides, without_jumps
 from pbl_pipeline.render.drawing import (
     NEAR_M,
     SIDE_COLOUR,

@@ -24,7 +24,6 @@ _LEG = ("hip", "knee", "ankle", "heel", "foot_index")
 class BodyTrack:
     """B bodies over T frames in the world of the fit (z up, origin at the camera)."""
 
-    names: tuple[str, ...]  # of the bodies
     sides: tuple[str, ...]  # "left", "right" or "middle"
     leg: np.ndarray  # (B,) true for the bodies of the two legs, from the thigh on
     parent: np.ndarray  # (B,) index of the parent; -1 for the root, which comes first
@@ -54,17 +53,12 @@ def body_track(fit: TrialFit) -> BodyTrack:
     quat = np.full((len(at.position_m), n, 4), np.nan)
     if len(known):
         found = Rotation.from_matrix(at.rotation[known].reshape(-1, 3, 3)).as_quat(scalar_first=True)
-        found = found.reshape(len(known), n, 4)
-        # q and -q are one rotation; each gets the sign of its predecessor, so that they can be interpolated.
-        turned = np.sign(np.sum(found[1:] * found[:-1], axis=2, keepdims=True))
-        found[1:] *= np.cumprod(np.where(turned == 0, 1.0, turned), axis=0)
-        quat[known] = found
+        quat[known] = without_jumps(found.reshape(len(known), n, 4))
     thighs = [i for i, name in enumerate(body.body_names) if name.startswith("femur_")]
     lowest = np.full(len(quat), np.nan)
     drawn = capsules(body, np.asarray(fit.qpos)[known], fit.scale)
     lowest[known] = (np.minimum(drawn.start[..., 2], drawn.end[..., 2]) - drawn.radius_m).min(axis=1)
     return BodyTrack(
-        names=tuple(body.body_names),
         sides=tuple(side_of(name) for name in body.body_names),
         leg=np.array([any(body.path[i, thigh] for thigh in thighs) for i in range(n)], bool),
         parent=parent,
@@ -74,6 +68,14 @@ def body_track(fit: TrialFit) -> BodyTrack:
         shapes=shapes,
         floor_m=float(np.median(lowest[known])) if len(known) else float("nan"),
     )
+
+
+def without_jumps(quat: np.ndarray) -> np.ndarray:
+    """Quaternions (T, ..., 4), each with the sign (q and -q are one rotation) that is nearer to the one before, so that
+    they can be interpolated. Across one that is NaN the sign stays."""
+    turned = np.nan_to_num(np.sign(np.sum(quat[1:] * quat[:-1], axis=-1, keepdims=True)), nan=1.0)
+    signs = np.cumprod(np.where(turned == 0, 1.0, turned), axis=0)
+    return np.concatenate([quat[:1], signs * quat[1:]])
 
 
 def _offsets(position_m: np.ndarray, rotation: np.ndarray, parent: np.ndarray) -> np.ndarray:

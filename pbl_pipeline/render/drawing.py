@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,6 +16,9 @@ from pbl_pipeline.body import joint_angles
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.runs import runs
 from pbl_pipeline.video import Camera, turning_radius2
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import GaitEvent
 
 #: Least depth of drawn points (m): the pinhole equations grow without bound below.
 NEAR_M = 0.1
@@ -61,7 +64,7 @@ SIDE_COLOUR: dict[str, str] = {"right": "#0072b2", "left": "#d55e00", "middle": 
 
 
 def bgr(colour: str) -> tuple[int, int, int]:
-    """Convert a "#rrggbb" colour to OpenCV's order."""
+    """Return a "#rrggbb" colour in OpenCV's order."""
     value = int(colour.lstrip("#"), 16)
     return value & 255, (value >> 8) & 255, value >> 16
 
@@ -224,24 +227,13 @@ _INK, _FAINT, _GRID, _PAPER = (51, 46, 42), (120, 112, 104), (232, 228, 224), (2
 _FONT_NAME = "sans"  # OpenCV carries this font itself
 
 
-class Event(Protocol):
-    """Fields of a gait event that are drawn: `side` "left" or "right", `event` "foot_down" or "foot_up"."""
-
-    @property
-    def time_s(self) -> float: ...
-    @property
-    def side(self) -> str: ...
-    @property
-    def event(self) -> str: ...
-
-
-def stance_spans(events: Iterable[Event], side: str) -> list[tuple[float, float]]:
+def stance_spans(events: Iterable[GaitEvent], side: str) -> list[tuple[float, float]]:
     """Times (initial contact, toe-off) in which the foot of `side` is known to be on the ground.
 
     Only a foot-down that is followed by a foot-up makes a span: before the first and after the last event, and between
     two events of one kind, nothing is claimed.
     """
-    own = sorted((float(e.time_s), str(e.event)) for e in events if e.side == side)
+    own = sorted((e.time_s, e.event) for e in events if e.side == side)
     pairs = itertools.pairwise(own)
     return [(t0, t1) for (t0, kind0), (t1, kind1) in pairs if kind0 == "foot_down" and kind1 == "foot_up"]
 
@@ -249,7 +241,7 @@ def stance_spans(events: Iterable[Event], side: str) -> list[tuple[float, float]
 class Strip:
     """A picture (height, width, 3) BGR that is drawn once; `frame(t)` adds the cursor of time t."""
 
-    def __init__(self, fit: TrialFit, events: Sequence[Event], width: int, height: int) -> None:
+    def __init__(self, fit: TrialFit, events: Sequence[GaitEvent], width: int, height: int) -> None:
         self._font = cv2.FontFace(_FONT_NAME)
         self._height = height
         self._text_px = max(9, round(height * 0.105))
@@ -297,7 +289,7 @@ class Strip:
                 corners = np.rint(points[run] * 16).astype(np.int32)
                 cv2.polylines(self._picture, [corners], False, bgr(SIDE_COLOUR[side]), 2, cv2.LINE_AA, 4)
 
-    def _draw_contacts(self, events: Sequence[Event]) -> None:
+    def _draw_contacts(self, events: Sequence[GaitEvent]) -> None:
         half = max(2, round(self._height * 0.04))
         for side, row in self._rows.items():
             colour = bgr(SIDE_COLOUR[side])

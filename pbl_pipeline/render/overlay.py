@@ -7,6 +7,7 @@ import functools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,15 +17,11 @@ from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.render.drawing import (
-    Event,
-    Strip,
-    capsule_outline,
-    draw_body,
-    draw_keypoints,
-    to_camera,
-)
+from pbl_pipeline.render.drawing import Strip, capsule_outline, draw_body, draw_keypoints, to_camera
 from pbl_pipeline.video import read_frames, scaled_matrix, write_h264
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import GaitEvent
 
 _BLOCK = 64  # frames whose capsules are computed and kept at a time
 _changed = functools.partial(
@@ -107,7 +104,7 @@ def render_overlay(
     out_path: str | Path,
     keypoints: Keypoints | None = None,
     *,
-    events: Sequence[Event] = (),
+    events: Sequence[GaitEvent] = (),
     max_side_px: int = 1280,
 ) -> Path:
     """Write the recording with the fitted body over it as H.264 in MP4, and return its path.

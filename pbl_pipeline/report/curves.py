@@ -54,7 +54,7 @@ def cycle_curves(
             continue
         band = (bands.percent, *bands.curves[name]) if name in bands.curves else None
         percent = np.linspace(0.0, 100.0, len(next(c for curves in by_side.values() for c in curves)))
-        means = {s: charts.mean_curve(curves) for s, curves in by_side.items() if curves}
+        means = {s: np.mean(curves, axis=0, dtype=float) for s, curves in by_side.items() if curves}
         ranges = {s: (float(m.min()), float(m.max())) for s, m in means.items() if np.isfinite(m).all()}
         picture = charts.cycle_chart(label(title, ranges), percent, by_side, foot_off, band, faint)
         norm = None if band is None else (float(band[1].min()), float(band[1].max()))

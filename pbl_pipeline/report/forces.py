@@ -61,7 +61,7 @@ def _row(name: str, measure: KineticMeasure | None, reason: str, mass_kg: float 
     asymmetry = number(measure.asymmetry_percent, 0)
     if measure.asymmetry_sd is not None:
         asymmetry += f" \N{PLUS-MINUS SIGN} {number(WIDTH_SD * measure.asymmetry_sd, 0)}"
-    newtons = "" if mass_kg is None or unit != "BW" else f"{number(9.80665 * mass_kg * measure.mean, 0)} N"
+    newtons = "" if mass_kg is None or unit != "BW" else f"{number(GRAVITY * mass_kg * measure.mean, 0)} N"
     return {
         "name": title,
         "known": True,

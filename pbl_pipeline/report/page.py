@@ -31,26 +31,20 @@ from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Che
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._figures import Picture
 from pbl_pipeline.report.forces import forces_section
-from pbl_pipeline.report.words import (
-    HEADLINES,
-    OUTCOME_WORDS,
-    VERDICT_WORDS,
-    check_name,
-    plural,
-    sentence,
-    size,
-)
+from pbl_pipeline.report.words import HEADLINES, OUTCOME_WORDS, VERDICT_WORDS, plural, sentence, size
 from pbl_pipeline.shipped import shipped_page, shipped_text
 from pbl_pipeline.texts import LANGUAGES, page_in
 from pbl_pipeline.visit import Recording, Visit
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, number, significant
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, check_words, number, significant
 
+#: Outcome of the check of a choice by its status, where no one was chosen.
+_UNCHOSEN = {"NEEDS_CHOICE": NEEDS_CHOICE, "NO_PERSON": FAIL}
 _CONVERGED = {True: "converged", False: "not converged", None: "convergence not recorded"}
 
 
-def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str, norm: NormativeSet | None) -> dict:
-    """Return everything that the template shows. `norm`: as in `write_report`."""
-    norm = _norm(visit) if norm is None else norm
+def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str) -> dict:
+    """Return everything that the template shows."""
+    norm = _norm(visit)
     recordings = visit.fitted or visit.recordings
     checks = _checks(visit, recordings)
     metrics = visit.measures
@@ -63,6 +57,11 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
             ("Recordings", ", ".join(r.name for r in recordings)),
         ],
         "verdict": _verdict(visit, recordings, checks),
+        "tiles": [],
+        "measures": [],
+        "cycle_charts": [],
+        "index": None,
+        "forces": None,
         "checks": [_check_row(c) for c in checks],
         "trials": [_trial(r, pictures.get(r.name, ())) for r in recordings],
         "open_time_charts": empty,
@@ -81,16 +80,17 @@ def page_of(visit: Visit, pictures: Mapping[str, Sequence[Picture]], title: str,
         values = metrics.spatiotemporal
         cycles = metrics.cycles
         page["tiles"] = [*(_tile(k, values[k], values.reasons.get(k, "")) for k in HEADLINES), _gdi_tile(metrics.gdi)]
-        page["measures"] = [_measure_row(k, values[k], values.reasons.get(k, "")) for k in MEASURES]
-        page["measures"].append(_gdi_row(metrics.gdi))
+        page["measures"] = [
+            *(_measure_row(MEASURES[k], values[k], values.reasons.get(k, "")) for k in MEASURES),
+            _gdi_row(metrics.gdi),
+        ]
         page["cycles_used"], page["cycles_found"] = plural(values.n_cycles_used, "gait cycle"), values.n_cycles_found
         bands = _bands(visit)
         page["cycle_charts"] = _figures.cycle_charts(cycles, bands)
         page["bands"] = {"words": bands.words(), "source": bands.source}
         page["far_leg"] = far_leg_of(cycles)
-        shipped = _norm(visit)
-        people = "the norm" if shipped is None else f"the norm's {shipped.n} typically developing children"
-        page["index"] = _index(metrics.gdi, metrics.cycles, people)
+        people = "the norm" if norm is None else f"the norm's {norm.n} typically developing children"
+        page["index"] = _index(metrics.gdi, cycles, people)
         page["forces"] = forces_section(visit)
     return page
 
@@ -111,10 +111,9 @@ def _checks(visit: Visit, recordings: Sequence[Recording]) -> list[Check]:
     """Return all checks, earlier stages first, each once: what a trial and its visit both say is said by the visit."""
     checks = [c for c in visit.checks if c not in visit.fit_checks]
     for r in recordings:
-        if r.choice is not None and r.choice.status == "NEEDS_CHOICE":
-            checks.append(Check("subject_choice", NEEDS_CHOICE, None, None, f"{r.name}: {r.choice.reason}"))
-        elif r.choice is not None and r.choice.status == "NO_PERSON":
-            checks.append(Check("subject_choice", FAIL, None, None, f"{r.name}: {r.choice.reason}"))
+        if r.choice is not None and r.choice.status in _UNCHOSEN:
+            outcome = _UNCHOSEN[r.choice.status]
+            checks.append(Check("subject_choice", outcome, None, None, f"{r.name}: {r.choice.reason}"))
     checks += visit.fit_checks
     if visit.measures is not None:
         for t in visit.measures.trials:
@@ -144,7 +143,7 @@ def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check])
         if metrics is None
         else "A check failed. The results below do not show how the person moves:",
     }
-    points = [f"{check_name(c)}: {c.advice}" if c.advice else check_name(c) for c in notable]
+    points = [f"{check_words(c.check)}: {c.advice}" if c.advice else check_words(c.check) for c in notable]
     return {
         "outcome": outcome,
         "word": VERDICT_WORDS[outcome],
@@ -197,8 +196,8 @@ def _interval(gdi: Gdi) -> str:
     return f"90 % interval {low} to {high}, minimal change {number(gdi.minimal_change, 0)}"
 
 
-def _measure_row(key: str, m: Measure | None, reason: str) -> dict:
-    name, unit, decimals = (MEASURES | TASKS)[key]
+def _measure_row(words: tuple[str, str, int], m: Measure | None, reason: str) -> dict:
+    name, unit, decimals = words
     if m is None:
         return {"name": name, "known": False, "reason": reason or "no reason was recorded"}
     return {
@@ -222,22 +221,14 @@ def _error(sd: float | None, decimals: int) -> str:
 
 
 def _task_rows(found: Spatiotemporal) -> list[dict]:
-    return [_measure_row(name, m, found.reasons.get(name, "")) for name, m in found.of_task.items()]
+    return [_measure_row(TASKS[name], m, found.reasons.get(name, "")) for name, m in found.of_task.items()]
 
 
 def _gdi_row(gdi: Gdi) -> dict:
-    if gdi.mean is None:
-        return {"name": gdi.title, "known": False, "reason": gdi.reason}
-    values = {"left": number(gdi.left, 1), "right": number(gdi.right, 1), "mean": number(gdi.mean, 1)}
-    unit = "100 = norm, 10 = 1 sd"
-    more = {
-        "sd": number(_gdi_sd(gdi), 1),
-        "n": gdi.n,
-        "error": _error(gdi.sd, 1),
-        "cv": number(None, 1),
-        "asymmetry": number(None, 1),
-    }
-    return {"name": gdi.title, "known": True, **values, **more, "unit": unit}
+    found = None
+    if gdi.mean is not None:
+        found = Measure(gdi.left, gdi.right, gdi.mean, _gdi_sd(gdi), gdi.n, error_sd=gdi.sd)
+    return _measure_row((gdi.title, "100 = norm, 10 = 1 sd", 1), found, gdi.reason)
 
 
 def _gdi_sd(gdi: Gdi) -> float | None:
@@ -327,7 +318,7 @@ def _trial(t: Recording, pictures: Sequence[Picture]) -> dict:
 
 def _check_row(c: Check) -> dict:
     return {
-        "name": check_name(c),
+        "name": check_words(c.check),
         "outcome": c.outcome,
         "word": OUTCOME_WORDS[c.outcome],
         "value": significant(c.value),
@@ -404,7 +395,6 @@ def write_report(
     visit: Visit,
     pictures: Mapping[str, Sequence[Picture]] | None = None,
     title: str = "Gait report",
-    norm: NormativeSet | None = None,
     language: str = LANGUAGES[0],
 ) -> Path:
     """Write the report of a visit as one HTML file and return its path.
@@ -413,16 +403,14 @@ def write_report(
     from a folder. Every text is escaped. The page of a visit without gait states that and shows the angles over time.
     The file appears when it is complete.
 
-    `pictures`: by the name of the recording. `norm`: the set of the index; None for the one that the measures name, if
-    it is included. `language`: one of `texts.LANGUAGES`. Raises as `Recording.fit` and `Recording.keypoints`.
+    `pictures`: by the name of the recording. `language`: one of `texts.LANGUAGES`. Raises as `Recording.fit` and
+    `Recording.keypoints`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     template = shipped_page("report/templates/report.html")
     css = Markup(shipped_text("report/templates/report.css"))  # noqa: S704  our own file
-    page = {"tiles": [], "measures": [], "cycle_charts": [], "index": None, "forces": None} | page_of(
-        visit, pictures or {}, title, norm
-    )
+    page = page_of(visit, pictures or {}, title)
     part = path.with_name(f"{path.name}.part{os.getpid()}")
     try:
         html = template.render(page=page, css=css, language=language)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
-from pbl_pipeline.words import capital, check_words
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN
+from pbl_pipeline.words import capital
 
 #: The measures of the tiles, before the GDI.
 HEADLINES = ("cadence_steps_per_min", "stride_time_s", "stance_percent", "double_support_percent")
@@ -22,11 +22,6 @@ VERDICT_WORDS = {
     NEEDS_CHOICE: "A person has to be chosen",
     FAIL: "Not to be used",
 }
-
-
-def check_name(check: Check) -> str:
-    """ "residual_3d_cm" -> "Residual 3D (cm)"."""
-    return check_words(check.check)
 
 
 def sentence(text: str) -> str:

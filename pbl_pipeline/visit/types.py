@@ -67,7 +67,6 @@ class Recording:
 
     @property
     def fitted(self) -> bool:
-        """True if a body was fitted."""
         return self.load_fit is not None
 
     @functools.cached_property
@@ -118,7 +117,6 @@ class Solution:
 
     @classmethod
     def of(cls, fit: SessionFit, software: str = "") -> Solution:
-        """Return the solution of a session fit."""
         own = [f.name for f in dataclasses.fields(cls) if f.name != "software"]
         return cls(**{name: getattr(fit, name) for name in own}, software=software or code_version())
 
@@ -150,7 +148,6 @@ class Visit:
 
     @property
     def left_out(self) -> tuple[Recording, ...]:
-        """The recordings without a fit."""
         return tuple(r for r in self.recordings if not r.fitted)
 
     @property
@@ -191,13 +188,6 @@ class Visit:
     def title(self) -> str:
         """Subject and label, for lists."""
         return " ".join(t for t in (self.subject if self.subject != "-" else "", self.label or self.date) if t)
-
-    def recording(self, name: str) -> Recording:
-        """Return the recording of that name. Raises KeyError."""
-        found = next((r for r in self.recordings if r.name == name), None)
-        if found is None:
-            raise KeyError(name)
-        return found
 
     def with_measures(self, measures: GaitMetrics) -> Visit:
         """Return the visit with these measures.

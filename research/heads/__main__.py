@@ -21,7 +21,8 @@ def main(data: Path, clips: tuple[str, ...]) -> None:
 
     The heads were located by eye. Recordings on which the margins were chosen are marked; the total is without them.
     """
-    from pbl_pipeline.deidentify import find_heads, ranges
+    from pbl_pipeline.deidentify import find_heads
+    from pbl_pipeline.runs import ranges
     from research.heads.coverage import BAR, frame_coverage, head_coverage, located_clips
 
     known = located_clips()

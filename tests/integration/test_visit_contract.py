@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
 
 import pbl_pipeline.fit
 import pbl_pipeline.gait.metrics as metrics
@@ -41,7 +40,7 @@ from tests.integration import chain, test_markers, test_rigs, web
 from tests.rows import register, remove_all
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, leaves
 from workers.populate import populate
-from workers.web import Options, ResultsFolder, create_app
+from workers.web import ResultsFolder
 
 NORM = "gillette-166-three-angles"
 MASS_KG = 70.0
@@ -244,7 +243,7 @@ def test_a_visit_of_the_tables_comes_back_from_its_folder(both: Both, tmp_path: 
 
 
 def test_the_report_is_the_same(both: Both) -> None:
-    pages = [list(leaves(page_of(of_both(v), {}, "Visit", None))) for v in (both.of_tables, both.of_files)]
+    pages = [list(leaves(page_of(of_both(v), {}, "Visit"))) for v in (both.of_tables, both.of_files)]
     assert len(pages[0]) > 40
     assert [where for where, _ in pages[0]] == [where for where, _ in pages[1]]
     for (where, a), (_, b) in zip(*pages, strict=True):
@@ -259,21 +258,16 @@ def test_exports_are_the_same(both: Both, tmp_path: Path) -> None:
     assert_same_exports(of_both(both.of_tables), of_both(both.of_files), formats, tmp_path, float32=True)
 
 
-def pages_of(options: Options) -> TestClient:
-    app = create_app(options)
-    browser = TestClient(app, base_url=web.BASE, raise_server_exceptions=False)
-    browser.get("/enter", params={"key": app.state.sessions.new_link("R. Viewer", "reader")})
-    return browser
-
-
 def test_pages_are_the_same(both: Both) -> None:
     """As JSON, up to the rounding of the files, without what only the tables know."""
-    browsers = [pages_of(Options()), pages_of(Options(folder=ResultsFolder(both.folder)))]
+    browsers = [web.client("reader", folder=folder) for folder in (None, ResultsFolder(both.folder))]
     visits = [b.get("/visits/1.json").json()["about"] for b in browsers]
     of_tables, of_files = (common_of_visit(v, both.kind) for v in visits)
     assert_same(of_tables, of_files, "visit", ROUNDED[Gdi])
+    assert all(bool(of_files["filming"][name]) == (both.kind == "single") for name in ("cameras", "pictures"))
+    numbers = {r.name: r.number for r in both.of_tables.recordings}
     for recording in both.of_files.fitted:
-        lead = both.of_tables.recording(recording.name).number
+        lead = numbers[recording.name]
         number = sorted(p.name for p in both.folder.glob("*.fit.npz")).index(f"{recording.name}.fit.npz") + 1
         pages = [f"/recordings/{n}" for n in (lead, number)]
         shown = [b.get(f"{p}.json").json()["about"] for b, p in zip(browsers, pages, strict=True)]

@@ -1,5 +1,6 @@
 """The review page over tables: finding visits, and what must not work."""
 
+import datetime
 import html
 import io
 import re
@@ -9,15 +10,13 @@ from typing import Any
 
 import pytest
 
-from pbl_pipeline.errors import PblError
-from schemas import gdi, lab, qc, session, study
+from schemas import fit, gdi, qc, study
 from schemas.reading import visit_list
 from schemas.reading.shown import shown_visit
 from schemas.reading.visit_list import Filter, visit_page
-from schemas.rows import utc_now
 from tests.integration import web
 from tests.integration.chain import small_video
-from tests.rows import register
+from tests.rows import new_visit, register
 from workers.populate import populate
 from workers.web import Options, create_app, export
 from workers.web.access import HOURS, Sessions
@@ -26,13 +25,9 @@ from workers.web.access import HOURS, Sessions
 @pytest.fixture
 def four_visits(tables: None) -> None:
     """P001 with three visits and P002 with one, no videos: numbers 1 to 4."""
-    people = ({"subject": s, "population": "patient", "subject_created": utc_now()} for s in ("P001", "P002"))
-    lab.Subject.insert(people)
-    days = {1: ("P001", "2026-01-10"), 2: ("P001", "2026-04-10"), 3: ("P001", None), 4: ("P002", "2026-02-01")}
-    session.Session.insert(
-        {"session_id": i, "subject": s, "session_label": d or "later", "session_date": d, "session_created": utc_now()}
-        for i, (s, d) in days.items()
-    )
+    for label in ("2026-01-10", "2026-04-10", "later"):
+        new_visit(label)
+    new_visit("2026-02-01", "P002")
     study.Visit.insert({"session_id": i, "visit_role": r} for i, r in ((1, "pre"), (2, "3_months"), (4, "pre")))
     study.Cohort.insert1({"cohort": "spine"})
     members = (("P001", True), ("P002", False))
@@ -44,8 +39,6 @@ def numbers(wanted: Filter, **more: Any) -> list[int]:
 
 
 def test_filters_of_the_list_and_their_order(four_visits: None):
-    import datetime
-
     assert numbers(Filter()) == [2, 4, 1, 3]  # the newest day first, no day last
     assert numbers(Filter(search="p001")) == [2, 1, 3]
     assert numbers(Filter(search="LATE")) == [3]
@@ -74,11 +67,11 @@ def test_pages_of_the_list_hold_every_visit_once(four_visits: None):
 def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for day in ("2026-01-10", "2026-04-10"):
         register(small_video(tmp_path, f"walk {day}"), session_label=day)
-    nobody = register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")[0]
-    waits = register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")[0]
+    register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")
+    register(small_video(tmp_path, "two", people="two alike"), subject="P002", session_label="2026-02-01")
     broken = tmp_path / "gone.mp4"
     broken.write_bytes(small_video(tmp_path, "gone").read_bytes() + b"x")
-    gone = register(broken, subject="P003", session_label="2026-02-02")[0]
+    register(broken, subject="P003", session_label="2026-02-02")
     broken.unlink()
     populate()
     for number, index in ((1, 80.0), (2, 90.0)):
@@ -96,15 +89,8 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert [rows[k].state for k in ("P0022026-02-01", "P0032026-02-02")] == ["waiting", "failed"]
     assert rows["P0032026-02-02"].problem == "VIDEO_MISSING"
     by_state = {s: numbers(Filter(state=s)) for s in visit_list.STATES}
-    counts = {s: len(n) for s, n in by_state.items()}
-    assert counts == {
-        "computed": 2,
-        "pending": 0,
-        "waiting": 1,
-        "failed": 1,
-        "empty": 1,
-        "unusable": 0,
-    }
+    counts = {s: len(n) for s, n in by_state.items() if n}
+    assert counts == {"computed": 2, "waiting": 1, "failed": 1, "empty": 1}
     assert sorted(numbers(Filter(quality=later.result.outcome))) == [1, 2]
     page = web.client().get("/visits").text
     assert "+10.0 since 2026-01-10: more than chance" in page
@@ -127,12 +113,9 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     assert not any("walk" in n or "P001" in n for n in names)
     assert web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}/export").status_code == 404
     assert rows["P0042026-02-03"].state == "empty"
-    assert len({waits, gone, nobody}) == 3
 
 
 def visit_list_key(number: int) -> dict[str, str]:
-    from schemas import fit
-
     return {"fit_set": (fit.FitSet & {"session_id": number}).fetch1("fit_set")}
 
 
@@ -167,17 +150,6 @@ def test_a_session_ends_and_is_never_taken_from_the_browser():
     browser.get("/enter", params={"key": sessions.new_link("A", "reader")}, follow_redirects=False)
     assert sessions.find("planted") is None
     assert web.TestClient(app, base_url=web.BASE, cookies={"pbl_session": "planted"}).get("/visits").status_code == 401
-
-
-def test_leaving_ends_the_session():
-    browser = web.client()
-    assert browser.get("/nothing").status_code == 404
-    token = re.search(r'name="token" value="([^"]+)"', browser.get("/nothing").text)
-    assert token
-    kept = browser.cookies["pbl_session"]
-    browser.post("/leave", data={"token": token[1]}, follow_redirects=False)
-    browser.cookies.set("pbl_session", kept)
-    assert browser.get("/nothing").status_code == 401
 
 
 @pytest.mark.parametrize(
@@ -315,10 +287,3 @@ def test_german_by_the_browser_and_by_choice(four_visits: None):
     web.post(browser, "/language", language="de", back="/visits/1")
     assert "Alle Termine dieser Person" in browser.get("/visits/1").text
     assert web.post(browser, "/language", language="de", back="//evil").headers["location"] == "/"
-
-
-def test_a_page_for_other_machines_without_tls_is_refused():
-    from workers.web import Where, serve
-
-    with pytest.raises(PblError, match="without TLS"):
-        serve(Where("0.0.0.0", 0))

@@ -2,7 +2,7 @@
 
 import time
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +45,12 @@ def visits(folder: Path) -> None:
     assert len(qc.SessionQc()) == 2
 
 
-def until(holds: Callable[[], bool], seconds: float = 300.0) -> None:
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end
-        time.sleep(0.1)
-
-
 def state(browser: Any, session_id: int) -> str:
     return told(types.SimpleNamespace(app=browser.app), visit_progress(session_id)).state  # type: ignore[arg-type]
 
 
 def ended(browser: Any, session_id: int = 1) -> None:
-    until(lambda: not state(browser, session_id))
+    web.until(lambda: not state(browser, session_id))
 
 
 def mark(browser: Any, number: int) -> None:
@@ -101,7 +94,7 @@ def test_a_visit_waits_for_the_one_before_and_says_so(visits: None, browser: Any
     mark(browser, 1)
     compute(browser, 1)
     compute(browser, 2)
-    until(lambda: state(browser, 1) == "running")
+    web.until(lambda: state(browser, 1) == "running")
     page = browser.get("/visits/1").text
     assert "This visit is being computed" in page
     assert "Compute now" not in page
@@ -125,7 +118,7 @@ def test_a_job_in_other_hands_is_not_taken_twice(visits: None, browser: Any):
     mark(browser, 2)
     (job,) = queue.claim(fit.SessionFit)  # a worker has it: this process
     compute(browser, 1)
-    until(lambda: "fit of the body" in browser.get("/visits/1/progress").text)
+    web.until(lambda: "fit of the body" in browser.get("/visits/1/progress").text)
     time.sleep(3.0)
     assert state(browser, 1) == "running"  # it waits for what follows
     assert len(fit.SessionFit & job.key) == 0

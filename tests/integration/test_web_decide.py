@@ -40,10 +40,7 @@ def two_alike(folder: Path) -> int:
 
 def form_of(browser: Any, number: int) -> dict[str, str]:
     """The hidden fields of the form in which a person is chosen."""
-    page = browser.get(f"/recordings/{number}").text
-    form = page[page.index(f'action="/recordings/{number}/person"') :]
-    form = form[: form.index("</form>")]
-    return dict(re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form))
+    return web.form_of(browser, f"/recordings/{number}", f"/recordings/{number}/person")
 
 
 def send(browser: Any, number: int, fields: dict[str, str], person: int):

@@ -2,7 +2,6 @@
 
 import html
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +34,7 @@ def _errors() -> set[int]:
 
 
 def again(browser: Any, **fields: str):
-    home = browser.get("/operate").text
-    token = re.findall(r'name="token" value="([^"]+)"', home)[0]
-    return browser.post("/operate/retry", data={"token": token, **fields}, follow_redirects=False)
+    return web.post(browser, "/operate/retry", **fields)
 
 
 def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[int]):
@@ -61,11 +58,8 @@ def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[i
         ("O. Perator", "retry", three_gone[1], 1),
         ("O. Perator", "retry", None, 2),
     ]
-    reviewer = web.client()
-    assert (
-        "tried again"
-        in reviewer.get(f"/visits/{(video.Video & {'video_id': three_gone[1]}).fetch1('session_id')}").text
-    )
+    visit = (video.Video & {"video_id": three_gone[1]}).fetch1("session_id")
+    assert "tried again" in web.client().get(f"/visits/{visit}").text
     assert "There are no errors" in browser.get("/operate").text
 
 

@@ -1,19 +1,16 @@
 """Choosing the person to be measured in the video itself, in a Chromium of the machine."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import pbl_pipeline.tracking
-from pbl_pipeline.tracking import Tracking
-from pbl_pipeline.video import VideoInfo, probe
 from schemas import reading, tracking
 from schemas.review import Decision
-from tests.integration import chain, web
+from tests.integration import web
 from tests.integration.chain import small_video
+from tests.integration.test_visit_contract import track_people
 from tests.rows import register
 from workers.populate import populate
 
@@ -21,15 +18,7 @@ from workers.populate import populate
 @pytest.fixture
 def seen(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """The people of the stand-in within the picture: it sees them in one of 1920 x 1080 px."""
-
-    def within(path: Path, params: object = None, info: VideoInfo | None = None) -> Tracking:
-        info = info or probe(path)
-        found, size = chain.track_people(path, params, info), (info.width_px, info.height_px)
-        scale = np.tile(np.divide(size, found.image_size_px), 2)
-        people = tuple(dataclasses.replace(p, box_px=p.box_px * scale) for p in found.persons)
-        return dataclasses.replace(found, image_size_px=size, persons=people)
-
-    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", within)
+    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
 
 
 @pytest.fixture

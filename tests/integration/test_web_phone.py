@@ -6,7 +6,6 @@ import json
 import random
 import re
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,16 @@ from pbl_pipeline.words import UNUSABLE
 from schemas import keypoints, session, video
 from schemas.capture import PhoneLink, PhoneRecording
 from schemas.cli.capture import capture
-from schemas.intake import VisitRecord, phone_recordings
+from schemas.intake import phone_recordings
 from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from schemas.intake.protocols import add_protocol, read_protocol
-from schemas.intake.records import session_ids
 from schemas.jobs import jobs_of
 from schemas.reading.usable import Next, Usable
 from schemas.rows import check_row
-from schemas.transactions import in_transaction
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.integration.compute_target import nothing
-from tests.integration.test_web_accounts import running
-from tests.rows import register
+from tests.rows import new_visit, register
 from workers import incoming, phone_uploads, queue
 from workers.populate import populate
 from workers.web import Options, Where, create_app
@@ -46,11 +42,6 @@ def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     for module in (phone_recordings, phone_uploads):
         monkeypatch.setattr(module, "PART_BYTES", 4096)
     return new_visit("2026-01-10")
-
-
-def new_visit(label: str, subject: str = "P001") -> int:
-    (number,) = in_transaction(lambda: session_ids([VisitRecord(subject, label)])).values()
-    return number
 
 
 def stranger() -> TestClient:
@@ -290,10 +281,8 @@ def test_torn_down_a_hundred_times_every_recording_arrives_once(visit: int, tmp_
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
 
-@contextlib.contextmanager
-def serving() -> Iterator[int]:
-    with running(create_app(Options(target=nothing)), Where()) as port:
-        yield port
+def serving() -> contextlib.AbstractContextManager[int]:
+    return web.running(create_app(Options(target=nothing)), Where())
 
 
 def test_the_phone_and_the_visits_page_say_whether_it_can_be_used(visit: int, tmp_path: Path):

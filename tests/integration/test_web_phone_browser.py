@@ -13,14 +13,15 @@ import av
 import numpy as np
 import pytest
 
-from pbl_pipeline.video import probe, read_phone_log
+from pbl_pipeline.video import VideoInfo, probe, read_phone_log
 from schemas import video
 from schemas.capture import PhoneRecording
 from schemas.intake import phone_recordings
 from schemas.intake.protocols import Step, add_protocol
+from tests.integration import web
 from tests.integration.compute_target import nothing
-from tests.integration.test_web_accounts import running
-from tests.integration.test_web_phone import link_of, new_visit
+from tests.integration.test_web_phone import link_of
+from tests.rows import new_visit
 from tests.videos import numbered_frames
 from workers import phone_uploads
 from workers.web import Options, Where, certificates, create_app, phone
@@ -99,7 +100,7 @@ def filming(
         cert, key = certificates.server_certificate(("127.0.0.1",))
         where = Where(tls_cert=cert, tls_key=key)
         context["ignore_https_errors"] = True  # the authority is not installed here
-    with running(create_app(Options(target=nothing, secure=tls)), where) as port:
+    with web.running(create_app(Options(target=nothing, secure=tls)), where) as port:
         base = f"{scheme}://127.0.0.1:{port}"
         made = browser.new_context(base_url=base, **{"locale": "en", **PHONE, **context})
         try:
@@ -136,18 +137,31 @@ def turn(page: Any, wxyz: tuple[float, ...]) -> None:
 
 def film(page: Any, seconds: float = 3.0) -> None:
     """From the opened page to the end of a take: one tap to begin, one to end."""
-    page.locator(".record").click()
-    page.wait_for_selector("main[data-filming='yes']")
+    start(page)
     page.wait_for_timeout(1000 * seconds)
     page.locator(".record").click()
     page.wait_for_selector(".after:not([hidden])")
 
 
-def arrived(page: Any, n: int = 1, seconds: float = 30) -> None:
+def start(page: Any) -> None:
+    page.locator(".record").click()
+    page.wait_for_selector("main[data-filming='yes']")
+
+
+def keep(page: Any) -> None:
+    page.locator(".keep").click()
+    arrived(page)
+
+
+def film_of(visit: int) -> VideoInfo:
+    """The one recording of the visit."""
+    return probe((video.Video & {"session_id": visit}).fetch1("video_path"))
+
+
+def arrived(page: Any) -> None:
+    """The server has one recording."""
     page.wait_for_function(
-        "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === n",
-        arg=n,
-        timeout=1000 * seconds,
+        "() => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === 1"
     )
 
 
@@ -160,8 +174,7 @@ def about_the_recording() -> dict[str, Any]:
 def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
     with filming(camera, visit) as page:
         page.get_by_label("fast").check()
-        page.locator(".record").click()
-        page.wait_for_selector("main[data-filming='yes']")
+        start(page)
         page.wait_for_timeout(1500)
         before = page.evaluate("performance.now()")
         turn(page, TURNED)
@@ -173,8 +186,7 @@ def test_from_the_link_to_the_recording_in_the_visit(camera: Any, visit: int):
         times = np.array(json.loads(page.locator("main").get_attribute("data-times")), float) / 1e6
         start_ms = float(page.locator("main").get_attribute("data-start"))
         page.locator("[name=note]").fill("first pass")
-        page.locator(".keep").click()
-        arrived(page)
+        keep(page)
         assert (
             page.evaluate("(async () => (await Array.fromAsync((await navigator.storage.getDirectory()).keys())))()")
             == []
@@ -207,12 +219,11 @@ def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: i
     camera = with_camera(chromium, tmp_path / "camera.mjpeg", numbered_frames(60, 1080, 1920))
     with camera as browser, filming(browser, visit) as page:
         film(page, 10.0)
-        page.locator(".keep").click()
-        arrived(page)
+        keep(page)
     about = about_the_recording()
     assert about["frames"] > 285, about
     assert about["dropped"] <= 0.01 * about["frames"], about
-    info = probe((video.Video & {"session_id": visit}).fetch1("video_path"))
+    info = film_of(visit)
     assert (info.width_px, info.height_px, info.n_frames) == (1920, 1080, about["frames"])
 
 
@@ -234,7 +245,7 @@ def test_reloads_in_the_middle_of_an_upload(camera: Any, visit: int):
         page.reload()
         arrived(page)
     assert len(video.Video() & {"session_id": visit}) == len(PhoneRecording()) == 1
-    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 45
+    assert film_of(visit).n_frames > 45
 
 
 def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int):
@@ -255,15 +266,14 @@ def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int
 
 def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     with filming(camera, visit) as page:
-        page.locator(".record").click()
-        page.wait_for_selector("main[data-filming='yes']")
+        start(page)
         page.wait_for_timeout(4500)
         page.evaluate("window.addEventListener('pagehide', (e) => e.stopImmediatePropagation(), true)")
         page.reload()
         page.wait_for_selector("main[data-ready]")
         page.get_by_role("button", name="Keep and send").last.click()
         arrived(page)
-    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+    assert film_of(visit).n_frames > 30
 
 
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
@@ -273,8 +283,7 @@ def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
         page.locator(".again").click()
         page.get_by_text("None yet").wait_for()
         film(page, 1.5)
-        page.locator(".keep").click()
-        arrived(page)
+        keep(page)
     assert (video.Video & {"session_id": visit}).fetch1("camera_motion") == "static"
     assert len(video.PhoneAttitude()) == 0
     assert len(PhoneRecording()) == 1
@@ -301,8 +310,7 @@ def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
         (cookie,) = (c for c in page.context.cookies() if "pbl_phone" in c["name"])
         assert (cookie["name"], cookie["secure"], cookie["httpOnly"]) == ("__Host-pbl_phone", True, True)
         film(page, 1.5)
-        page.locator(".keep").click()
-        arrived(page)
+        keep(page)
         answer = page.request.get("/phone/authority.crt")
         assert answer.body() == certificates.authority().read_bytes()
     assert len(video.Video() & {"session_id": visit}) == 1
@@ -315,8 +323,7 @@ def test_a_call_and_a_turned_phone_end_a_take(camera: Any, visit: int):
                             " document.dispatchEvent(new Event('visibilitychange')); delete document.hidden; }"),
             ("turned", "() => { canvas.width = 480; canvas.height = 640; }"),
         ):  # fmt: skip
-            page.locator(".record").click()
-            page.wait_for_selector("main[data-filming='yes']")
+            start(page)
             page.wait_for_timeout(1200)
             page.evaluate(act)
             page.locator(".said", has_text=why).wait_for()
@@ -348,14 +355,12 @@ JUMPING = """
 def test_times_that_jump_end_a_take_which_is_good_up_to_there(camera: Any, visit: int, jump_s: float):
     with filming(camera, visit) as page:
         page.evaluate(JUMPING)
-        page.locator(".record").click()
-        page.wait_for_selector("main[data-filming='yes']")
+        start(page)
         page.wait_for_timeout(2000)
         page.evaluate("us => { jump_us = us; }", 1e6 * jump_s)
         page.locator(".said", has_text="jumped").wait_for()
-        page.locator(".keep").click()
-        arrived(page)
-    info = probe((video.Video & {"session_id": visit}).fetch1("video_path"))
+        keep(page)
+    info = film_of(visit)
     assert np.diff(info.time_s).max() < 2.0
     assert info.n_frames > 10
 
@@ -371,8 +376,7 @@ def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(cam
         page.locator(".said", has_text="no room").wait_for()
         assert page.locator("main").get_attribute("data-filming") != "yes"
         page.evaluate("() => { navigator.storage.estimate = estimate; }")
-        page.locator(".record").click()
-        page.wait_for_selector("main[data-filming='yes']")
+        start(page)
         page.wait_for_timeout(3000)
         (writer,) = page.workers
         writer.evaluate(
@@ -389,7 +393,7 @@ def test_a_full_phone_says_so_before_a_take_and_keeps_what_it_has_during_one(cam
         writer.evaluate("() => { globalThis.isFull = false; }")  # there is room again, and what was filmed is sent
         again.click()
         arrived(page)
-    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 10
+    assert film_of(visit).n_frames > 10
 
 
 #: In the page: the person does not allow the camera; a phone that asks for its sensors within a tap, as iOS does.
@@ -418,9 +422,8 @@ def test_without_an_encoder_the_browsers_recorder_films(camera: Any, visit: int)
         page.evaluate("delete globalThis.VideoEncoder")
         film(page)
         page.locator(".said", has_text="less exact").wait_for()
-        page.locator(".keep").click()
-        arrived(page)
-    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames > 30
+        keep(page)
+    assert film_of(visit).n_frames > 30
 
 
 def test_frames_of_the_shown_video_count_by_their_capture_and_not_by_when_they_are_shown(camera: Any, visit: int):
@@ -452,10 +455,9 @@ def test_a_recording_of_one_frame_arrives(camera: Any, visit: int):
     with filming(camera, visit) as page:
         page.evaluate(ONE_FRAME)
         film(page, 1.0)
-        page.locator(".keep").click()
-        arrived(page)
+        keep(page)
     assert about_the_recording()["frames"] == 1
-    assert probe((video.Video & {"session_id": visit}).fetch1("video_path")).n_frames == 1
+    assert film_of(visit).n_frames == 1
 
 
 def test_the_longest_take_ends_by_itself_and_is_kept(camera: Any, visit: int):
@@ -464,9 +466,8 @@ def test_the_longest_take_ends_by_itself_and_is_kept(camera: Any, visit: int):
         page.evaluate("() => { document.querySelector('main').dataset.most = '2'; }")
         page.locator(".record").click()
         page.locator(".said", has_text="Ten minutes").wait_for()
-        page.locator(".keep").click()
-        arrived(page)
-    assert 2 <= probe((video.Video & {"session_id": visit}).fetch1("video_path")).time_s[-1] < 5
+        keep(page)
+    assert 2 <= film_of(visit).time_s[-1] < 5
 
 
 def test_the_first_load_is_small(camera: Any, visit: int):
@@ -508,8 +509,7 @@ def test_nothing_keeps_anybody_from_the_page(camera: Any, visit: int, scheme: st
         # The frame for the person lies in the picture: its box has the picture's shape.
         box = page.locator(".view").bounding_box()
         assert box["width"] / box["height"] == pytest.approx(640 / 480, rel=0.01)
-        page.locator(".record").click()
-        page.wait_for_selector("main[data-filming='yes']")
+        start(page)
         look(page, folder / f"phone-{scheme}-filming")
         page.locator(".record").click()
         page.wait_for_selector(".after:not([hidden])")

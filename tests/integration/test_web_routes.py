@@ -2,7 +2,6 @@
 
 import re
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
@@ -13,8 +12,8 @@ from starlette.testclient import TestClient
 from schemas.review import Viewing
 from tests.integration import web
 from tests.integration.chain import small_video
-from tests.integration.test_web_accounts import running
-from tests.rows import register, remove_all
+from tests.integration.test_web_attacks import rows
+from tests.rows import register
 from workers.populate import populate
 from workers.web import Options, Where, audit, create_app
 
@@ -104,21 +103,12 @@ def spellings(path: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def one_visit(database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def one_visit(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     """Visit 1 with recording 1, computed; and each look is to leave a row."""
-    import schemas
-    from tests.integration import chain
-
-    with pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
-        remove_all()
-        chain.install(patch)
-        patch.setenv("PBL_AUDIT_LOOKS", "1")
-        patch.setattr(audit, "AGAIN_S", 0.0)
-        register(small_video(tmp_path_factory.mktemp("routes"), "walk"), session_label="2026-01-10")
-        populate()
-        yield
-        remove_all()
+    module_patch.setenv("PBL_AUDIT_LOOKS", "1")
+    module_patch.setattr(audit, "AGAIN_S", 0.0)
+    register(small_video(module_tables, "walk"), session_label="2026-01-10")
+    populate()
 
 
 @pytest.fixture(scope="module")
@@ -142,25 +132,31 @@ def test_every_address_is_expected_here():
 
 
 def test_each_address_opens_for_its_roles_and_leaves_its_row(browsers: dict[str, TestClient]):
-    stranger = web.client(signed_in=False)
+    stranger, before = web.client(signed_in=False), rows()
     for name, (allowed, look) in EXPECTED.items():
         method, path = name.split()
         if name == "GET /enter":  # says 401 itself where a link is no way in
             continue
+        answer = stranger.request(method, path)
+        assert "P001" not in answer.text, name
         if path != "/":  # shows the way in
-            assert (stranger.request(method, path).status_code == 401) == (allowed != "*"), name
+            assert (answer.status_code == 401) == (allowed != "*"), name
         of = (1, None) if "recordings" in path else (None, 1)
         for role, browser in browsers.items():
             Viewing().delete_quick()
-            status = browser.request(method, path, follow_redirects=False).status_code
+            answer = browser.request(method, path, follow_redirects=False)
+            status = answer.status_code
             if role in allowed or allowed in "*+":
                 if name == "GET /phone/open":  # says 403 itself where the key opens nothing
                     continue
                 assert status in ((200, 303, 400, 404, 409) if method == "GET" else (415,)), (name, role, status)
                 assert looks() == ([(look, *of)] if look else []), (name, role)
             else:
-                assert status == 403, (name, role)
+                assert (status, "P001" in answer.text) == (403, False), (name, role)
                 assert looks() == [], (name, role)
+    Viewing().delete_quick()
+    changed = {table for table, found in rows().items() if found != before[table]}
+    assert changed <= {"pbl_lab.numbered"}  # of the looks
 
 
 @pytest.mark.parametrize("name", [n for n in EXPECTED if EXPECTED[n][0] != "*"])
@@ -181,9 +177,8 @@ def test_no_spelling_of_an_address_passes_its_right_or_its_row(browsers: dict[st
 
 def test_addresses_that_no_browser_sends(one_visit: None):
     """By a socket: a client of HTTP would put them right."""
-    app = create_app(Options())
-    cookie = app.state.sessions.enter(app.state.sessions.new_link("A", "reader"))
-    with running(app, Where()) as port:
+    app, cookie = web.app_with_cookie("reader")
+    with web.running(app, Where()) as port:
         for target in ("/operate%0a", "/operate%", "/operate%0", "/./operate", "//operate", "/operate#", "/operate\t",
                        "http://127.0.0.1/operate%0a", "*", "/visits/../operate", "/visits/" + "1" * 4500):  # fmt: skip
             lines = [f"GET {target} HTTP/1.1", f"Host: 127.0.0.1:{port}", f"Cookie: pbl_session={cookie}"]

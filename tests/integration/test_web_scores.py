@@ -6,23 +6,19 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from schemas import lab, session, study
+from schemas import study
 from schemas.cli.study import instrument
 from schemas.review import Decision
-from schemas.rows import utc_now
 from schemas.studies.visit_forms import enter_scores, scores_form
 from tests.integration import web
-from tests.rows import everything
+from tests.rows import everything, new_visit
 
 
 @pytest.fixture
 def two_visits(tables: None) -> None:
     """P001 with visits 1 (pre, mJOA 12) and 2 of 2026, without videos."""
-    lab.Subject.insert1({"subject": "P001", "population": "patient", "subject_created": utc_now()})
-    session.Session.insert(
-        {"session_id": i, "subject": "P001", "session_label": d, "session_date": d, "session_created": utc_now()}
-        for i, d in ((1, "2026-01-10"), (2, "2026-04-10"))
-    )
+    new_visit("2026-01-10")
+    new_visit("2026-04-10")
     study.Visit.insert1({"session_id": 1, "visit_role": "pre", "visit_note": "uses a cane"})
     study.ClinicalScore.insert1({"session_id": 1, "instrument": "mJOA", "score_value": 12})
 

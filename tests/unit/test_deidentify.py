@@ -20,13 +20,13 @@ from pbl_pipeline.deidentify import (
     cover,
     covered_picture,
     deidentify,
-    ranges,
     sidecar_of,
 )
 from pbl_pipeline.deidentify.heads_of_video import around_both, body_end, head_circle, head_of_person, held, off_course
 from pbl_pipeline.deidentify.types import BODY, DISAGREE, HELD, KEYPOINTS, NONE
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import BlazePoseLandmarks, Keypoints
+from pbl_pipeline.runs import ranges
 from pbl_pipeline.tracking import PersonTrack
 from pbl_pipeline.video import Camera, probe, read_frames, read_metadata
 from tests.command import pbl
@@ -367,6 +367,3 @@ def test_a_video_without_a_head_is_written_and_says_so(tmp_path):
     assert [(u["first"], u["last"], u["why"]) for u in said["uncertain"]] == [(0, 7, ["no_head"])]
     assert probe(tmp_path / "näme ☃.deidentified.mp4").n_frames == 8
     assert pbl("deidentify", path).error_code == "FILE_UNWRITABLE"
-
-
-# --- how much is covered

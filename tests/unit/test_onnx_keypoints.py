@@ -552,7 +552,7 @@ def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_pat
 def test_the_report_names_the_model(video, registered):
     path, tracking = video
     found = detect_keypoints(path, tracking, 1, CAMERA, "dots-simcc")
-    groups = page_of(Visit((Recording.of("walk", keypoints=found),)), {}, "Report", None)["origin"]
+    groups = page_of(Visit((Recording.of("walk", keypoints=found),)), {}, "Report")["origin"]
     (software,) = (group["rows"] for group in groups if group["name"] == "Software")
     assert ("keypoints of walk", found.origin, False) in software
 

@@ -94,7 +94,7 @@ def test_report_and_metrics_agree_on_the_outcome(
     pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
     ((shown, pictures),) = written
-    page = page_of(shown, pictures, "Gait report", None)
+    page = page_of(shown, pictures, "Gait report")
     assert visit.judged is not None
     assert content["outcome"] == page["verdict"]["outcome"] == visit.judged.outcome
     assert content["outcome"] == ("FAIL" if outcome == "FAIL" else "WARN")

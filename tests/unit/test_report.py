@@ -7,48 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pbl_pipeline.body import load_body
-from pbl_pipeline.charts import cycle_chart, mean_curve, nice_ticks
+from pbl_pipeline.charts import cycle_chart, nice_ticks
 from pbl_pipeline.code_version import code_version
-from pbl_pipeline.fit import SessionFit, TrialFit
+from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, load_norm
 from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, PASS, WARN, Check
 from pbl_pipeline.report import Picture, write_report
-from pbl_pipeline.report.words import check_name, plural, sentence, size
+from pbl_pipeline.report.words import plural, sentence, size
 from pbl_pipeline.texts import LANGUAGES, catalogue, library_words
 from pbl_pipeline.tracking import SubjectChoice
-from pbl_pipeline.video import VideoInfo
-from pbl_pipeline.visit import Recording, Solution, Visit
-from pbl_pipeline.words import number, significant
+from pbl_pipeline.visit import Recording, Visit
+from pbl_pipeline.words import check_words, number, significant
 from tests import not_none
 from tests.html_page import Page, commands_in
-from tests.inputs import video_info
+from tests.unit.visits import solution_of, video_of
 from tests.walking_fit import walking_fit
 
 N, FPS = 200, 30.0
 EVIL = "<script>alert(1)</script>&\"'"
-
-
-def _video(name: str = "walk.mp4") -> VideoInfo:
-    return video_info(
-        path=f"/somewhere/secret/{name}",
-        sha256="ab" * 32,
-        size_bytes=3_456_789,
-        container="mp4",
-        width_px=640,
-        height_px=360,
-        rotation_deg=0,
-        time_s=np.arange(N) / FPS,
-        duration_s=N / FPS,
-        recorded_utc="2026-11-20T10:00:00Z",
-        make="Acme",
-        model="Phone 9",
-    )
-
-
+VIDEO = video_of("walk", np.arange(N) / FPS, duration_s=N / FPS, recorded_utc="2026-11-20T10:00:00Z", model="Phone 9")
 CHOICE = SubjectChoice("CHOSEN", 2, 0.9, 1, 0.2, {1: 0.2, 2: 0.9}, "person 2 walks through the picture")
-
-
 FIT_CHECKS = (Check("residual_3d_cm", PASS, 3.1, 6.0),)
 PICTURES = {"walk": tuple(Picture(i, i / FPS, np.full((90, 120, 3), i, np.uint8)) for i in (30, 90, 150))}
 
@@ -56,17 +34,9 @@ PICTURES = {"walk": tuple(Picture(i, i / FPS, np.full((90, 120, 3), i, np.uint8)
 def _visit(*recordings: Recording, measures: GaitMetrics | None = None) -> Visit:
     """A visit of these recordings, fitted where one of them is."""
     fits = tuple(r.fit for r in recordings if r.fit is not None)
-    solution = None
-    if fits:
-        f, trace = fits[0], np.array([[0.0, 99.0], [100.0, 9.0]])
-        solution = Solution.of(
-            SessionFit(
-                fits, f.scale, f.site_offset_m, trace, 7, True, f.solver, f.params_hash, 31.2, 12.0, "cpu", FIT_CHECKS
-            )
-        )
     visit = Visit(
         recordings,
-        solution,
+        solution_of(fits[0]) if fits else None,
         FIT_CHECKS if fits else (),
         subject="S-014",
         date="2026-11-20",
@@ -77,14 +47,12 @@ def _visit(*recordings: Recording, measures: GaitMetrics | None = None) -> Visit
 
 @pytest.fixture(scope="module")
 def walk() -> TrialFit:
-    body = load_body()
-    return walking_fit(body.joint_names, body.sha256, n_frames=N, seen=(10, 190), speed_m_s=0.5)  # her feet slide
+    return walking_fit(n_frames=N, seen=(10, 190), speed_m_s=0.5)  # her feet slide
 
 
 @pytest.fixture(scope="module")
 def stand() -> TrialFit:
-    body = load_body()
-    return walking_fit(body.joint_names, body.sha256, n_frames=N, walks=False, name="stand")
+    return walking_fit(n_frames=N, walks=False, name="stand")
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +62,7 @@ def measured(walk: TrialFit) -> GaitMetrics:
 
 @pytest.fixture(scope="module")
 def visit(walk: TrialFit, measured: GaitMetrics) -> Visit:
-    return _visit(Recording.of("walk", walk, video=_video(), choice=CHOICE), measures=measured)
+    return _visit(Recording.of("walk", walk, video=VIDEO, choice=CHOICE), measures=measured)
 
 
 def _written(visit: Visit, path: Path, title: str = "Visit 1") -> Path:
@@ -196,7 +164,8 @@ def test_charts_and_pictures_have_words(visit: Visit, tmp_path: Path) -> None:
 def test_names_are_escaped_everywhere(visit: Visit, walk: TrialFit, tmp_path: Path) -> None:
     fit = dataclasses.replace(walk, name=EVIL, camera=dataclasses.replace(walk.camera, source=EVIL))
     choice = dataclasses.replace(CHOICE, reason=EVIL)
-    video = dataclasses.replace(_video(EVIL.replace("/", "")), model=EVIL, recorded_utc=EVIL)
+    path = f"/somewhere/secret/{EVIL.replace('/', '')}"
+    video = dataclasses.replace(VIDEO, path=path, model=EVIL, recorded_utc=EVIL)
     recording = Recording.of(EVIL, fit, choice=choice, video=video, problem=EVIL)
     whole = _visit(recording, measures=gait_metrics([fit]).with_checks([Check(EVIL, WARN, None, None, EVIL)]))
     evil = dataclasses.replace(
@@ -236,7 +205,7 @@ def test_what_names_an_option_on_the_command_line_is_said_otherwise(visit: Visit
     named = ("camera_orientation_known", "lengths_scale", "camera_intrinsics_measured")
     checks = [Check(name, WARN, None, None, advice) for name, advice in zip(named, advised, strict=True)]
     asking = visit.with_measures(not_none(visit.measures).with_checks([*visit.checks, *checks]))
-    page = write_report(tmp_path / "report.html", asking, PICTURES, "Visit 1", None, language).read_text("utf-8")
+    page = write_report(tmp_path / "report.html", asking, PICTURES, "Visit 1", language).read_text("utf-8")
     assert not commands_in(page)
     for advice in advised:
         told = library_words(language, advice)[1:].replace("'", "&#39;")
@@ -246,7 +215,7 @@ def test_what_names_an_option_on_the_command_line_is_said_otherwise(visit: Visit
 def test_session_without_gait_says_so_and_draws_the_angles(stand: TrialFit, tmp_path: Path) -> None:
     metrics = gait_metrics([stand])
     assert metrics.status == EMPTY
-    page = _page(_visit(Recording.of("stand", stand, video=_video(), choice=CHOICE), measures=metrics), tmp_path)
+    page = _page(_visit(Recording.of("stand", stand, video=VIDEO, choice=CHOICE), measures=metrics), tmp_path)
     assert _verdict(page) == EMPTY
     assert "No gait to measure" in page.text
     assert sentence(metrics.trials[0].reason) in page.text
@@ -260,7 +229,7 @@ def test_one_recording_without_gait_does_not_empty_the_session(
     visit: Visit, walk: TrialFit, stand: TrialFit, tmp_path: Path
 ) -> None:
     metrics = gait_metrics([walk, stand])
-    standing = Recording.of("stand", stand, video=_video("stand.mp4"), choice=CHOICE)
+    standing = Recording.of("stand", stand, video=dataclasses.replace(VIDEO, path="stand.mp4"), choice=CHOICE)
     page = _page(_visit(visit.recordings[0], standing, measures=metrics), tmp_path)
     assert _verdict(page) == WARN
     assert "steps/min" in page.text
@@ -269,13 +238,13 @@ def test_one_recording_without_gait_does_not_empty_the_session(
 
 def test_session_that_waits_for_a_choice(tmp_path: Path) -> None:
     choice = SubjectChoice("NEEDS_CHOICE", None, 0.5, 2, 0.48, {1: 0.5, 2: 0.48}, "two people walk alike")
-    page = _page(_visit(Recording("walk", video=_video(), choice=choice)), tmp_path)
+    page = _page(_visit(Recording("walk", video=VIDEO, choice=choice)), tmp_path)
     assert _verdict(page) == NEEDS_CHOICE
     assert "two people walk alike" in page.text
 
 
 def test_session_whose_chain_broke(tmp_path: Path) -> None:
-    recording = Recording("walk", video=_video(), problem="TRACK_TOO_SHORT: in view for 0.4 s")
+    recording = Recording("walk", video=VIDEO, problem="TRACK_TOO_SHORT: in view for 0.4 s")
     page = _page(_visit(recording), tmp_path)
     assert _verdict(page) == FAIL
     assert "in view for 0.4 s" in page.text
@@ -289,7 +258,7 @@ def test_fit_without_a_known_frame_is_drawn_without_curves(stand: TrialFit, tmp_
         residual_2d_px=np.full_like(stand.residual_2d_px, np.nan),
         residual_3d_m=np.full_like(stand.residual_3d_m, np.nan),
     )
-    recording = Recording.of("stand", unknown, video=_video(), choice=CHOICE, problem="nobody was seen")
+    recording = Recording.of("stand", unknown, video=VIDEO, choice=CHOICE, problem="nobody was seen")
     page = _page(_visit(recording), tmp_path)
     assert "The body is fitted in no frame." in page.text
 
@@ -311,11 +280,6 @@ def test_norm_band_is_the_norm() -> None:
     per_degree = (y0 - y20) / 20
     np.testing.assert_allclose((y0 - (upper[:, 1] + lower[:, 1]) / 2) / per_degree, curve["mean_deg"], atol=0.3)
     np.testing.assert_allclose((lower[:, 1] - upper[:, 1]) / per_degree / 2, curve["sd_deg"], atol=0.3)
-
-
-def test_mean_curve_is_unknown_where_a_cycle_is() -> None:
-    mean = mean_curve([np.array([1.0, 2.0]), np.array([3.0, np.nan])])
-    np.testing.assert_array_equal(mean, [2.0, np.nan])
 
 
 @pytest.mark.parametrize(
@@ -341,8 +305,8 @@ def test_words() -> None:
     assert significant(0.5) == "0.5"
     assert significant(0.0) == "0"
     assert significant(None) == ""
-    assert check_name(Check("residual_3d_cm", PASS, 1.0, 2.0)) == "Residual 3D (cm)"
-    assert check_name(Check("gdi_cycles", PASS, 1.0, 2.0)) == "GDI cycles"
+    assert check_words("residual_3d_cm") == "Residual 3D (cm)"
+    assert check_words("gdi_cycles") == "GDI cycles"
     assert plural(1, "cycle") == "1 cycle"
     assert plural(0, "cycle") == "0 cycles"
     assert size(999) == "999 bytes"

@@ -1,10 +1,11 @@
-"""A visit written to its folder and read back: equal in every field, and so are its report and its exports."""
+"""A visit written to its folder and read back: equal in every field, and so are its exports.
+
+The report and the pages of both: tests/integration/test_visit_contract.py."""
 
 import dataclasses
 import functools
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import TrialFit
@@ -37,9 +37,8 @@ from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, visit_o
 from tests import not_none
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit
-from tests.inputs import video_info
-from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, fields, leaves
-from tests.unit.visits import solution_of
+from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, fields, leaves
+from tests.unit.visits import solution_of, video_of
 from tests.walking_fit import walking_fit
 
 FPS = 30.0
@@ -61,26 +60,13 @@ def walk(name: str, *, n: int = 200, hidden: slice | None = None, seed: int = 0)
 
 
 def stand(name: str) -> TrialFit:
-    body = load_body()
-    fit = walking_fit(body.joint_names, body.sha256, n_frames=120, walks=False, name=name)
-    return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=fit.qpos)
+    return dataclasses.replace(marked_fit(n_frames=120), name=name, qpos=walking_fit(n_frames=120, walks=False).qpos)
 
 
-def video_of(name: str, time_s: np.ndarray) -> VideoInfo:
-    return video_info(
-        path=f"/somewhere/secret/{name}.mp4",
-        sha256="ab" * 32,
-        size_bytes=3_456_789,
-        container="mp4",
-        width_px=640,
-        height_px=360,
-        time_s=time_s,
-        duration_s=float("nan"),
-        recorded_utc="2026-03-01T10:00:00Z",
-        make="Acme",
-        notes=("two stamps repeat",),
-        capture_fps=240.0,  # slow motion: a check that FAILs, of the recording
-    )
+def slow_motion(name: str, time_s: np.ndarray) -> VideoInfo:
+    """A video with a check that FAILs, of the recording."""
+    day, notes = "2026-03-01T10:00:00Z", ("two stamps repeat",)
+    return video_of(name, time_s, duration_s=float("nan"), recorded_utc=day, notes=notes, capture_fps=240.0)
 
 
 def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: Any) -> Visit:
@@ -91,7 +77,7 @@ def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: An
             f,
             keypoints_of(f),
             path=Path(f"/somewhere/secret/{f.name}.mp4"),
-            video=video_of(f.name, f.time_s),
+            video=slow_motion(f.name, f.time_s),
             choice=CHOICE,
             condition=Condition("walking", "self_selected"),
         )
@@ -102,7 +88,7 @@ def visit_of(*fits: TrialFit, left_out: tuple[Recording, ...] = (), **fields: An
 
 
 def dark() -> Recording:
-    video = video_of("dark", np.arange(50) / FPS)
+    video = slow_motion("dark", np.arange(50) / FPS)
     return Recording("dark", Path(video.path), video, NOBODY, problem="TRACK_NO_PERSON: nobody was found")
 
 
@@ -146,6 +132,10 @@ VISITS: dict[str, Callable[[], Visit]] = {
     "a fit that failed": lambda: measured(dataclasses.replace(visit_of(walk("walk")), fit_checks=FAILED)),
     "markers": lambda: measured(of_markers(walk("walk"))),
 }
+
+
+def recording_of(visit: Visit, name: str) -> Recording:
+    return next(r for r in visit.recordings if r.name == name)
 
 
 @functools.cache
@@ -228,19 +218,6 @@ def test_files_name_no_folder(visit: Visit, folder: Path) -> None:
     assert [p.name for p in folder.iterdir() if b"secret" in p.read_bytes()] == []
     names = {f"{r.name}.mp4" for r in visit.recordings if r.video is not None}
     assert all(name in (folder / "session.json").read_text() for name in names)
-
-
-def test_the_report_of_the_loaded_visit_is_the_same(visit: Visit, folder: Path) -> None:
-    one, other = (list(leaves(page_of(v, {}, "Visit", None))) for v in (visit, load_visit(folder)))
-    assert len(one) > 40
-    assert [where for where, _ in one] == [where for where, _ in other]
-    for (where, a), (_, b) in zip(one, other, strict=True):
-        assert_same_text(a, b, where)
-
-
-def test_the_tables_of_the_loaded_visit_are_the_same(visit: Visit, folder: Path, tmp_path: Path) -> None:
-    """Up to the rounding of metrics.json and events.csv."""
-    assert_same_exports(visit, load_visit(folder), ["csv"], tmp_path)
 
 
 @pytest.mark.parametrize("name", ["two trials", "markers"])
@@ -407,8 +384,8 @@ def test_a_folder_of_an_older_version_is_read_and_says_what_it_lacks(two: Visit,
         events = [dataclasses.replace(e, bout=0) for e in not_none(before.events).events]
         assert_same(tuple(events), not_none(recording.measured).events.events)
         assert_same(before.fit, recording.fit)
-    page = dict(leaves(page_of(found, {}, "Visit", None)))
-    assert page["/measures/0/mean"] == dict(leaves(page_of(two, {}, "Visit", None)))["/measures/0/mean"]
+    page = dict(leaves(page_of(found, {}, "Visit")))
+    assert page["/measures/0/mean"] == dict(leaves(page_of(two, {}, "Visit")))["/measures/0/mean"]
 
 
 def test_tables_of_an_older_folder_are_refused_until_its_cycles_are_there(saved: Path, tmp_path: Path) -> None:
@@ -456,19 +433,19 @@ def test_a_folder_half_written_shows_what_is_there(two: Visit, saved: Path, file
     found = load_visit(saved)
     (lack,) = found.lacks
     assert lack.startswith(lacks)
-    walked = found.recording("walk")
-    assert_same(fields(as_stored(two).recording("walk"))["fit"], walked.fit)
+    walked = recording_of(found, "walk")
+    assert_same(fields(recording_of(as_stored(two), "walk"))["fit"], walked.fit)
     assert_same(keypoints_of(walk("walk")), walked.keypoints)
     assert [r.name for r in found.fitted] == (["walk"] if gone == "fit" else ["walk", "back"])
     assert (found.measures is None) is (gone == "measures")
     if gone in ("measures", "fit"):
         assert {c.check for c in found.checks} >= {"residual_3d_cm"}
         return
-    back = found.recording("back")
+    back = recording_of(found, "back")
     assert (back.keypoints is None) is (gone == "keypoints")
     assert (back.events is not None and back.events.events == ()) is (gone == "events")
-    assert [bool(c.curves) for c in back.cycles] == [gone != "curves"] * len(two.recording("back").cycles)
-    assert page_of(found, {}, "Visit", None)["measures"]
+    assert [bool(c.curves) for c in back.cycles] == [gone != "curves"] * len(recording_of(two, "back").cycles)
+    assert page_of(found, {}, "Visit")["measures"]
 
 
 @pytest.mark.parametrize(("file", "what"), [("back.events.csv", "gait events"), ("back.cycles.npz", "gait cycles")])
@@ -518,7 +495,7 @@ def test_a_value_of_another_type_never_ends_without_a_code(tmp_path: Path, file:
                 found = load_visit(tmp_path)
                 assert not_none(found.measures).table()
                 if i == j:  # a page takes ten times as long
-                    page_of(found, {}, "Visit", None)
+                    page_of(found, {}, "Visit")
             except PblError:
                 refused += 1
             except Exception as error:
@@ -588,7 +565,7 @@ def test_a_session_file_of_another_fit_says_nothing_of_this_one(saved: Path, cha
 
 def test_keypoints_of_another_recording_are_not_those_of_a_fit(saved: Path) -> None:
     keypoints_of(walk("walk", n=90)).save(saved / "walk.keypoints.npz")
-    found = load_visit(saved).recording("walk")
+    found = recording_of(load_visit(saved), "walk")
     assert found.keypoints is None
     assert found.video is not None
     assert np.isnan(found.video.time_s).all()
@@ -596,15 +573,10 @@ def test_keypoints_of_another_recording_are_not_those_of_a_fit(saved: Path) -> N
 
 
 def test_fits_alone_are_a_visit_without_checks(tmp_path: Path) -> None:
-    shutil.copyfile(saved_fit(tmp_path / "a"), tmp_path / "walk.fit.npz")
+    walk("walk").save(tmp_path / "walk.fit.npz")
     found = visit_of_fits([tmp_path / "walk.fit.npz"])
     assert [c.check for c in found.fit_checks] == ["fit_checks_known"]
     assert [(r.name, r.fitted, r.keypoints, r.measured) for r in found.recordings] == [("walk", True, None, None)]
-
-
-def saved_fit(folder: Path) -> Path:
-    save_visit(visit_of(walk("walk")), folder)
-    return folder / "walk.fit.npz"
 
 
 def test_a_visit_that_was_never_fitted_is_saved_and_read(tmp_path: Path) -> None:

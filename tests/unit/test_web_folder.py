@@ -13,14 +13,15 @@ import pandas as pd
 import pytest
 from starlette.testclient import TestClient
 
-from pbl_pipeline.body import load_body, marker_set
+from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.visit import load_visit, save_beside
 from tests import not_none
 from tests.exported import with_markers
+from tests.integration import web
 from tests.walking_fit import walking_fit
-from workers.web import Options, ResultsFolder, Where, create_app, serve
+from workers.web import ResultsFolder, Where, serve
 from workers.web.pages import plain
 
 
@@ -28,11 +29,11 @@ from workers.web.pages import plain
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two visits, one with a recording beside it; one whose files are not those of `pbl run`; one whose measures are
     missing; and one of a run that was ended."""
-    folder, body = tmp_path_factory.mktemp("results"), load_body()
+    folder = tmp_path_factory.mktemp("results")
     for name in ("2026-01-10", "2026-06-10 <b>"):
         out = folder / name
         out.mkdir()
-        plain = walking_fit(body.joint_names, body.sha256, name="walk", n_frames=240)
+        plain = walking_fit(name="walk", n_frames=240)
         points = marker_set("blazepose_33")
         more = {"marker_set": points.name, "marker_names": points.names, "site_offset_m": np.zeros((33, 3))}
         seen = {"residual_2d_px": np.full((240, 33), 4.0), "residual_3d_m": np.full((240, 33), 0.03)}
@@ -53,16 +54,12 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def browser_of(folder: ResultsFolder) -> TestClient:
-    app = create_app(Options(folder=folder, roles=("reader",)))
-    browser = TestClient(app, base_url="http://127.0.0.1:8484", raise_server_exceptions=False)
-    assert browser.get("/visits").status_code == 401
-    browser.get("/enter", params={"key": app.state.sessions.new_link("R. Viewer", "reader")})
-    return browser
+@pytest.fixture
+def browser(results: Path) -> TestClient:
+    return web.client("reader", folder=ResultsFolder(results))
 
 
-def test_a_folder_is_found_looked_at_and_taken_along(results):
-    browser = browser_of(ResultsFolder(results))
+def test_a_folder_is_found_looked_at_and_taken_along(results, browser):
     first = browser.get("/visits").text
     index = json.loads((results / "2026-01-10" / "metrics.json").read_text())["session"]["gdi"]["mean"]
     assert "2026-01-10" in first
@@ -87,8 +84,7 @@ def test_a_folder_is_found_looked_at_and_taken_along(results):
     assert any(name.endswith(".mot") for name in files)
 
 
-def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(results):
-    browser = browser_of(ResultsFolder(results))
+def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(results, browser):
     page = " ".join(browser.get("/visits/1").text.split())
     assert "compares with 166 typically developing children" in page
     assert page.count('<svg viewBox="0 0 280 200"') == 4
@@ -109,19 +105,11 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
     assert "*" not in re.findall(r"Cadence.*?</tr>", page)[0]
 
 
-def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):
-    browser = browser_of(ResultsFolder(results))
-    assert (
-        "copy the recording beside its results" in browser.get("/recordings/2").text
-    )  # no recording beside the second visit
+def test_what_is_not_there_is_said(browser, monkeypatch: pytest.MonkeyPatch):
+    # The second visit has no recording beside it.
+    assert "copy the recording beside its results" in browser.get("/recordings/2").text
     assert browser.get("/recordings/2/video").status_code == 404
-    for path in (
-        "/visits/9",
-        "/recordings/9",
-        "/recordings/9/movement",
-        "/visits/../../etc/passwd",
-        "/recordings/2/overlay",
-    ):
+    for path in ("/visits/9", "/recordings/9", "/recordings/9/movement", "/recordings/2/overlay"):
         assert browser.get(path).status_code == 404, path
     assert "FILE_FORMAT" in browser.get("/visits/3").text
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
@@ -130,8 +118,7 @@ def test_what_is_not_there_is_said(results, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(("number", "file"), [(4, "metrics.json"), (5, "session.json")])
-def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_missing(results, number, file):
-    browser = browser_of(ResultsFolder(results))
+def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_missing(browser, number, file):
     visit = browser.get(f"/visits/{number}").text
     assert f"no {file}" in visit
     assert "This visit has no measures yet" in visit
@@ -143,8 +130,8 @@ def test_a_visit_without_all_of_its_files_shows_what_is_there_and_names_what_is_
     assert "240 frames" in recording
 
 
-def test_each_page_as_json(results):
-    browser = browser_of(ResultsFolder(results))
+def test_the_list_as_json(browser):
+    """The other pages: tests/integration/test_visit_contract.py."""
     listed = browser.get("/visits.json").json()["page"]["visits"]
     assert [(v["session_id"], v["label"], v["state"]) for v in listed] == [
         (1, "2026-01-10", "computed"),
@@ -153,19 +140,9 @@ def test_each_page_as_json(results):
         (4, "unmeasured", "incomplete"),
         (5, "was ended", "incomplete"),
     ]
-    stored = json.loads((results / "2026-01-10" / "metrics.json").read_text())
-    visit = browser.get("/visits/1.json").json()["about"]
-    assert visit["visit"]["metrics"] == stored
-    assert visit["row"]["result"]["index"] == stored["session"]["gdi"]["mean"]
-    recording = browser.get("/recordings/1.json").json()["about"]
-    assert (recording["number"], recording["n_frames"]) == (1, 240)
-    times = [e["time_s"] for e in recording["recording"]["events"]]
-    movement = browser.get("/recordings/1/movement").json()["events"]
-    assert times == pytest.approx([e[0] for e in movement], abs=1e-4)
 
 
-def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch: pytest.MonkeyPatch):
-    browser = browser_of(ResultsFolder(results))
+def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, browser):
     pages = ["/visits.json", *(f"/visits/{n}.json" for n in range(1, 7)), *(f"/recordings/{n}.json" for n in range(6))]
     for page in pages:
         answer = browser.get(page)
@@ -189,20 +166,13 @@ def test_no_json_has_a_path_or_a_number_that_is_not_finite(results, monkeypatch:
 def test_what_plain_values_are_of():
     frame = pd.DataFrame({"percent": [0, 1], "mean_deg": [np.nan, 2.5]})
     assert plain(frame) == [{"percent": 0, "mean_deg": None}, {"percent": 1, "mean_deg": 2.5}]
-    assert plain(
-        {"at": datetime.date(2026, 3, 1), "p": Path("/a/b.mp4"), "x": np.float32(np.inf), "y": np.zeros(3)}
-    ) == {
-        "at": "2026-03-01",
-        "p": "b.mp4",
-        "x": None,
-        "y": None,
-    }
+    values = {"at": datetime.date(2026, 3, 1), "p": Path("/a/b.mp4"), "x": np.float32(np.inf), "y": np.zeros(3)}
+    assert plain(values) == {"at": "2026-03-01", "p": "b.mp4", "x": None, "y": None}
     assert plain("no file at /data/visits/2026/walk.mp4: gone") == "no file at walk.mp4: gone"
     assert plain("/visits/3, 1.2 m/s, https://a.org/b/c") == "3, 1.2 m/s, https://a.org/b/c"
 
 
-def test_nothing_is_decided_in_a_folder(results):
-    browser = browser_of(ResultsFolder(results))
+def test_nothing_is_decided_in_a_folder(browser):
     for path in ("/recordings/1/person", "/visits/1/accept"):
         assert browser.post(path, data={"token": "x"}).status_code in (403, 404, 405)
 
@@ -222,7 +192,6 @@ def test_results_are_found_again_when_they_were_made_anew(results, tmp_path):
         (out / file.name).write_bytes(file.read_bytes())
     folder = ResultsFolder(out)
     before = folder.state(1)
-    body = load_body()
-    walking_fit(body.joint_names, body.sha256, name="walk", n_frames=200).save(out / "walk.fit.npz")
+    walking_fit(name="walk", n_frames=200).save(out / "walk.fit.npz")
     assert folder.state(1) != before
     assert len(not_none(folder.recording(1).recording.fit).time_s) == 200

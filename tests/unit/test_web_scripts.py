@@ -29,8 +29,7 @@ needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="no node on
 
 def handheld_walk(n_frames: int = 90):
     """A walk before a lens with distortion, in a hand that turns; the person is in view from frame 5 to 79."""
-    body = load_body()
-    fit = walking_fit(body.joint_names, body.sha256, n_frames=n_frames, seen=(5, 80), image_size_px=(1280, 720))
+    fit = walking_fit(n_frames=n_frames, seen=(5, 80), image_size_px=(1280, 720))
     lens = np.array([[1100.0, 0, 655], [0, 1090, 350], [0, 0, 1]])
     sway = Rotation.from_rotvec(0.05 * np.sin(np.arange(n_frames)[:, None] / [9.0, 14.0, 6.0]))
     quat = (sway * Rotation.from_quat(LEVEL_CAMERA_QUAT_WXYZ, scalar_first=True)).as_quat(scalar_first=True)
@@ -106,7 +105,7 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
     )
     body, numbers = body_json(Recording.of("walk", markers))
     assert body["camera"] is None
-    assert body["known"] == [[5, 79]]
+    assert body["known"] == [(5, 79)]
     assert len(numbers) == 2 * 90 * (3 + 4 * len(body["sides"]) + 4)
     nobody = dataclasses.replace(fit, qpos=np.full_like(fit.qpos, np.nan))
     sent = json.loads(Movement.of(Recording.of("walk", nobody)).movement)
@@ -115,5 +114,5 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
 
 def test_the_floor_is_under_the_feet():
     """The walker's pelvis is 0.95 m above the floor, which lies 1.15 m under the camera (`walking_fit`)."""
-    body, _ = body_json(Recording.of("walk", walking_fit(load_body().joint_names, load_body().sha256)))
+    body, _ = body_json(Recording.of("walk", walking_fit()))
     assert body["floor"] == pytest.approx(-1.15, abs=0.06)

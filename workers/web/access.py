@@ -121,11 +121,10 @@ class Sessions:
     def __init__(
         self,
         clock: Callable[[], float] = time.monotonic,
-        hours: float = HOURS,
         idle_hours: float | None = None,
         still: Callable[[str, str], bool] | None = None,
     ) -> None:
-        self._clock, self._hours, self._idle, self._still = clock, hours, idle_hours, still
+        self._clock, self._idle, self._still = clock, idle_hours, still
         self._sessions: dict[str, Session] = {}
         self._links: dict[str, tuple[str, tuple[str, ...]]] = {}
 
@@ -145,7 +144,7 @@ class Sessions:
         now = self._clock()
         self._sessions = {k: s for k, s in self._sessions.items() if self._lasts(s, now)}
         cookie = secrets.token_urlsafe(32)
-        self._sessions[hashed(cookie)] = Session(name, roles, now + 3600 * self._hours, now, changed)
+        self._sessions[hashed(cookie)] = Session(name, roles, now + 3600 * HOURS, now, changed)
         return cookie
 
     def find(self, cookie: str) -> Session | None:
@@ -162,7 +161,6 @@ class Sessions:
         return session.ends > now and (self._idle is None or now - session.seen < 3600 * self._idle)
 
     def leave(self, cookie: str) -> None:
-        """End a session."""
         self._sessions.pop(hashed(cookie), None)
 
 
@@ -189,7 +187,6 @@ class Cookie:
         )
 
     def forget(self, response: Response) -> None:
-        """Have a browser forget it."""
         response.delete_cookie(self.name, path="/", httponly=True, samesite="strict", secure=self.secure)
 
 

@@ -80,9 +80,8 @@ class Accounts:
         stamp = (about.st_mtime_ns, about.st_size, about.st_ino, about.st_mode)
         if self._read[0] != stamp:
             if os.name == "posix" and about.st_mode & 0o077:
-                raise self._bad(
-                    "its account alone may read it", f"chmod 600 {self.path}", f"mode {about.st_mode & 0o777:o}"
-                )
+                mode = f"{self.path}: mode {about.st_mode & 0o777:o}"
+                raise _refused(mode, "its account alone may read it", f"chmod 600 {self.path}")
             try:
                 found = json.loads(self.path.read_text("utf-8"))["accounts"]
                 known = {n: Account(n, tuple(a["roles"]), a["password"], a["changed"]) for n, a in found.items()}
@@ -92,8 +91,11 @@ class Accounts:
                     ):
                         raise ValueError("another content")
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-                next_step = "restore the file, or remove it and add the accounts again"
-                raise self._bad("accounts as `pbl web account` writes them", next_step, type(error).__name__) from error
+                raise _refused(
+                    f"{self.path}: {type(error).__name__}",
+                    "accounts as `pbl web account` writes them",
+                    "restore the file, or remove it and add the accounts again",
+                ) from error
             self._read = (stamp, known)
         return self._read[1]
 
@@ -130,7 +132,8 @@ class Accounts:
     def check(self, name: str, password: str) -> Account | None:
         """Return the account if the password is right. Takes as long for an unknown name."""
         account = self.all().get(name)
-        right = matches(password, account.password if account is not None else _nobody())
+        # A hash that no password has takes as long to compare.
+        right = matches(password, _stored(b"0" * 16, b"0" * 16) if account is None else account.password)
         return account if right else None
 
     def current(self, name: str, changed: str) -> bool:
@@ -156,11 +159,8 @@ class Accounts:
             raise _refused(f"no account {name!r}", "an existing account", "`pbl web account list` prints them")
         return known[name]
 
-    def _bad(self, expected: str, next_step: str, found: str) -> PblError:
-        return PblError("WEB_ACCOUNT", found=f"{self.path}: {found}", expected=expected, next_step=next_step)
 
-
-def hashed(password: str, log_n: int | None = None) -> str:
+def hashed(password: str) -> str:
     """A salted hash of a password, with what it takes to compare another one with it. Raises `PblError` WEB_ACCOUNT for
     one that is too short or long. The password is in no error."""
     if not SHORTEST <= len(password) <= LONGEST:
@@ -169,28 +169,25 @@ def hashed(password: str, log_n: int | None = None) -> str:
             f"{SHORTEST} to {LONGEST}",
             "choose a longer one, such as five words",
         )
-    salt, log_n = secrets.token_bytes(16), LOG_N if log_n is None else log_n
-    parts = (salt, _key(password, salt, log_n, R, P))
-    return "$".join(["scrypt", str(log_n), str(R), str(P), *(base64.b64encode(p).decode() for p in parts)])
+    salt = secrets.token_bytes(16)
+    return _stored(salt, _key(password, salt, LOG_N))
+
+
+def _stored(salt: bytes, key: bytes) -> str:
+    return f"scrypt${LOG_N}${R}${P}${base64.b64encode(salt).decode()}${base64.b64encode(key).decode()}"
 
 
 def matches(password: str, stored: str) -> bool:
     """Return whether a hash is that of a password."""
-    _, log_n, r, p, salt, key = stored.split("$")
-    found = _key(password[: 4 * LONGEST], base64.b64decode(salt), int(log_n), int(r), int(p))
+    _, log_n, _, _, salt, key = stored.split("$")
+    found = _key(password[: 4 * LONGEST], base64.b64decode(salt), int(log_n))
     return hmac.compare_digest(found, base64.b64decode(key))
 
 
-def _key(password: str, salt: bytes, log_n: int, r: int, p: int) -> bytes:
+def _key(password: str, salt: bytes, log_n: int) -> bytes:
     # The same letters however a keyboard composes them.
     text = unicodedata.normalize("NFKC", password).encode("utf-8", "surrogatepass")
-    return hashlib.scrypt(text, salt=salt, n=2**log_n, r=r, p=p, maxmem=256 * 2**log_n * r, dklen=32)
-
-
-def _nobody() -> str:
-    """Return a hash that no password has, and that takes as long to compare."""
-    nothing = base64.b64encode(b"0" * 16).decode()
-    return f"scrypt${LOG_N}${R}${P}${nothing}${nothing}"
+    return hashlib.scrypt(text, salt=salt, n=2**log_n, r=R, p=P, maxmem=256 * 2**log_n * R, dklen=32)
 
 
 def _now() -> str:
@@ -276,7 +273,7 @@ class SignIn:
     attempts: Attempts
 
 
-def routes(pages: Pages, way: SignIn, used: object = None) -> list[Address]:
+def routes(pages: Pages, way: SignIn, used: Callable[[], None]) -> list[Address]:
     """The addresses of this part. `used`: called after a link was used."""
     turn = asyncio.Semaphore(AT_ONCE)
 
@@ -293,8 +290,7 @@ def routes(pages: Pages, way: SignIn, used: object = None) -> list[Address]:
             return pages.refused(request, "session")
         to = request.query_params.get("to", "")
         response = opened(request, value, to if to.startswith("/visits/") and whole_number(to[8:]) else "/")
-        if callable(used):
-            used()
+        used()
         return response
 
     async def ask(request: Request) -> Response:

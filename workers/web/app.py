@@ -129,10 +129,10 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
     asks: Asks
     source: Source
     if options.folder is not None:
-        asks, source = Files(), options.folder
+        asks, source, phones = Files(), options.folder, None
         parts = folder.routes(pages, asks, options.folder)
     else:
-        asks, source = tables, TablesSource(videos)
+        asks, source, phones = tables, TablesSource(videos), phone.Phones(tables, options.secure)
         parts = [
             *visits.list_routes(pages, tables),
             *decide.routes(pages, tables),
@@ -144,20 +144,16 @@ def create_app(options: Options, sessions: access.Sessions | None = None) -> Sta
             *registration.routes(pages, tables),
             *operate.routes(pages, tables),
             *trend.routes(pages, tables),
+            *phone.routes(pages, tables, phones, visits_queue, options.target),
         ]
-    phones = phone.Phones(tables, options.secure) if options.folder is None else None
-    if phones is not None:
-        parts += phone.routes(pages, tables, phones, visits_queue, options.target)
-    parts += [
-        *visits.routes(pages, asks, source),
-        *recordings.routes(pages, asks, source),
-        *export.routes(asks, source),
-    ]
     routes: list[Address] = [
         Address("/", home, OPEN),
         *sign_in_routes(pages, way, link_used),
         Address("/language", language, "", methods=["POST"]),
         *parts,
+        *visits.routes(pages, asks, source),
+        *recordings.routes(pages, asks, source),
+        *export.routes(asks, source),
         _files("static", "no-store"),
         _files("vendor", _KEEP),
     ]

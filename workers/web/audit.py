@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from schemas.decisions.review_decisions import record_viewing
 
@@ -17,13 +16,13 @@ AGAIN_S = 600.0
 class Looks:
     """Record of looks; `address.Address` declares which addresses count."""
 
-    def __init__(self, tables: Tables, clock: Callable[[], float] = time.monotonic) -> None:
-        self._tables, self._clock = tables, clock
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
 
     async def record(self, session: Session, of: str, number: int, what: str) -> None:
         """Insert a row for what is looked at, one in `AGAIN_S` for all but a page; `of`: "video_id" or "session_id".
         Raises `PblError` where it cannot be written."""
-        key, now = (of, str(number), what), self._clock()
+        key, now = (of, str(number), what), time.monotonic()
         if what != "page" and now - session.looked.get(key, -AGAIN_S) < AGAIN_S:
             return
         await self._tables.ask(record_viewing, of, number, what, session.name)

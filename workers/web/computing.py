@@ -68,8 +68,6 @@ def _broken(session_id: int, found: str) -> PblError:
 
 @dataclasses.dataclass(frozen=True)
 class Told:
-    """Progress of a visit."""
-
     progress: Progress
     state: str  # "running" or "waiting" here, or "" if it was not asked for
     error: PblError | None  # what ended its last process before it was done

@@ -129,7 +129,6 @@ class Connection(H11Protocol):
         self._end("answer")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop all timers."""
         self._end("request")
         self._end("answer")
         super().connection_lost(exc)

@@ -63,13 +63,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def boxes(request: Request) -> Response:
         number, which = number_of(request), whole_number(request.query_params.get("method", "0"))
 
-        def load() -> Tracking:
-            found = candidates.candidates(number)
-            if which is None or which >= len(found):
-                raise video.unknown_video(number)
-            return reading.load_tracking(found[which].key)
-
-        tracked = await tables.ask(load)
+        tracked = await tables.ask(lambda: reading.load_tracking(_candidates(number, which).key))
         return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
 
     async def people(request: Request) -> Response:
@@ -79,11 +73,8 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         def picture() -> bytes:
             if settings.deidentify_how():
                 raise video.unknown_video(number)
-            found = candidates.candidates(number)
-            if which >= len(found):
-                raise video.unknown_video(number)
             with new_folder() as folder:
-                return candidates.write_sheet(found[which], folder / "people.jpg").read_bytes()
+                return candidates.write_sheet(_candidates(number, which), folder / "people.jpg").read_bytes()
 
         return Response(await tables.ask(picture), media_type="image/jpeg")
 
@@ -93,6 +84,14 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         Address("/recordings/{video_id:int}/boxes", boxes, "look", look="boxes"),
         Address("/visits/{session_id:int}/accept", accept, "decide", methods=["POST"]),
     ]
+
+
+def _candidates(video_id: int, which: int | None) -> candidates.Candidates:
+    """Return the candidates of a recording by one of its tracking methods. Raises `PblError` DB_NOT_FOUND."""
+    found = candidates.candidates(video_id)
+    if which is None or which >= len(found):
+        raise video.unknown_video(video_id)
+    return found[which]
 
 
 def _number(text: str) -> int:

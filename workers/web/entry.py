@@ -12,7 +12,7 @@ from schemas.studies import study_sheets, visit_forms
 
 from .access import form_of, sender
 from .address import Address, number_of
-from .pages import Pages, in_field, reader_language
+from .pages import NOTHING, Pages, in_field, reader_language
 from .tables import Tables
 
 #: Prefix of the names of the fields: an instrument may have the name of another field of the form.
@@ -20,10 +20,10 @@ _FIELD = "value:"
 
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
-    def page(
-        request: Request, entry: visit_forms.Form, values: Mapping[str, str], errors: Mapping[str, PblError]
+    async def form(
+        request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
     ) -> Response:
-        language = reader_language(request)
+        entry, language = await tables.ask(visit_forms.scores_form, number_of(request)), reader_language(request)
         scores = {name: in_field(language, entry.values[name]) for name in entry.instruments}
         return pages.show(
             request,
@@ -36,9 +36,6 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             usual_roles=visit_forms.USUAL_ROLES,
         )
 
-    async def form(request: Request) -> Response:
-        return page(request, await tables.ask(visit_forms.scores_form, number_of(request)), {}, {})
-
     async def send(request: Request) -> Response:
         fields = await form_of(request)
         number = number_of(request)
@@ -48,20 +45,19 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             visit_forms.enter_scores, number, values, sender(request), fields.get("seen", ""), reason
         )
         if errors:
-            return page(request, await tables.ask(visit_forms.scores_form, number), values, errors)
+            return await form(request, values, errors)
         return RedirectResponse(f"/visits/{number}#entered", 303)
-
-    async def instruments(request: Request) -> Response:
-        return await instrument_page(request, {}, {})
 
     async def add_instrument(request: Request) -> Response:
         fields = await form_of(request)
         errors = await tables.ask(study_sheets.add_instrument, fields, sender(request))
         if errors:
-            return await instrument_page(request, fields, errors)
+            return await instruments(request, fields, errors)
         return RedirectResponse("/instruments", 303)
 
-    async def instrument_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+    async def instruments(
+        request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
+    ) -> Response:
         rows = await tables.ask(visit_forms.instruments)
         fields = (*study_sheets.TEXTS, *study_sheets.NUMBERS, *study_sheets.FLAGS)
         known = {name: values.get(name, "") for name in fields}

@@ -24,34 +24,28 @@ FORMATS = ("csv", "trc", "mot")
 def routes(asks: Asks, source: Source) -> list[Address]:
     async def export(request: Request) -> Response:
         number, result = number_of(request), shown_of(request)
-
-        def load() -> Visit:
-            return source.to_export(number, result).loaded()
-
-        return await archive_of(await asks.ask(load), f"visit_{number}.zip")
+        visit = await asks.ask(lambda: source.to_export(number, result).loaded())
+        folder = new_folder()
+        try:
+            archive = await asyncio.to_thread(_archive, visit, folder.path)
+        except BaseException:
+            folder.cleanup()
+            raise
+        done = BackgroundTask(folder.cleanup)
+        return FileResponse(archive, media_type="application/zip", filename=f"visit_{number}.zip", background=done)
 
     return [Address("/visits/{session_id:int}/export", export, "look", look="export")]
 
 
-async def archive_of(visit: Visit, name: str) -> Response:
-    """A visit's movement as an archive of that name, in the formats of `FORMATS`."""
-    folder = new_folder()
+def _archive(visit: Visit, folder: Path) -> Path:
+    """Write a visit's movement into an archive in a folder, in the formats of `FORMATS`."""
+    from pbl_pipeline.export import ExportOptions, write_export
 
-    def write() -> Path:
-        from pbl_pipeline.export import ExportOptions, write_export
-
-        # As a reviewer sees it: the files state failed checks.
-        options = ExportOptions(number_trials=True, allow_failed=True)
-        out, archive = folder.path / "files", folder.path / "visit.zip"
-        paths = write_export(visit, FORMATS, out, options)
-        with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
-            for path in paths:
-                file.write(path, path.relative_to(out))
-        return archive
-
-    try:
-        archive = await asyncio.to_thread(write)
-    except BaseException:
-        folder.cleanup()
-        raise
-    return FileResponse(archive, media_type="application/zip", filename=name, background=BackgroundTask(folder.cleanup))
+    # As a reviewer sees it: the files state failed checks.
+    options = ExportOptions(number_trials=True, allow_failed=True)
+    out, archive = folder / "files", folder / "visit.zip"
+    paths = write_export(visit, FORMATS, out, options)
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        for path in paths:
+            file.write(path, path.relative_to(out))
+    return archive

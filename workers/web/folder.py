@@ -18,13 +18,12 @@ from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Held, Rec
 from pbl_pipeline.words import MEASURES
 from schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
 from schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
-from schemas.reading.visit_progress import Progress
 from schemas.subject_codes import day_of
 
 from .access import REPORT_POLICY
 from .address import Address, interval, number_of, page
-from .corrections import Judged
 from .pages import Pages
+from .source import Source
 from .tables import Asks
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ class _Place:
     recordings: dict[str, int]
 
 
-class ResultsFolder:
+class ResultsFolder(Source):
     """Visits below a folder, each a folder with a `session.json` or, of a run that was ended, with fits alone.
 
     Raises `PblError` FILE_MISSING if no results are in it.
@@ -80,7 +79,7 @@ class ResultsFolder:
         return Page(tuple(self._row(number) for number in self._places), None, len(self._places))
 
     def visit(self, number: int, result: int) -> ShownVisit:
-        """Return a visit. Raises `PblError` DB_NOT_FOUND; FILE_MISSING, FILE_FORMAT for files that cannot be read."""
+        """Return as `Source.visit`. Raises `PblError` FILE_MISSING, FILE_FORMAT for files that cannot be read."""
         visit, row = self._visit(number), self._row(number)
         checks = visit.checks if visit.judged is None else visit.judged.checks
         return ShownVisit(
@@ -96,7 +95,7 @@ class ResultsFolder:
         )
 
     def recording(self, number: int) -> ShownRecording:
-        """Return a recording. Raises as `visit`."""
+        """Return as `Source.recording`. Raises as `visit`."""
         of, _ = self._of_recording(number)
         visit = self._visit(of)
         found = next((r for r in visit.recordings if r.number == number), None)
@@ -160,22 +159,6 @@ class ResultsFolder:
     def to_export(self, number: int, result: int) -> Visit:
         """Return a visit. Raises as `visit`."""
         return self._visit(number)
-
-    def people(self, about: ShownRecording) -> tuple[list[Any], list[str]]:
-        """Return nothing: results hold one person."""
-        return [], []
-
-    def judged(self, number: int) -> Judged:
-        """Return nothing: nothing is decided about results in a folder."""
-        return Judged(None, "", 0, None)
-
-    def progress(self, session_id: int) -> Progress:
-        """Return nothing: all is computed."""
-        return Progress(session_id, 0, (), ())
-
-    def around(self, about: ShownVisit) -> dict[str, Any]:
-        """Return nothing: decisions and entered scores are in tables alone."""
-        return {"decisions": None, "accepted": {}, "entry": None, "film": None}
 
     def _place(self, number: int) -> _Place:
         if number not in self._places:

@@ -99,7 +99,8 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
         camera's, in steps. Of each channel second differences, first the low bytes of all, then the high bytes: that
         packs to a third. Frames without a pose repeat the one before.
     """
-    from pbl_pipeline.render import NEAR_M, body_track
+    from pbl_pipeline.render import NEAR_M, body_track, without_jumps
+    from pbl_pipeline.runs import ranges
     from pbl_pipeline.video import turning_radius2
 
     fit = _fit(found)
@@ -108,12 +109,13 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
     known = _finite(track.quat_wxyz) & _finite(track.root_m)
     quat, position = np.asarray(fit.phone_quat_wxyz, float), np.asarray(fit.camera_position_m, float)
     aimed = _finite(quat) & bool(np.isfinite(position).all() and np.isfinite(fit.camera.matrix).all())
+    turning = turning_radius2(fit.camera)
     start = track.root_m[np.argmax(known)] if known.any() else np.zeros(3)
     channels = np.concatenate(
         [
             METRE_STEPS * _held(track.root_m - start, known),
             TURN_STEPS * _held(track.quat_wxyz.reshape(t, -1), known),
-            CAMERA_STEPS * _held(_continuous(quat), aimed),
+            CAMERA_STEPS * _held(without_jumps(quat / np.linalg.norm(quat, axis=1, keepdims=True)), aimed),
         ],
         axis=1,
     )
@@ -127,15 +129,15 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
         "capsules": [[int(b), *np.round(c, 6).tolist()] for b, c in zip(shapes.body, capsules, strict=True)],
         "floor": round(track.floor_m, 4) if np.isfinite(track.floor_m) else None,
         "start": np.round(start, 6).tolist(),
-        "known": _spans(known),
+        "known": ranges(known),
         "steps": {"metre": METRE_STEPS, "turn": TURN_STEPS, "camera": CAMERA_STEPS},
         "camera": {
             "lens": [float(v) for v in (m[0, 0], m[1, 1], m[0, 2], m[1, 2])],
             "distortion": [float(v) for v in fit.camera.distortion],
-            "turning": _number(turning_radius2(fit.camera)),
+            "turning": turning if np.isfinite(turning) else None,
             "near": NEAR_M,
             "position": position.tolist(),
-            "known": _spans(aimed),
+            "known": ranges(aimed),
         }
         if aimed.any()
         else None,
@@ -189,26 +191,8 @@ def _held(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return values[last]
 
 
-def _continuous(quat_wxyz: np.ndarray) -> np.ndarray:
-    """Unit quaternions (T, 4) without changes of sign."""
-    unit = quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True)
-    turned = np.nan_to_num(np.sign(np.sum(unit[1:] * unit[:-1], axis=1, keepdims=True)), nan=1.0)
-    unit[1:] *= np.cumprod(np.where(turned == 0, 1.0, turned), axis=0)
-    return unit
-
-
 def _finite(values: np.ndarray) -> np.ndarray:
     return np.asarray(np.isfinite(values).all(axis=tuple(range(1, values.ndim))), bool)
-
-
-def _spans(mask: np.ndarray) -> list[list[int]]:
-    from pbl_pipeline.runs import runs
-
-    return [[int(r.start), int(r.stop) - 1] for r in runs(mask)]
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _listed(values: np.ndarray) -> list[float | None]:

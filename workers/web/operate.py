@@ -32,8 +32,6 @@ MOST = 100
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Errors of one table and code."""
-
     table: str
     code: str
     errors: tuple[ErrorRow, ...]
@@ -74,7 +72,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
 
 def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:
-    """Errors by table and code, the most first."""
+    """Return errors by table and code, the most first."""
     found: dict[tuple[str, str], list[ErrorRow]] = {}
     for error in errors:
         found.setdefault((error.table, error.code), []).append(error)

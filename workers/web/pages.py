@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jinja2
@@ -27,6 +28,8 @@ from schemas.reading.shown import ShownVisit
 from .access import HEADERS, HOURS, Session
 from .address import JSON
 
+#: Fields of a form that no one has filled in, and their errors.
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 #: The folders of an absolute path in a text.
 _FOLDERS = re.compile(r"(?<![\w:/.])/(?:[^\s/'\"]+/)+(?=[^\s/'\"])")
 _unforeseen = functools.partial(
@@ -167,7 +170,6 @@ class Pages:
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
-        """Return the answer to a coded error."""
         return self.show(request, "error.html", status, error=error)
 
     def missing(self, request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:

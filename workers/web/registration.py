@@ -23,7 +23,7 @@ from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sen
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
-from .pages import Pages, in_field, reader_language
+from .pages import NOTHING, Pages, in_field, reader_language
 from .tables import Tables, on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
@@ -45,9 +45,11 @@ _no_file = functools.partial(
 def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def new(request: Request) -> Response:
         today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
-        return await new_page(request, {"visit": today}, {})
+        return await new_page(request, {"visit": today})
 
-    async def new_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+    async def new_page(
+        request: Request, values: Mapping[str, str], errors: Mapping[str, PblError] = NOTHING
+    ) -> Response:
         known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
         return pages.show(
             request,
@@ -65,14 +67,12 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         if errors:
             return await new_page(request, fields, errors)
         if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
-            for visit in await tables.ask(_visits_of_person_of, number):
-                await tables.ask(queue_visit, visit)
+            await tables.ask(_queue_visits_of_person, number)
         return RedirectResponse(f"/visits/{number}", 303)
 
-    async def facts(request: Request) -> Response:
-        return await facts_page(request, {}, {})
-
-    async def facts_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError]) -> Response:
+    async def facts(
+        request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
+    ) -> Response:
         from pbl_pipeline.gait import ACTIVITIES, PACES
 
         stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
@@ -93,10 +93,9 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
         changed, errors = await tables.ask(visit_forms.correct_facts, number, fields, sender(request), seen, reason)
         if errors:
-            return await facts_page(request, fields, errors)
+            return await facts(request, fields, errors)
         if changed:
-            for visit in await tables.ask(_visits_of_person_of, number) if "height_m" in changed else [number]:
-                await tables.ask(queue_visit, visit)
+            await tables.ask(_queue_visits_of_person if "height_m" in changed else queue_visit, number)
         return RedirectResponse(f"/visits/{number}", 303)
 
     async def upload(request: Request) -> Response:
@@ -229,9 +228,10 @@ async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | N
         return None
 
 
-def _visits_of_person_of(session_id: int) -> list[int]:
+def _queue_visits_of_person(session_id: int) -> None:
     subject = (sessions.Session & {"session_id": session_id}).fetch1("subject")
-    return [int(n) for n in (sessions.Session & {"subject": subject}).to_arrays("session_id")]
+    for visit in (sessions.Session & {"subject": subject}).to_arrays("session_id"):
+        queue_visit(int(visit))
 
 
 def _populations() -> list[str]:

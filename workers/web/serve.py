@@ -188,7 +188,6 @@ def serve(
 
 
 def config(app: object, where: Where) -> uvicorn.Config:
-    """Return the configuration of uvicorn."""
     proxy = ipaddress.ip_network(where.behind_proxy, strict=False) if where.behind_proxy else None
     limits = {"per_address": None if proxy else _OF_ONE, "only_from": proxy, "tls": where.tls()}
     return uvicorn.Config(

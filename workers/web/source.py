@@ -62,7 +62,7 @@ class Source(Protocol):
     """Visits and recordings by their numbers, for the pages that both sources have.
 
     All methods may be slow: they are called away from the loop that answers browsers. An unknown number is a `PblError`
-    DB_NOT_FOUND.
+    DB_NOT_FOUND. A source in which nothing is computed or decided inherits the last four.
     """
 
     def visit(self, number: int, result: int, /) -> shown.ShownVisit: ...
@@ -85,19 +85,19 @@ class Source(Protocol):
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
         """Return the candidates for the measured person by tracking method, and the state that is shown."""
-        ...
+        return [], []
 
     def judged(self, number: int, /) -> Judged:
         """Return the decisions about a recording."""
-        ...
+        return Judged(None, "", 0, None)
 
     def progress(self, session_id: int, /) -> Progress:
         """Return the pending computations of a visit."""
-        ...
+        return Progress(session_id, 0, (), ())
 
     def around(self, about: shown.ShownVisit) -> dict[str, Any]:
         """Return the surroundings of a visit on its page: decisions, accepted checks, entered scores."""
-        ...
+        return {"decisions": None, "accepted": {}, "entry": None, "film": None}
 
 
 class TablesSource:

@@ -26,7 +26,6 @@ class Files:
     """Asks questions of files, several at a time."""
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:
-        """The answer of a function that reads files."""
         return await asyncio.to_thread(question, *args)
 
 

@@ -29,15 +29,17 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
         title = title or texts.text(language, "visit.gdi")
         label = texts.text(language, "trend.chart", name=title, n=len(found.points))
         picture = _chart(label, found.points, found.measure == INDEX)
-        values = {
-            "found": found,
-            "title": title,
-            "unit": unit,
-            "decimals": decimals,
-            "picture": picture and texts.in_chart(language, picture),
-            "index": INDEX,
-        }
-        return pages.show(request, "trend.html", here=number_of(request), **values)
+        return pages.show(
+            request,
+            "trend.html",
+            here=number_of(request),
+            found=found,
+            title=title,
+            unit=unit,
+            decimals=decimals,
+            picture=picture and texts.in_chart(language, picture),
+            index=INDEX,
+        )
 
     return page("/visits/{session_id:int}/trend", trend, "look", look="trend")
 
