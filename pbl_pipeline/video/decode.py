@@ -18,7 +18,7 @@ from av.container import InputContainer
 from av.error import FFmpegError
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.resources import cores, return_large_blocks
+from pbl_pipeline.resources import cores, keep_large_blocks
 
 from .container_tags import family, missing_end, photo_format
 
@@ -85,7 +85,7 @@ class Decoder:
     """
 
     def __init__(self, path: Path, threads: int | None = None, exact: bool = False) -> None:
-        return_large_blocks()
+        keep_large_blocks(False)
         self.path = path
         self.notes: list[str] = []
         self.container = _open(path)

@@ -1,25 +1,21 @@
 """Decoded pictures of one video in memory, so that probe, tracking and keypoints share one decoding.
 
 Decoding takes as long as all their other work outside the networks. Pictures are kept within `frames_kept` if those of
-the whole video fit into this process's share of the memory; longer videos are decoded each time.
-
-They are copied into memory that held those of the recording before: clearing new memory takes the system several times
-as long as the copy.
+the whole video fit into this process's share of the memory; longer videos are decoded each time. Meanwhile the memory
+of freed pictures stays with the process for those of the next recording.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import weakref
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
 import av
-import numpy as np
 
-from pbl_pipeline.resources import share_of_memory
+from pbl_pipeline.resources import keep_large_blocks, return_free_memory, share_of_memory
 
 from .decode import Decoder
 
@@ -42,12 +38,7 @@ class _Shelf:
     def __init__(self) -> None:
         self.wanted = 0
         self.pictures: Pictures | None = None
-        self.blocks: list[np.ndarray] = []  # memory of released pictures
-
-    def return_block(self, block: np.ndarray) -> None:
-        """Keep the memory of a picture that was freed, while pictures are to be kept."""
-        if self.wanted:
-            self.blocks.append(block)
+        self.size = 0  # bytes of a picture
 
 
 _shelf = _Shelf()
@@ -69,7 +60,8 @@ def release_frames(memory: bool = True) -> None:
     """Release the kept pictures; without `memory`, theirs stays with this process for those of the next recording."""
     _shelf.pictures = None
     if memory:
-        _shelf.blocks = []
+        keep_large_blocks(False)
+        return_free_memory()
 
 
 def kept(path: Path) -> Pictures | None:
@@ -82,44 +74,23 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield the pictures of a decoder, and keep them if that is wanted and the end is reached."""
     release_frames(memory=False)
     room = share_of_memory() * _FRACTION if _shelf.wanted else 0.0
+    keep_large_blocks(room > 0)
     file, stamped = _identity(decoder.path), []
     for pts, frame in decoder:
+        size = sum(plane.buffer_size for plane in frame.planes)
+        if size != _shelf.size:  # the places of the last ones do not suit
+            return_free_memory()
+            _shelf.size = size
         # The memory of a reference picture counts in full, although the decoder also holds it.
-        room -= sum(plane.buffer_size for plane in frame.planes)
+        room -= size
         if room >= 0:
-            # The first one states the orientation, which the copy does not.
-            stamped.append((pts, _in_used_memory(frame) if stamped else frame))
-        else:
+            stamped.append((pts, frame))
+        elif stamped:
             stamped.clear()
             release_frames()
         yield pts, frame
     if room >= 0:
         _shelf.pictures = Pictures(file, decoder.time_base, stamped)
-
-
-def _in_used_memory(frame: av.VideoFrame) -> av.VideoFrame:
-    """Return a copy of a picture in a block of released memory; the picture itself in a format that PyAV does not take
-    from arrays, or whose conversion uses facts that PyAV does not copy (10 bits: where the colour samples lie)."""
-    ends, blocks = np.cumsum([plane.buffer_size for plane in frame.planes]), _shelf.blocks
-    fits = len(ends) == 3 and not frame.interlaced_frame and frame.format.components[0].bits == 8
-    if blocks and not (fits and len(blocks[-1]) == ends[-1]):
-        blocks.clear()
-    if not fits:
-        return frame
-    block = blocks.pop() if blocks else np.empty(ends[-1], np.uint8)
-    planes = []
-    for plane, part in zip(frame.planes, np.split(block, ends[:-1]), strict=True):
-        part[:] = np.frombuffer(memoryview(plane), np.uint8)
-        planes.append(part.reshape(plane.height, -1)[:, : plane.width])
-    try:
-        copy = av.VideoFrame.from_dlpack(planes, frame.format.name)
-    except (NotImplementedError, ValueError):  # odd sizes, and formats without a plane for each component
-        return frame
-    copy.colorspace, copy.color_range = frame.colorspace, frame.color_range
-    copy.color_trc, copy.color_primaries = frame.color_trc, frame.color_primaries
-    # The last array that the copy holds is freed with it.
-    weakref.finalize(planes[-1], _shelf.return_block, block).atexit = False
-    return copy
 
 
 def _identity(path: Path) -> tuple[object, ...]:

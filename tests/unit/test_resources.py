@@ -13,7 +13,7 @@ import pytest
 from pbl_pipeline import assets, resources
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.limited import LimitExceeded, limited
-from pbl_pipeline.resources import return_large_blocks
+from pbl_pipeline.resources import keep_large_blocks
 from schemas.operations.embedded import process
 from tests.command import pbl
 from tests.ended_process import Ended
@@ -157,10 +157,10 @@ def test_the_database_is_sized_to_the_machine(sixteen, tmp_path: Path, monkeypat
 PROGRAM = """
 import sys
 import numpy as np
-from pbl_pipeline.resources import return_large_blocks
+from pbl_pipeline.resources import keep_large_blocks
 
-if sys.argv[1] == "fixed":
-    assert return_large_blocks()
+if sys.argv[1:]:
+    assert keep_large_blocks(sys.argv[1] == "kept")
 first = np.ones(6_220_800, np.uint8)
 del first
 place = np.ones(6_220_800, np.uint8).ctypes.data
@@ -169,16 +169,11 @@ print(int(heap[0], 16) <= place < int(heap[1], 16))
 """
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the C library's limit is that of Linux")
-def test_pictures_are_kept_out_of_the_heap():
-    if not return_large_blocks():
-        pytest.skip("another C library than glibc")
-
-    def in_heap(how: str) -> str:
-        done = subprocess.run([sys.executable, "-c", PROGRAM, how], capture_output=True, text=True, check=True)
-        return done.stdout.strip()
-
-    assert (in_heap("free"), in_heap("fixed")) == ("True", "False")
+@pytest.mark.skipif(not keep_large_blocks(False), reason="another C library than glibc")
+@pytest.mark.parametrize(("how", "expected"), [((), "True"), (("kept",), "True"), (("returned",), "False")])
+def test_pictures_are_kept_out_of_the_heap(how: tuple[str, ...], expected: str):
+    done = subprocess.run([sys.executable, "-c", PROGRAM, *how], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == expected
 
 
 # --- A function that takes too long or too much is ended; what it raises arrives.

@@ -735,33 +735,31 @@ def test_kept_pictures_are_those_of_the_file(monkeypatch: pytest.MonkeyPatch, vi
     assert decodes(monkeypatch, video)
 
 
-@pytest.mark.parametrize(
-    ("codec", "pixel_format", "copied"),
-    [("libx264", "yuv420p", 7), ("libx264", "yuv444p", 7), ("libx265", "yuv420p10le", 0)],
-)
-def test_pictures_in_memory_that_is_used_again_are_those_of_the_file(
-    tmp_path: Path, codec: str, pixel_format: str, copied: int
-) -> None:
-    # Pictures of a single colour would not show that samples are in another place.
-    noise = np.random.default_rng(0).integers(0, 256, (8, 122, 162, 3), np.uint8)
-    paths = [
-        write_video(tmp_path / f"{i}.mp4", noise[::step], constant_rate(8), codec, pixel_format=pixel_format)
-        for i, step in enumerate((1, -1))
-    ]
-    expected = [pictures(path) for path in paths]
+def test_memory_of_kept_pictures_stays_for_the_next_ones_alone(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+    stays = list[bool]()
+    for room in (kept, decode):
+        monkeypatch.setattr(room, "keep_large_blocks", stays.append)
+    probe(video)
+    assert not stays[-1]
     with frames_kept():
-        probe(paths[0])
+        probe(video)
         release_frames(memory=False)
-        blocks = list(kept._shelf.blocks)
-        assert len(blocks) == copied
-        for path, before in zip(paths, expected, strict=True):
-            probe(path)
-            assert not kept._shelf.blocks
-            for (_, _, image), (_, _, other) in zip(before, pictures(path), strict=True):
-                np.testing.assert_array_equal(image, other)
-        release_frames(memory=False)
-        assert {id(b) for b in kept._shelf.blocks} == {id(b) for b in blocks}
-    assert not kept._shelf.blocks
+        assert stays[-1]
+        pictures(other_video(video))  # is decoded again each time
+        assert not stays[-1]
+        probe(video)
+        assert stays[-1]
+        monkeypatch.setattr(kept, "share_of_memory", lambda: 8e5)  # for some of the pictures
+        probe(video)
+        assert not stays[-1]
+        monkeypatch.setattr(kept, "share_of_memory", lambda: 2**30)
+        probe(video)
+        assert stays[-1]
+    assert not stays[-1]
+
+
+def other_video(video: Path) -> Path:
+    return Path(shutil.copy(video, video.with_name("b.mp4")))
 
 
 def test_nothing_is_kept_unless_asked_for(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
@@ -770,8 +768,7 @@ def test_nothing_is_kept_unless_asked_for(monkeypatch: pytest.MonkeyPatch, video
 
 
 def test_another_file_and_a_changed_one_are_decoded(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
-    other = video.with_name("b.mp4")
-    shutil.copy(video, other)
+    other = other_video(video)
     with frames_kept():
         probe(video)
         assert decodes(monkeypatch, other)
@@ -787,7 +784,6 @@ def test_a_released_one_and_one_without_room_are_decoded(monkeypatch: pytest.Mon
         for room in (2e5, 8e5):  # for none, and for some of the pictures
             monkeypatch.setattr(kept, "share_of_memory", lambda room=room: room)
             probe(video)
-            assert not kept._shelf.blocks
             assert decodes(monkeypatch, video)
 
 
