@@ -33,6 +33,7 @@ class Unknowns(enum.Enum):
     JOINT_IN_THREE_FRAMES = "a joint in three frames"
     SOLE_AND_FLOOR = "joints, scale, floor"
     SOLE_IN_TWO_FRAMES = "joints of two frames, scale"
+    SHARED = "what all frames share"
 
 
 class Phone(NamedTuple):
@@ -162,6 +163,7 @@ class SharedTerm:
     #: Parameter of the weight; "": 1.
     weight: str
     cost: Callable[[At], Array]
+    unknowns: Unknowns = Unknowns.SHARED
 
     def value(self, at: At) -> Float[Array, ""]:
         return weight_of(self, at) * self.cost(at)

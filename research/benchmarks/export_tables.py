@@ -21,7 +21,6 @@ from research.benchmarks.export import resident_mib
 from tests.command import pbl
 from tests.database import installation
 from tests.integration import chain
-from tests.integration.test_export_tables import fit_with_markers
 from tests.rows import register
 
 #: Columns that are another visit's in a copy: the value of visit number `s.seq`.
@@ -56,13 +55,12 @@ def main(visits: tuple[int, ...], formats: tuple[str, ...]) -> None:
 
 def _first(home: Path, patch: pytest.MonkeyPatch) -> None:
     """The visit whose rows are copied."""
-    import pbl_pipeline.fit
     import schemas
     from workers.populate import populate
 
     schemas.activate()
     chain.install(patch)
-    patch.setattr(pbl_pipeline.fit, "fit_session", fit_with_markers)
+    chain.change_fits(patch, chain.with_all_markers)
     register(chain.small_video(home, "walk"), subject="S0", session_label="1")
     populate()
 

@@ -158,10 +158,12 @@ def film_of(visit: int) -> VideoInfo:
     return probe((video.Video & {"session_id": visit}).fetch1("video_path"))
 
 
-def arrived(page: Any) -> None:
+def arrived(page: Any, seconds: float = 30) -> None:
     """The server has one recording."""
     page.wait_for_function(
-        "() => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === 1"
+        "n => [...document.querySelectorAll('.takes li')].filter((e) => /server has/.test(e.textContent)).length === n",
+        arg=1,
+        timeout=1000 * seconds,
     )
 
 
