@@ -252,5 +252,5 @@ def suspicious(session: Session, qpos: Float[np.ndarray, "F Q"]) -> bool:
     used = np.asarray(session.problem.weight) > 0
     high = np.asarray(session.body.joint_range_rad)[:, 1]
     knees = [i for i, n in enumerate(session.body.joint_names) if n.startswith("knee_angle")]
-    straight = np.mean(qpos[used][:, knees] > high[knees] - np.deg2rad(1.0), axis=0)
-    return bool(np.mean(straight) > BACKWARDS_FRACTION)
+    straight = qpos[used][:, knees] > high[knees] - np.deg2rad(1.0)
+    return bool(knees) and bool(np.mean(straight) > BACKWARDS_FRACTION)  # another body may have none

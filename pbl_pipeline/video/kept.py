@@ -73,9 +73,11 @@ def kept(path: Path) -> Pictures | None:
 def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield the pictures of a decoder, and keep them if that is wanted and the end is reached."""
     release_frames(memory=False)
-    room = share_of_memory() * _FRACTION if _shelf.wanted else 0.0
-    keep_large_blocks(room > 0)
-    file, stamped = _identity(decoder.path), []
+    if not _shelf.wanted:
+        yield from decoder
+        return
+    keep_large_blocks(True)
+    room, file, stamped = share_of_memory() * _FRACTION, _identity(decoder.path), []
     for pts, frame in decoder:
         size = sum(plane.buffer_size for plane in frame.planes)
         if size != _shelf.size:  # the places of the last ones do not suit
@@ -85,7 +87,7 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
         room -= size
         if room >= 0:
             stamped.append((pts, frame))
-        elif stamped:
+        elif room + size >= 0:  # the first one too many
             stamped.clear()
             release_frames()
         yield pts, frame

@@ -32,7 +32,7 @@ from research.clip_keypoints import clip_keypoints
 SURE = 0.5
 
 
-#: What a process keeps open until it ends.
+#: Contexts that stay open until the process ends.
 _OPEN = contextlib.ExitStack()
 
 
