@@ -1,6 +1,6 @@
 """Small test videos made with PyAV: exact time stamps, a rotation flag, and any content."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -81,3 +81,10 @@ def numbered_frames(n: int, height: int = 64, width: int = 96) -> Iterable[np.nd
 def constant_rate(n: int, fps: float = 30.0) -> np.ndarray:
     """Times of `n` frames at `fps`, first at 0 (s)."""
     return np.arange(n) / fps
+
+
+def noise_frames(n: int) -> Iterator[np.ndarray]:
+    """Pictures that do not compress, so that every part of the file is picture data."""
+    rng = np.random.default_rng(1)
+    for _ in range(n):
+        yield rng.integers(0, 255, (64, 96, 3), np.uint8)

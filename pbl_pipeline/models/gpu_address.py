@@ -1,4 +1,4 @@
-"""Address and start of the process that owns the GPU for detection; the first process that needs it starts it.
+"""Address and start of the process that owns the GPU for detection and decoding; the first that needs it starts it.
 
 It is separate because many processes that decode share one GPU, and ends by itself after a while without connections.
 """
@@ -18,6 +18,8 @@ from pbl_pipeline.temporary import private_folder
 
 #: Time after which a GPU process that does not listen has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
+#: First line of a connection whose videos are decoded.
+DECODING = {"decoding": True}
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
@@ -56,7 +58,8 @@ def running_server() -> str:
 def _name() -> str:
     """Name of the process for this code and the GPUs that this process may use."""
     here = Path(__file__).parent
-    code = b"".join((here / name).read_bytes() for name in ("gpu_server.py", "network.py", "tflite_jax.py"))
+    names = ("gpu_server.py", "network.py", "nvdec.py", "tflite_jax.py")
+    code = b"".join((here / name).read_bytes() for name in names)
     seen = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
     return hashlib.sha256(code + seen.encode() + sys.executable.encode()).hexdigest()[:16]
 

@@ -1,14 +1,20 @@
-"""The process that owns the GPU for detection: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
+"""The process that owns the GPU for detection and decoding: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
 
-Each connection is of one network: a line of JSON with its `NetworkSpec`, answered by one; then the bytes of pictures,
-each answered with the network's outputs as float32 in the order of the pictures. The pictures that wait on all
-connections of a network are one batch. Each network has one batch size, so that one program is compiled for it; a batch
-that is not full is padded, and a picture's result does not depend on the others.
+Each connection is of one network, or of a process that reads videos. It begins with a line of JSON, answered by one.
+
+- A network: its `NetworkSpec`; then the bytes of pictures, each answered with the network's outputs as float32 in the
+  order of the pictures. The pictures that wait on all connections of a network are one batch. Each network has one
+  batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's result does
+  not depend on the others.
+- A reader of videos: `DECODING`; then the file of its memory, and for each video a line of JSON and its packets. The
+  pictures are written into that memory, and the answer is a line with their stamps. Networks and decoder share the
+  process, because the GPU would serve two in turns.
 """
 
 from __future__ import annotations
 
 import json
+import mmap
 import os
 import selectors
 import socket
@@ -17,13 +23,15 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from pbl_pipeline.errors import PblError
 
+from .gpu_address import DECODING
 from .network import NetworkSpec, batches, receive, receive_line, send_line
+from .nvdec import Nvdec
 from .tflite import LiteModel, read_network
 
 #: Pictures in one call of a network, and the least if the GPU's memory does not suffice.
@@ -32,8 +40,8 @@ BATCH, LEAST_BATCH = 16, 4
 IDLE_S = 60.0
 #: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
-#: Number of networks that use the device at a time.
-_AT_ONCE = 2
+#: Number of networks that use the device at a time, and of videos that are decoded.
+_AT_ONCE, _VIDEOS_AT_ONCE = 2, int(os.environ.get("PBL_EXP_VIDEOS", "8"))
 
 
 class Program:
@@ -169,7 +177,14 @@ class _Served:
 class Server:
     """Serves networks at an address until it is closed or has had no connection for `idle_s`."""
 
-    def __init__(self, address: str, any_device: bool = False, idle_s: float = IDLE_S, batch: int = BATCH) -> None:
+    def __init__(
+        self,
+        address: str,
+        any_device: bool = False,
+        idle_s: float = IDLE_S,
+        batch: int = BATCH,
+        decoder: Nvdec | None = None,
+    ) -> None:
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(address)
         self._listener.listen(256)
@@ -177,7 +192,8 @@ class Server:
         self._served: dict[NetworkSpec, _Served] = {}
         self._locks: dict[NetworkSpec, threading.Lock] = {}
         self._device = threading.Semaphore(_AT_ONCE)
-        self._opening = 0
+        self._decoder, self._decoding = decoder, threading.Semaphore(_VIDEOS_AT_ONCE)
+        self._opening = self._n_readers = 0
         # Programs of several networks compile in parallel.
         self._openers = ThreadPoolExecutor(16)
 
@@ -201,6 +217,9 @@ class Server:
         self._opening += 1
         try:
             given = json.loads(receive_line(connection))
+            if given == DECODING:
+                threading.Thread(target=self._read_videos, args=[connection], daemon=True).start()
+                return
             outputs = None if given["outputs"] is None else tuple(given["outputs"])
             spec = NetworkSpec(**(given | {"outputs": outputs}))
             try:
@@ -221,12 +240,43 @@ class Server:
         finally:
             self._opening -= 1
 
+    def _read_videos(self, connection: socket.socket) -> None:
+        """Decode the videos of a process until it ends the connection."""
+        self._n_readers += 1
+        try:
+            with connection, connection.makefile("rb") as asked:
+                if self._decoder is None:
+                    send_line(connection, {"error": "the GPU has no decoder"})
+                    return
+                send_line(connection, {})
+                _, (file,), _, _ = socket.recv_fds(connection, 1, 1)
+                memory = np.frombuffer(mmap.mmap(file, 0), np.uint8)
+                os.close(file)
+                with self._decoder.pinned(memory):
+                    while line := asked.readline():
+                        send_line(connection, self._decode(self._decoder, json.loads(line), asked, memory))
+        except (OSError, RuntimeError, ValueError) as error:  # the reader falls back to FFmpeg
+            sys.stderr.write(f"no further videos are decoded for a process: {error}\n")
+        finally:
+            self._n_readers -= 1
+
+    def _decode(self, decoder: Nvdec, asked: dict[str, Any], source: BinaryIO, memory: np.ndarray) -> dict[str, Any]:
+        """Decode a video into the beginning of `memory`; return its answer."""
+        packets = [(stamp, source.read(n)) for stamp, n in zip(asked["stamps"], asked["lengths"], strict=True)]
+        n, (width, height) = len(packets), asked["size_px"]
+        into = memory[: n * height * 3 // 2 * width].reshape(n, height * 3 // 2, width)
+        try:
+            with self._decoding:
+                return {"stamps": decoder.decode(asked["codec"], (width, height), packets, into)}
+        except RuntimeError as error:
+            return {"error": str(error)}
+
     def _watch(self) -> None:
         """End the process when it is no longer used."""
         last = time.monotonic()
         while time.monotonic() - last < self._idle_s:
             time.sleep(min(1.0, self._idle_s / 4))
-            if self._opening or any(s.n_connections for s in list(self._served.values())):
+            if self._opening or self._n_readers or any(s.n_connections for s in list(self._served.values())):
                 last = time.monotonic()
         self.close()
         os._exit(0)
@@ -238,13 +288,18 @@ def main() -> None:
     address.unlink(missing_ok=True)
     from pbl_pipeline.jax_setup import configure
 
+    try:
+        decoder = Nvdec()  # before JAX, which would choose how threads wait for the GPU
+    except RuntimeError as error:
+        sys.stderr.write(f"videos are not decoded on the GPU: {error}\n")
+        decoder = None
     configure()
     import jax
 
     device = jax.devices()[0]
     if device.platform != "gpu":
         raise SystemExit(f"JAX finds no GPU, only {device.device_kind}")
-    Server(str(address)).run()
+    Server(str(address), decoder=decoder).run()
 
 
 if __name__ == "__main__":

@@ -95,6 +95,8 @@ class Decoder:
         self.stream.codec_context.thread_count = min(threads or min(cores(), _MAX_THREADS), room)
         self.stream.codec_context.options = _MAX_PIXELS  # also refuses pictures that are larger than announced
         self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
+        #: Its pictures in order, where the GPU has decoded them; the packets are then only counted.
+        self.pictures: list[av.VideoFrame] | None = None
         self.n_frames = 0
         self._first_pts: int | None = None
         self._last_pts: int | None = None
@@ -118,7 +120,16 @@ class Decoder:
         return self.stream.frames
 
     def __iter__(self) -> Iterator[tuple[int, av.VideoFrame]]:
+        for frame in self._frames():
+            pts = self._accept(frame)
+            if pts is not None:
+                yield pts, frame
+        self._check()
+
+    def _frames(self) -> Iterator[av.VideoFrame]:
         for packet in self._packets():
+            if self.pictures is not None:
+                continue
             try:
                 frames = self.stream.decode(packet)
             except FFMPEG_ERRORS:
@@ -128,11 +139,8 @@ class Decoder:
                 else:
                     self._n_damaged_at_start += 1
                 continue
-            for frame in frames:
-                pts = self._accept(frame)
-                if pts is not None:
-                    yield pts, frame
-        self._check()
+            yield from frames
+        yield from self.pictures or []
 
     def packet_stamps(self) -> list[int]:
         """Stamps of the pictures in the order of the file, without decoding; to be called instead of iterating."""

@@ -17,6 +17,7 @@ import av
 
 from pbl_pipeline.resources import keep_large_blocks, return_free_memory, share_of_memory
 
+from . import gpu_decoding
 from .decode import Decoder
 
 #: Largest fraction of the process's share of the memory for pictures.
@@ -62,6 +63,7 @@ def release_frames(memory: bool = True) -> None:
     if memory:
         keep_large_blocks(False)
         return_free_memory()
+        gpu_decoding.release()
 
 
 def kept(path: Path) -> Pictures | None:
@@ -78,6 +80,7 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
         return
     keep_large_blocks(True)
     room, file, stamped = share_of_memory() * _FRACTION, _identity(decoder.path), []
+    decoder.pictures = gpu_decoding.decoded(decoder.path, decoder.stream.index, room)
     for pts, frame in decoder:
         size = sum(plane.buffer_size for plane in frame.planes)
         if size != _shelf.size:  # the places of the last ones do not suit

@@ -39,7 +39,7 @@ from tests import refused
 from tests.guard import guarded
 from tests.integration import chain
 from tests.quicktime import box
-from tests.videos import constant_rate, numbered_frames, write_video
+from tests.videos import constant_rate, noise_frames, numbered_frames, write_video
 
 VARIABLE_S = np.cumsum(np.r_[0.0, np.random.default_rng(0).uniform(0.01, 0.05, 39)])
 
@@ -48,13 +48,6 @@ def grey(frame: Frame) -> int:
     """The number that `numbered_frames` wrote into the middle of the picture."""
     h, w = frame.image.shape[:2]
     return round(float(frame.image[h // 2 - 4 : h // 2 + 4, w // 2 - 4 : w // 2 + 4].mean()) / 8)
-
-
-def noise_frames(n: int) -> Iterator[np.ndarray]:
-    """Pictures that do not compress, so that every part of the file is picture data."""
-    rng = np.random.default_rng(1)
-    for _ in range(n):
-        yield rng.integers(0, 255, (64, 96, 3), np.uint8)
 
 
 def stream_in(

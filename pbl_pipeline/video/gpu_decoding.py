@@ -1,0 +1,146 @@
+"""Decoding by the process that owns the GPU (`models.gpu_server`), of all pictures of a video at once.
+
+The decoder of the GPU makes the same pictures as FFmpeg's, to the last bit, and states whether each decoded without an
+error. Where anything is unusual or damaged, FFmpeg decodes the file and states what it is.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import re
+import socket
+import weakref
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.bitstream import BitStreamFilterContext
+from av.container import InputContainer
+from av.error import FFmpegError
+
+from pbl_pipeline.models import gpu_address
+from pbl_pipeline.models.devices import asked_device
+from pbl_pipeline.models.gpu_address import DECODING
+from pbl_pipeline.models.network import receive_line, send_line
+from pbl_pipeline.models.nvdec import CODECS
+
+#: Formats of the pictures: colour at half the resolution, 8 bits.
+_FORMATS = ("yuv420p", "yuvj420p")
+#: Time to wait for the pictures of a video (s) before FFmpeg decodes it.
+_PATIENCE_S = 120.0
+#: What no coded picture contains (ITU-T H.264, 7.4.1; H.265, 7.4.2): a part of the file is missing. The decoder of the
+#: GPU does not notice all such places.
+_ZEROS = re.compile(rb"\0\0\0[^\1]")
+
+
+class _Connection:
+    """A connection, and memory that is shared with the process that owns the GPU, for the pictures of one video."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(_PATIENCE_S)
+        self._socket.connect(gpu_address.running_server())
+        send_line(self._socket, DECODING)
+        self._receive()
+        file = os.memfd_create("pictures")
+        try:
+            os.ftruncate(file, size)
+            self._memory = mmap.mmap(file, size)
+            # The kernel clears its pages now and here; the other process would do it for one reader after another.
+            np.frombuffer(self._memory, np.uint8)[:: mmap.PAGESIZE] = 0
+            socket.send_fds(self._socket, [b"m"], [file])
+        finally:
+            os.close(file)
+        self._last: weakref.ref[np.ndarray] | None = None
+
+    def free(self) -> bool:
+        """True if no picture of the last video is used any more."""
+        return self._last is None or self._last() is None
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def decode(self, codec: str, like: av.VideoFrame, packets: list[tuple[int, bytes]]) -> list[av.VideoFrame]:
+        """Return the pictures of `packets` in the order of showing, of the size and format of `like`.
+
+        Raises RuntimeError: not all pictures decode without an error.
+        """
+        stamps, pieces = zip(*packets, strict=True)
+        n, width, height = len(packets), like.width, like.height
+        asked = {"codec": codec, "size_px": (width, height), "stamps": stamps, "lengths": [len(p) for p in pieces]}
+        send_line(self._socket, asked)
+        self._socket.sendall(b"".join(pieces))
+        found = self._receive()["stamps"]
+        if found != sorted(stamps):
+            raise RuntimeError(f"{len(found)} pictures of {n} packets, or other stamps")
+        memory = np.frombuffer(self._memory, np.uint8, n * height * 3 // 2 * width)
+        self._last = weakref.ref(memory)
+        frames = []
+        for stamp, picture in zip(found, memory.reshape(n, height * 3 // 2, width), strict=True):
+            colours = picture[height:]
+            pairs = colours.reshape(height // 2, width // 2, 2)
+            colours.reshape(2, height // 2, width // 2)[:] = cv2.split(pairs)  # one after the other, as FFmpeg's
+            frame = av.VideoFrame.from_numpy_buffer(picture, like.format.name)
+            frame.pts, frame.color_range, frame.colorspace = stamp, like.color_range, like.colorspace
+            frames.append(frame)
+        return frames
+
+    def _receive(self) -> dict:
+        answer = json.loads(receive_line(self._socket))
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer
+
+
+_connection: _Connection | None = None
+
+
+def release() -> None:
+    """Give back the memory of the pictures."""
+    global _connection
+    if _connection is not None:
+        _connection.close()
+        _connection = None
+
+
+def decoded(path: Path, stream_index: int, room: float) -> list[av.VideoFrame] | None:
+    """Decode all pictures of a video file, in the order of showing; None where FFmpeg has to decode it.
+
+    They lie in the memory of those before, if these are no longer used. `room`: bytes that they may take.
+    """
+    if asked_device() == "cpu" or not gpu_address.gpu_visible():
+        return None
+    try:
+        with av.open(str(path)) as container:
+            return _decoded(container, container.streams[stream_index], room)
+    except (EOFError, FFmpegError, OSError, RuntimeError, StopIteration, ValueError):
+        release()
+        return None
+
+
+def _decoded(container: InputContainer, stream: av.VideoStream, room: float) -> list[av.VideoFrame] | None:
+    global _connection
+    codec = stream.codec_context.name
+    packets = [p for p in container.demux(stream) if p.size]
+    stamps = [p.pts for p in packets]  # the filter empties the packets
+    if codec not in CODECS or None in stamps or any(p.is_corrupt or p.is_discard for p in packets):
+        return None
+    stream.codec_context.thread_count = 1
+    first = next(frame for p in packets for frame in stream.decode(p))
+    size = len(packets) * first.width * first.height * 3 // 2
+    if first.format.name not in _FORMATS or first.width % 2 or first.height % 2 or size > room:
+        return None
+    to_annex_b = BitStreamFilterContext(f"{codec}_mp4toannexb", stream)
+    pieces = [bytes(q) for p in packets for q in to_annex_b.filter(p)]
+    if any(_ZEROS.search(piece) for piece in pieces):
+        return None
+    if _connection is None or _connection.size < size or not _connection.free():
+        release()
+        _connection = _Connection(size)
+    frames = _connection.decode(codec, first, list(zip(stamps, pieces, strict=True)))
+    same = frames[0].pts == first.pts and np.array_equal(frames[0].to_ndarray(), first.to_ndarray())
+    return [first, *frames[1:]] if same else None
