@@ -18,7 +18,11 @@ from pbl_pipeline import settings
 #: Programs that compile faster than this are not worth a file.
 MIN_COMPILE_SECONDS = 0.3
 #: Flags of XLA (see `configure`).
-FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
+FLAGS = (
+    "--xla_gpu_autotune_level=0",
+    "--xla_gpu_enable_triton_gemm=false",
+    "--xla_cpu_use_fusion_emitters=false",
+)
 
 
 @functools.cache
@@ -44,8 +48,9 @@ def configure() -> None:
     _default("jax_persistent_cache_min_entry_size_bytes", -1)
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
-    # neither: 0.98 s and 14 s). Read when the first device is asked for. The networks have no convolutions
-    # (`models.tflite_jax`), which would need the trials.
+    # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
+    # On a CPU, XLA's newer compiler of fused operations takes longer for programs that are no faster
+    # (docs/benchmarks.md). Read when the first device is asked for.
     for flag in FLAGS:
         flags = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in flags:

@@ -41,7 +41,7 @@ IDLE_S = 60.0
 #: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
 #: Number of networks that use the device at a time, and of videos that are decoded.
-_AT_ONCE, _VIDEOS_AT_ONCE = 2, int(os.environ.get("PBL_EXP_VIDEOS", "8"))
+_AT_ONCE, _VIDEOS_AT_ONCE = 2, 8
 
 
 class Program:

@@ -116,7 +116,8 @@ def decoded(path: Path, stream_index: int, room: float) -> list[av.VideoFrame] |
         return None
     try:
         with av.open(str(path)) as container:
-            return _decoded(container, container.streams[stream_index], room)
+            stream = next(s for s in container.streams.video if s.index == stream_index)
+            return _decoded(container, stream, room)
     except (EOFError, FFmpegError, OSError, RuntimeError, StopIteration, ValueError):
         release()
         return None
@@ -126,8 +127,9 @@ def _decoded(container: InputContainer, stream: av.VideoStream, room: float) -> 
     global _connection
     codec = stream.codec_context.name
     packets = [p for p in container.demux(stream) if p.size]
-    stamps = [p.pts for p in packets]  # the filter empties the packets
-    if codec not in CODECS or None in stamps or any(p.is_corrupt or p.is_discard for p in packets):
+    stamps = [p.pts for p in packets if p.pts is not None]  # the filter empties the packets
+    unusual = len(stamps) < len(packets) or any(p.is_corrupt or p.is_discard for p in packets)
+    if codec not in CODECS or unusual:
         return None
     stream.codec_context.thread_count = 1
     first = next(frame for p in packets for frame in stream.decode(p))

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import threading
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -332,9 +333,12 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     before = not_none(event_corrections.shown_events(1))
     with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:
+        # On a slow connection the editor comes after the player is ready.
+        page.route("**/correct.js", lambda route: (time.sleep(1.0), route.continue_()))
         page.goto("/recordings/1")
         page.wait_for_selector("[data-ready]")
         page.get_by_text("Correct the events").click()
+        page.wait_for_selector(".track .mark")
         marks = page.locator(".track .mark")
         assert marks.count() == len(before.detected)
         # By the mouse: 0.2 s later, on a frame; the video shows it.

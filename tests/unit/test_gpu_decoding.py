@@ -37,7 +37,8 @@ class FFmpegDecoder:
     ) -> list[int]:
         if self.error:
             raise RuntimeError(self.error)
-        context = av.CodecContext.create(codec, "r")
+        context = av.VideoCodecContext.create(codec, "r")
+        assert isinstance(context, av.VideoCodecContext)
         frames = []
         for stamp, data in packets:
             packet = av.Packet(data)

@@ -1,7 +1,7 @@
 // Correct events: marks on a line that are dragged, moved by the arrow keys, deleted and added, then saved together.
 // The player (recording.js) tells the frame that it shows and the frames there are; a mark that moves has it show its own.
 
-import { seconds } from "./recording.js";
+import { player, seconds } from "./recording.js";
 
 /** @typedef {{time: number, side: "l"|"r", event: "d"|"u", changed: boolean}} Mark */
 
@@ -43,12 +43,12 @@ export function nearest(times, at) {
   return low > 0 && at - times[low - 1] <= times[low] - at ? low - 1 : low;
 }
 
-/** @param {HTMLFormElement} form @param {HTMLElement} look @param {number[]} times */
-function edit(form, look, times) {
+/** @param {HTMLFormElement} form @param {HTMLElement} look @param {number[]} times @param {number} frame the one that is shown */
+function edit(form, look, times, frame) {
   const find = (/** @type {string} */ what) => /** @type {any} */ (form.querySelector(what));
   const track = find(".track"), line = find(".line"), said = find(".said"), problem = find(".problem"), words = form.dataset;
   const before = textOf(marksOf(words.events ?? ""));
-  let marks = marksOf(words.events ?? ""), frame = 0;
+  let marks = marksOf(words.events ?? "");
   /** @type {Mark|null} */ let chosen = null;
   /** @type {Map<Mark, HTMLButtonElement>} */ const shown = new Map();
   const here = document.createElement("div");
@@ -201,6 +201,6 @@ function edit(form, look, times) {
 }
 
 if (typeof document !== "undefined") {
-  const form = /** @type {HTMLFormElement|null} */ (document.querySelector("form.correct")), look = /** @type {HTMLElement|null} */ (document.querySelector(".look[data-fitted]"));
-  if (form && look) look.addEventListener("movement", (e) => edit(form, look, /** @type {CustomEvent<{time: number[]}>} */ (e).detail.time), { once: true });
+  const form = /** @type {HTMLFormElement|null} */ (document.querySelector("form.correct"));
+  if (form) player.then((shown) => { if (shown) edit(form, shown.look, shown.movement.time, shown.frame); });
 }

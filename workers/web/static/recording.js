@@ -225,7 +225,6 @@ async function start() {
   // Where the body is fitted later only, the page begins there: before, the view may be empty.
   const begin = m.body.known[0]?.[0] ?? 0;
   if (begin > 0 && (!video || (video.paused && video.currentTime === 0))) clock.go(begin);
-  look.dispatchEvent(new CustomEvent("movement", { detail: m }));
   look.dataset.ready = "";
   return { movement: m, poses, look, canvas, get frame() { return clock.frame; }, watch: (seen) => { watching.push(seen); seen(clock.frame); },
     redraw: () => show(clock.frame) };
