@@ -49,7 +49,7 @@ def configure() -> None:
     # On a GPU, XLA tries many forms of each matrix product. Handed to NVIDIA's library instead, the many small products
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
     # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
-    # On a CPU, XLA's newer compiler of fused operations takes longer for programs that are no faster
+    # On a CPU, XLA's newer compiler of fused operations takes longer, and its programs are not faster
     # (docs/benchmarks.md). Read when the first device is asked for.
     for flag in FLAGS:
         flags = os.environ.get("XLA_FLAGS", "")

@@ -218,12 +218,12 @@ class Nvdec:
 
 
 class _Decoding:
-    """One video in `Nvdec.decode`. What its callbacks raise ends the parser's call and is raised after it."""
+    """One video in `Nvdec.decode`. An error of a callback ends the parser's call and is raised after it."""
 
     def __init__(self, call: Any, codec: str, size_px: tuple[int, int], into: np.ndarray) -> None:
         self._call, self._codec, self._size, self._into = call, CODECS[codec], size_px, into
         self._decoder, self._stream, self._copied, self._parser = c_void_p(), c_void_p(), c_void_p(), c_void_p()
-        self._height = 0  # of the decoder's surface
+        self._coded = 0, 0, 0  # width, height, surfaces
         self._stamps: list[int] = []
         self._error: Exception | None = None
         call("cuStreamCreate", byref(self._stream), c_uint(_OWN_ORDER))
@@ -252,6 +252,7 @@ class _Decoding:
             self._call("cuvidDestroyDecoder", self._decoder)
         self._call("cuEventDestroy_v2", self._copied)
         self._call("cuStreamDestroy_v2", self._stream)
+        self._callbacks = ()  # they refer to this object
 
     def _parse(self, packet: _Packet) -> None:
         try:
@@ -274,16 +275,18 @@ class _Decoding:
         kind = (found.codec, found.chroma, found.luma_bits_over_8, found.chroma_bits_over_8, found.progressive)
         if kind != (self._codec, _YUV_420, 0, 0, 1) or (left, top, right, bottom) != (0, 0, *self._size):
             raise RuntimeError(f"a video of another kind: {kind}, {left, top, right, bottom}")
+        surfaces, coded = found.surfaces + _AHEAD + 1, (found.width, found.height, found.surfaces)
         if self._decoder:
-            raise RuntimeError("the video begins anew inside")
-        surfaces = found.surfaces + _AHEAD + 1
+            if coded != self._coded:
+                raise RuntimeError(f"{coded} after {self._coded}")
+            return surfaces
+        self._coded = coded
         wanted = _ToCreate(found.width, found.height, surfaces, found.codec, found.chroma, _BY_DECODER)
         wanted.most_width = wanted.target_width = found.width
         wanted.most_height = wanted.target_height = found.height
         wanted.shown[2], wanted.shown[3] = found.width, found.height
         wanted.deinterlacing, wanted.output_surfaces = _WEAVE, 2
         self._call("cuvidCreateDecoder", byref(self._decoder), byref(wanted))
-        self._height = found.height + found.height % 2
         return surfaces
 
     def _decode(self, picture: int) -> int:
@@ -300,7 +303,8 @@ class _Decoding:
         try:
             width, height = self._size
             to = self._into[len(self._stamps)]
-            for first, at, rows in ((0, 0, height), (self._height, height, height // 2)):
+            coded_height = self._coded[1] + self._coded[1] % 2
+            for first, at, rows in ((0, 0, height), (coded_height, height, height // 2)):
                 source = surface.value + first * pitch.value
                 copy = _Copy(from_type=_DEVICE, from_device=source, from_pitch=pitch.value, to_type=_HOST)
                 copy.to_host, copy.to_pitch = to[at:].ctypes.data, width

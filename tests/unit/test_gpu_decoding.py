@@ -56,7 +56,7 @@ class FFmpegDecoder:
 def decoder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FFmpegDecoder]:
     found = FFmpegDecoder()
     address = str(tmp_path / "gpu.sock")
-    found.server = Server(address, any_device=True, decoder=cast(nvdec.Nvdec, found))
+    found.server = Server(address, any_device=True, idle_s=float("inf"), decoder=cast(nvdec.Nvdec, found))
     threading.Thread(target=found.server.run, daemon=True).start()
     monkeypatch.setattr(gpu_address, "running_server", lambda: address)
     monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
