@@ -25,7 +25,7 @@ docs: $(READY)  ## the site of the documentation: build/docs/site/index.html
 test: $(READY)  ## the tests
 	$(PYTEST)
 
-test-fast: $(READY) ## the tests that take 105 s on two idle cores: no database, no fit, no network over a video
+test-fast: $(READY) ## the tests that take 90 s on two idle cores: no database, no fit, no network over a video
 	$(PYTEST) tests -m "not slow and not database and not browser and not needs_extra"
 
 lint: $(READY)  ## style, formatting and types

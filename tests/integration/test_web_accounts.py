@@ -400,6 +400,7 @@ def test_only_the_proxy_is_answered_and_believed(known: Accounts):
         assert seen[-1] == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_page_that_is_ended_stops_the_database_that_it_started(tmp_path: Path, number: signal.Signals):
     script = """

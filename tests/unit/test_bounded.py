@@ -295,7 +295,7 @@ def test_a_file_that_grows_while_it_is_read(tmp_path: Path):
         ("digits", "a=[0x" + "f" * 5000 + "]"),
         ("MiB", "a=1\n" * 20_000),
         ("integer string", "a=1" + "0" * 5000),
-        ("deep", ".".join(["a"] * 12_000) + "=1"),
+        pytest.param("deep", ".".join(["a"] * 12_000) + "=1", marks=pytest.mark.slow),
     ],
     ids=["nested", "very nested", "nested tables", "hexadecimal", "long", "digits", "a key of many parts"],
 )

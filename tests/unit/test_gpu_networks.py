@@ -104,6 +104,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     server.close()
 
 
+@pytest.mark.slow
 def test_pictures_of_many_videos_share_batches_and_get_their_own_answers(server: Server) -> None:
     shown = pictures(224, 3)
     lite = network_of("blazepose_detector")

@@ -17,7 +17,7 @@ from workers.web import accounts
 KINDS = {kind.name: kind for kind in kinds()}
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[pytest.mark.slow] * (k == "board.mp4")) for k in KINDS])
 def test_mutated_files_have_a_result_or_a_code(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(accounts, "LOG_N", 4)  # a hash that costs little
     n = 2 if name in ("walk.fit.npz", "session.json", "norm.json", "board.mp4") else 5

@@ -162,7 +162,7 @@ def test_the_largest_csv_takes_less_than_a_gibibyte(tmp_path: Path):
 @pytest.mark.parametrize(
     ("pattern", "words"),
     [
-        ("(?P<subject>(a+)+)$", "takes too much"),
+        pytest.param("(?P<subject>(a+)+)$", "takes too much", marks=pytest.mark.slow),
         ("(?P<subject>a{99999999999})", "overflow|too large"),
         ("(" * 5000 + ")" * 5000, "recursion|missing|nested|without named"),
     ],
