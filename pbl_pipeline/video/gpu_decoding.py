@@ -6,6 +6,7 @@ error. Where anything is unusual or damaged, FFmpeg decodes the file and states 
 
 from __future__ import annotations
 
+import itertools
 import json
 import mmap
 import os
@@ -18,14 +19,14 @@ import av
 import cv2
 import numpy as np
 from av.bitstream import BitStreamFilterContext
-from av.container import InputContainer
-from av.error import FFmpegError
 
 from pbl_pipeline.models import gpu_address
 from pbl_pipeline.models.devices import asked_device
 from pbl_pipeline.models.gpu_address import DECODING
 from pbl_pipeline.models.network import receive_line, send_line
 from pbl_pipeline.models.nvdec import CODECS
+
+from .decode import FFMPEG_ERRORS, Decoder
 
 #: Formats of the pictures: colour at half the resolution, 8 bits.
 _FORMATS = ("yuv420p", "yuvj420p")
@@ -107,7 +108,7 @@ def release() -> None:
         _connection = None
 
 
-def decoded(path: Path, stream_index: int, room: float) -> list[av.VideoFrame] | None:
+def decoded(path: Path, room: float) -> list[av.VideoFrame] | None:
     """Decode all pictures of a video file, in the order of showing; None where FFmpeg has to decode it.
 
     They lie in the memory of those before, if these are no longer used. `room`: bytes that they may take.
@@ -115,34 +116,33 @@ def decoded(path: Path, stream_index: int, room: float) -> list[av.VideoFrame] |
     if asked_device() == "cpu" or not gpu_address.gpu_visible():
         return None
     try:
-        with av.open(str(path)) as container:
-            stream = next(s for s in container.streams.video if s.index == stream_index)
-            return _decoded(container, stream, room)
-    except (EOFError, FFmpegError, OSError, RuntimeError, StopIteration, ValueError):
+        with Decoder(path, threads=1) as decoder:
+            return _decoded(decoder, room)
+    except (*FFMPEG_ERRORS, EOFError, OSError, RuntimeError, StopIteration, ValueError):
         release()
         return None
 
 
-def _decoded(container: InputContainer, stream: av.VideoStream, room: float) -> list[av.VideoFrame] | None:
+def _decoded(decoder: Decoder, room: float) -> list[av.VideoFrame] | None:
     global _connection
-    codec = stream.codec_context.name
-    packets = [p for p in container.demux(stream) if p.size]
+    stream, codec = decoder.stream, decoder.stream.codec_context
+    size = decoder.n_announced * codec.width * codec.height * 3 // 2
+    known = codec.name in CODECS and codec.format is not None and codec.format.name in _FORMATS
+    if not known or codec.width % 2 or codec.height % 2 or not 0 < max(size, decoder.path.stat().st_size) <= room:
+        return None
+    packets = [p for p in itertools.islice(decoder.container.demux(stream), decoder.n_announced + 2) if p.size]
     stamps = [p.pts for p in packets if p.pts is not None]  # the filter empties the packets
-    unusual = len(stamps) < len(packets) or any(p.is_corrupt or p.is_discard for p in packets)
-    if codec not in CODECS or unusual:
+    usual = len(stamps) == len(packets) == decoder.n_announced > 0
+    if not usual or any(p.is_corrupt or p.is_discard for p in packets):
         return None
-    stream.codec_context.thread_count = 1
     first = next(frame for p in packets for frame in stream.decode(p))
-    size = len(packets) * first.width * first.height * 3 // 2
-    if first.format.name not in _FORMATS or first.width % 2 or first.height % 2 or size > room:
-        return None
-    to_annex_b = BitStreamFilterContext(f"{codec}_mp4toannexb", stream)
+    to_annex_b = BitStreamFilterContext(f"{codec.name}_mp4toannexb", stream)
     pieces = [bytes(q) for p in packets for q in to_annex_b.filter(p)]
     if any(_ZEROS.search(piece) for piece in pieces):
         return None
     if _connection is None or _connection.size < size or not _connection.free():
         release()
         _connection = _Connection(size)
-    frames = _connection.decode(codec, first, list(zip(stamps, pieces, strict=True)))
+    frames = _connection.decode(codec.name, first, list(zip(stamps, pieces, strict=True)))
     same = frames[0].pts == first.pts and np.array_equal(frames[0].to_ndarray(), first.to_ndarray())
     return [first, *frames[1:]] if same else None

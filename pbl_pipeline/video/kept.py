@@ -78,9 +78,9 @@ def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
     if not _shelf.wanted:
         yield from decoder
         return
-    keep_large_blocks(True)
     room, file, stamped = share_of_memory() * _FRACTION, _identity(decoder.path), []
-    decoder.pictures = gpu_decoding.decoded(decoder.path, decoder.stream.index, room)
+    decoder.pictures = gpu_decoding.decoded(decoder.path, room)
+    keep_large_blocks(True)
     for pts, frame in decoder:
         size = sum(plane.buffer_size for plane in frame.planes)
         if size != _shelf.size:  # the places of the last ones do not suit

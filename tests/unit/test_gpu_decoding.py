@@ -13,7 +13,7 @@ import pytest
 
 from pbl_pipeline.models import gpu_address, nvdec
 from pbl_pipeline.models.gpu_server import Server
-from pbl_pipeline.video import frames_kept, gpu_decoding, kept, probe, read_frames, release_frames
+from pbl_pipeline.video import decode, frames_kept, gpu_decoding, kept, probe, read_frames, release_frames
 from tests import refused
 from tests.videos import constant_rate, noise_frames, write_video
 
@@ -69,8 +69,8 @@ def pictures(path: Path) -> list[tuple[float, bytes]]:
     return [(f.time_s, f.image.tobytes()) for f in read_frames(path)]
 
 
-def video(folder: Path, name: str = "a", **options: Any) -> Path:
-    return write_video(folder / f"{name}.mp4", noise_frames(12), constant_rate(12), **options)
+def video(folder: Path, name: str = "a", suffix: str = "mp4", **options: Any) -> Path:
+    return write_video(folder / f"{name}.{suffix}", noise_frames(12), constant_rate(12), **options)
 
 
 @pytest.mark.parametrize(
@@ -109,18 +109,26 @@ def unusual(folder: Path, kind: str) -> Path:
         return video(folder, pixel_format="yuv444p")
     if kind == "ten bits":
         return video(folder, codec="libx265", pixel_format="yuv420p10le")
+    if kind == "no count of pictures":
+        return video(folder, suffix="mkv")
     if kind == "another codec":
         return video(folder, codec="mpeg4", ticks_per_s=30)
     return video(folder)
 
 
-@pytest.mark.parametrize("kind", ["more colour", "ten bits", "another codec", "an error", "other pictures", "no room"])
+@pytest.mark.parametrize(
+    "kind",
+    ["more colour", "ten bits", "another codec", "no count of pictures"]
+    + ["more than announced", "an error", "other pictures", "no room"],
+)
 def test_ffmpeg_decodes_all_else(
     monkeypatch: pytest.MonkeyPatch, decoder: FFmpegDecoder, tmp_path: Path, kind: str
 ) -> None:
     path = unusual(tmp_path, kind)
     expected = pictures(path)
     decoder.error, decoder.changed = "damage" * (kind == "an error"), kind == "other pictures"
+    if kind == "more than announced":
+        monkeypatch.setattr(decode.Decoder, "n_announced", property(lambda _: 11))
     if kind == "no room":
         monkeypatch.setattr(kept, "share_of_memory", lambda: 8e4)
     with frames_kept():
