@@ -118,8 +118,16 @@ def unusual(folder: Path, kind: str) -> Path:
 
 @pytest.mark.parametrize(
     "kind",
-    ["more colour", "ten bits", "another codec", "no count of pictures"]
-    + ["more than announced", "an error", "other pictures", "no room"],
+    [
+        "more colour",
+        "ten bits",
+        "another codec",
+        "no count of pictures",
+        "more than announced",
+        "an error",
+        "other pictures",
+        "no room",
+    ],
 )
 def test_ffmpeg_decodes_all_else(
     monkeypatch: pytest.MonkeyPatch, decoder: FFmpegDecoder, tmp_path: Path, kind: str
