@@ -21,7 +21,7 @@ from pbl_pipeline.keypoints import KeypointParams, detect_keypoints
 from pbl_pipeline.kinetics import METHODS as KINETICS_METHODS
 from pbl_pipeline.kinetics import visit_kinetics
 from pbl_pipeline.methods import Method
-from pbl_pipeline.models import asked_device, gpu_visible
+from pbl_pipeline.models import gpu_wanted
 from pbl_pipeline.names import check_height, check_label, check_mass, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
@@ -137,7 +137,7 @@ def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblErro
 def at_once(videos: int) -> int:
     """Number of processes that detect in so many videos: one for each core if a GPU computes the networks, else one,
     whose threads use the cores."""
-    return max(1, min(videos, cores())) if gpu_visible() and asked_device() != "cpu" else 1
+    return max(1, min(videos, cores())) if gpu_wanted() else 1
 
 
 @contextlib.contextmanager

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from pbl_pipeline.temporary import private_folder
 
+from .devices import asked_device
+
 #: Time after which a GPU process that does not listen has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
-#: First line of a connection whose videos are decoded.
-DECODING = {"decoding": True}
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
@@ -32,6 +32,14 @@ def gpu_visible() -> bool:
         return False
     driver = any(Path(p).exists() for p in ("/dev/nvidiactl", "/proc/driver/nvidia/version", "/dev/dxg"))
     return driver and any(importlib.util.find_spec(p) is not None for p in _PLUGINS)
+
+
+def gpu_wanted() -> bool:
+    """True if a GPU is visible and PBL_ONNX_DEVICE is not "cpu".
+
+    Raises `PblError` USAGE: a GPU is visible and PBL_ONNX_DEVICE names an unknown device.
+    """
+    return gpu_visible() and asked_device() != "cpu"
 
 
 def running_server() -> str:

@@ -29,8 +29,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from .gpu_address import DECODING
-from .network import NetworkSpec, batches, receive, receive_line, send_line
+from .network import DECODING, NetworkSpec, batches, receive, receive_line, send_line
 from .nvdec import Nvdec
 from .tflite import LiteModel, read_network
 
@@ -193,7 +192,8 @@ class Server:
         self._locks: dict[NetworkSpec, threading.Lock] = {}
         self._device = threading.Semaphore(_AT_ONCE)
         self._decoder, self._decoding = decoder, threading.Semaphore(_VIDEOS_AT_ONCE)
-        self._opening = self._n_readers = 0
+        self._readers = set[socket.socket]()  # connections whose videos are decoded
+        self._opening = 0
         # Programs of several networks compile in parallel.
         self._openers = ThreadPoolExecutor(16)
 
@@ -242,7 +242,7 @@ class Server:
 
     def _read_videos(self, connection: socket.socket) -> None:
         """Decode the videos of a process until it ends the connection."""
-        self._n_readers += 1
+        self._readers.add(connection)
         try:
             with connection, connection.makefile("rb") as asked:
                 if self._decoder is None:
@@ -258,7 +258,7 @@ class Server:
         except (OSError, RuntimeError, ValueError) as error:  # the reader falls back to FFmpeg
             sys.stderr.write(f"no further videos are decoded for a process: {error}\n")
         finally:
-            self._n_readers -= 1
+            self._readers.discard(connection)
 
     def _decode(self, decoder: Nvdec, asked: dict[str, Any], source: BinaryIO, memory: np.ndarray) -> dict[str, Any]:
         """Decode a video into the beginning of `memory`; return its answer."""
@@ -276,7 +276,7 @@ class Server:
         last = time.monotonic()
         while time.monotonic() - last < self._idle_s:
             time.sleep(min(1.0, self._idle_s / 4))
-            if self._opening or self._n_readers or any(s.n_connections for s in list(self._served.values())):
+            if self._opening or self._readers or any(s.n_connections for s in list(self._served.values())):
                 last = time.monotonic()
         self.close()
         os._exit(0)

@@ -23,6 +23,9 @@ from . import gpu_address
 from .devices import asked_device, unavailable
 from .tflite import NUM_THREADS, LiteModel
 
+#: First line of a connection to the process that owns the GPU whose videos are decoded; of others, a `NetworkSpec`.
+DECODING = {"decoding": True}
+
 
 @dataclasses.dataclass(frozen=True)
 class NetworkSpec:
@@ -73,7 +76,7 @@ class Network:
         self.sha256, self.device, self.note = sha256, "", ""
         self._remote: _Remote | None = None
         self._lite: LiteModel | None = None
-        if asked_device() == "cpu" or not gpu_address.gpu_visible():
+        if asked_device() == "cpu" or not gpu_address.gpu_visible():  # refuses unknown devices on every machine
             self._lite = self._load()
             return
         try:

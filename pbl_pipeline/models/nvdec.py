@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 from collections.abc import Iterable, Iterator
-from ctypes import POINTER, byref, c_int, c_longlong, c_short, c_ubyte, c_uint, c_ulong, c_ulonglong, c_void_p
+from ctypes import POINTER, byref, c_int, c_longlong, c_short, c_size_t, c_ubyte, c_uint, c_ulong, c_ulonglong, c_void_p
 from typing import Any
 
 import numpy as np
@@ -109,27 +109,24 @@ class _Status(ctypes.Structure):
     _fields_ = (("status", c_int), ("reserved", c_uint * 31), ("reserved2", c_void_p * 8))
 
 
+class _Place(ctypes.Structure):
+    """Source or destination of `_Copy`."""
+
+    _fields_ = (
+        ("x", c_size_t),
+        ("y", c_size_t),
+        ("type", c_int),
+        ("host", c_void_p),
+        ("device", c_ulonglong),
+        ("array", c_void_p),
+        ("pitch", c_size_t),
+    )
+
+
 class _Copy(ctypes.Structure):
     """CUDA_MEMCPY2D."""
 
-    _fields_ = (
-        ("from_x", ctypes.c_size_t),
-        ("from_y", ctypes.c_size_t),
-        ("from_type", c_int),
-        ("from_host", c_void_p),
-        ("from_device", c_ulonglong),
-        ("from_array", c_void_p),
-        ("from_pitch", ctypes.c_size_t),
-        ("to_x", ctypes.c_size_t),
-        ("to_y", ctypes.c_size_t),
-        ("to_type", c_int),
-        ("to_host", c_void_p),
-        ("to_device", c_ulonglong),
-        ("to_array", c_void_p),
-        ("to_pitch", ctypes.c_size_t),
-        ("row_bytes", ctypes.c_size_t),
-        ("rows", ctypes.c_size_t),
-    )
+    _fields_ = (("source", _Place), ("to", _Place), ("row_bytes", c_size_t), ("rows", c_size_t))
 
 
 _OnSequence = ctypes.CFUNCTYPE(c_int, c_void_p, POINTER(_Format))
@@ -178,7 +175,7 @@ class Nvdec:
         """Let the GPU write into memory of this process directly, within this block."""
         at = c_void_p(memory.ctypes.data)
         self._call("cuCtxSetCurrent", self._context)
-        self._call("cuMemHostRegister_v2", at, ctypes.c_size_t(memory.nbytes), c_uint(_ALL_CONTEXTS))
+        self._call("cuMemHostRegister_v2", at, c_size_t(memory.nbytes), c_uint(_ALL_CONTEXTS))
         try:
             yield
         finally:
@@ -305,10 +302,8 @@ class _Decoding:
             to = self._into[len(self._stamps)]
             coded_height = self._coded[1] + self._coded[1] % 2
             for first, at, rows in ((0, 0, height), (coded_height, height, height // 2)):
-                source = surface.value + first * pitch.value
-                copy = _Copy(from_type=_DEVICE, from_device=source, from_pitch=pitch.value, to_type=_HOST)
-                copy.to_host, copy.to_pitch = to[at:].ctypes.data, width
-                copy.row_bytes, copy.rows = width, rows
+                source = _Place(type=_DEVICE, device=surface.value + first * pitch.value, pitch=pitch.value)
+                copy = _Copy(source, _Place(type=_HOST, host=to[at:].ctypes.data, pitch=width), width, rows)
                 self._call("cuMemcpy2DAsync_v2", byref(copy), self._stream)
             self._call("cuEventRecord", self._copied, self._stream)
             self._call("cuEventSynchronize", self._copied)

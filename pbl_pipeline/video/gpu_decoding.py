@@ -21,9 +21,7 @@ import numpy as np
 from av.bitstream import BitStreamFilterContext
 
 from pbl_pipeline.models import gpu_address
-from pbl_pipeline.models.devices import asked_device
-from pbl_pipeline.models.gpu_address import DECODING
-from pbl_pipeline.models.network import receive_line, send_line
+from pbl_pipeline.models.network import DECODING, receive_line, send_line
 from pbl_pipeline.models.nvdec import CODECS
 
 from .decode import FFMPEG_ERRORS, Decoder
@@ -113,7 +111,7 @@ def decoded(path: Path, room: float) -> list[av.VideoFrame] | None:
 
     They lie in the memory of those before, if these are no longer used. `room`: bytes that they may take.
     """
-    if asked_device() == "cpu" or not gpu_address.gpu_visible():
+    if not gpu_address.gpu_wanted():
         return None
     try:
         with Decoder(path, threads=1) as decoder:
@@ -130,6 +128,10 @@ def _decoded(decoder: Decoder, room: float) -> list[av.VideoFrame] | None:
     known = codec.name in CODECS and codec.format is not None and codec.format.name in _FORMATS
     if not known or codec.width % 2 or codec.height % 2 or not 0 < max(size, decoder.path.stat().st_size) <= room:
         return None
+    # First, so that a GPU without a decoder does not cost a reading of each file.
+    if _connection is None or _connection.size < size or not _connection.free():
+        release()
+        _connection = _Connection(size)
     packets = [p for p in itertools.islice(decoder.container.demux(stream), decoder.n_announced + 2) if p.size]
     stamps = [p.pts for p in packets if p.pts is not None]  # the filter empties the packets
     usual = len(stamps) == len(packets) == decoder.n_announced > 0
@@ -140,9 +142,6 @@ def _decoded(decoder: Decoder, room: float) -> list[av.VideoFrame] | None:
     pieces = [bytes(q) for p in packets for q in to_annex_b.filter(p)]
     if any(_ZEROS.search(piece) for piece in pieces):
         return None
-    if _connection is None or _connection.size < size or not _connection.free():
-        release()
-        _connection = _Connection(size)
     frames = _connection.decode(codec.name, first, list(zip(stamps, pieces, strict=True)))
     same = frames[0].pts == first.pts and np.array_equal(frames[0].to_ndarray(), first.to_ndarray())
     return [first, *frames[1:]] if same else None
