@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
+import importlib.util
 import io
 import os
 import sys
@@ -17,17 +17,17 @@ from pbl_pipeline import settings
 
 #: Programs that compile faster than this are not worth a file.
 MIN_COMPILE_SECONDS = 0.3
-#: Flags of XLA (see `configure`).
-FLAGS = (
-    "--xla_gpu_autotune_level=0",
-    "--xla_gpu_enable_triton_gemm=false",
-    "--xla_cpu_use_fusion_emitters=false",
-)
+#: Flags of XLA (see `configure`), and the last version of JAX that is known to have them: a library that does not know
+#: a flag ends the process. Those of GPUs do not know all flags of CPUs.
+GPU_FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
+CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
+FLAGS_UNTIL = (0, 12)
 
 
 @functools.cache
-def configure() -> None:
-    """Set JAX up for the fit and the networks of detection. Call before the first array; idempotent.
+def configure(*flags: str) -> None:
+    """Set JAX up for the fit and the networks of detection, `flags` of XLA included. Call before the first array;
+    idempotent.
 
     Compiled programs are kept in `jax/` of the user's cache folder. JAX's own settings win: those of
     `JAX_COMPILATION_CACHE_DIR` and `JAX_PERSISTENT_CACHE_*`, those that a program made in `jax.config` before, and XLA
@@ -51,11 +51,18 @@ def configure() -> None:
     # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
     # On a CPU, XLA's newer compiler of fused operations takes longer, and its programs are not faster
     # (docs/benchmarks.md). Read when the first device is asked for.
-    for flag in FLAGS:
-        flags = os.environ.get("XLA_FLAGS", "")
-        if flag.partition("=")[0] not in flags:
-            os.environ["XLA_FLAGS"] = f"{flags} {flag}".strip()
+    for flag in known_flags(jax.__version__, flags):
+        given = os.environ.get("XLA_FLAGS", "")
+        if flag.partition("=")[0] not in given:
+            os.environ["XLA_FLAGS"] = f"{given} {flag}".strip()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
+
+
+def known_flags(version: str, more: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Return the flags that the libraries of this version of JAX know, those of its plugins included."""
+    if tuple(int(n) for n in version.split(".")[:2]) > FLAGS_UNTIL:
+        return ()
+    return (*GPU_FLAGS, *more) if importlib.util.find_spec("jax_plugins") else (*GPU_FLAGS, CPU_FLAG, *more)
 
 
 _COMPILED = {"seconds": 0.0}

@@ -2,10 +2,10 @@
 
 Each connection is of one network, or of a process that reads videos. It begins with a line of JSON, answered by one.
 
-- A network: its `NetworkSpec`; then the bytes of pictures, each answered with the network's outputs as float32 in the
-  order of the pictures. The pictures that wait on all connections of a network are one batch. Each network has one
-  batch size, so that one program is compiled for it; a batch that is not full is padded, and a picture's result does
-  not depend on the others.
+- A network: its `NetworkSpec`; then the file of memory for `AT_ONCE` pictures, and for each picture a byte that says
+  where in it the picture is, answered with the network's outputs as float32 in the order of these bytes. The pictures
+  that wait on all connections of a network are one batch. Each network has one batch size, so that one program is
+  compiled for it; a batch that is not full is padded, and a picture's result does not depend on the others.
 - A reader of videos: `DECODING`; then the file of its memory, and for each video a line of JSON and its packets. The
   pictures are written into that memory, and the answer is a line with their stamps. Networks and decoder share the
   process, because the GPU would serve two in turns.
@@ -14,7 +14,6 @@ Each connection is of one network, or of a process that reads videos. It begins 
 from __future__ import annotations
 
 import json
-import mmap
 import os
 import selectors
 import socket
@@ -29,7 +28,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
-from .network import DECODING, NetworkSpec, batches, receive, receive_line, send_line
+from .network import AT_ONCE, DECODING, NetworkSpec, batches, receive_line, send_line, shared_memory
 from .nvdec import Nvdec
 from .tflite import LiteModel, read_network
 
@@ -39,6 +38,8 @@ BATCH, LEAST_BATCH = 16, 4
 IDLE_S = 60.0
 #: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
+#: Otherwise XLA records its calls in graphs, and any call of the decoder meanwhile makes the recording fail.
+NO_GRAPHS = "--xla_gpu_enable_command_buffer="
 #: Number of networks that use the device at a time, and of videos that are decoded.
 _AT_ONCE, _VIDEOS_AT_ONCE = 2, 8
 
@@ -108,7 +109,7 @@ class _Served:
 
     def __init__(self, program: Program, device: threading.Semaphore) -> None:
         self._program, self._device = program, device
-        self._selector = selectors.DefaultSelector()
+        self._selector = selectors.DefaultSelector()  # each connection with its pictures
         self._changed = threading.Condition()
         # One batch is filled while the other is computed; allocating memory for each would take longer than receiving.
         self._images, self._spare = (np.zeros((program.batch, *program.image_shape), np.uint8) for _ in range(2))
@@ -117,30 +118,30 @@ class _Served:
         for work in (self._collect, self._compute):
             threading.Thread(target=work, daemon=True).start()
 
-    def add(self, connection: socket.socket) -> None:
+    def add(self, connection: socket.socket, memory: np.ndarray) -> None:
         self.n_connections += 1
-        self._selector.register(connection, selectors.EVENT_READ, connection)
+        pictures = memory.reshape(-1, *self._program.image_shape)
+        self._selector.register(connection, selectors.EVENT_READ, (connection, pictures))
 
     def close(self) -> None:
         """End all connections."""
-        for connection in [key.data for key in self._selector.get_map().values()]:
+        for connection, _ in [key.data for key in self._selector.get_map().values()]:
             self._drop(connection)
 
     def _collect(self) -> None:
-        """Receive pictures into the batch that is computed next."""
+        """Copy pictures into the batch that is computed next."""
         while True:
             for key, _ in self._selector.select(1.0):
-                with self._changed:
-                    self._changed.wait_for(lambda: len(self._owners) < len(self._images))
-                    images, at = self._images, len(self._owners)
-                if not receive(key.data, images[at]):
-                    self._drop(key.data)
-                    continue
-                with self._changed:
-                    if self._images is not images:  # the batch was exchanged meanwhile
-                        self._images[0] = images[at]
-                    self._owners.append(key.data)
-                    self._changed.notify()
+                connection, pictures = key.data
+                places = received(connection)
+                if not places:
+                    self._drop(connection)
+                for place in places:
+                    with self._changed:
+                        self._changed.wait_for(lambda: len(self._owners) < len(self._images))
+                        self._images[len(self._owners)] = pictures[place]
+                        self._owners.append(connection)
+                        self._changed.notify()
 
     def _drop(self, connection: socket.socket) -> None:
         try:
@@ -171,6 +172,14 @@ class _Served:
                     owner.sendall(outputs.data)
                 except (OSError, ValueError):
                     continue
+
+
+def received(connection: socket.socket) -> bytes:
+    """Return what a connection has sent; nothing if it ended."""
+    try:
+        return connection.recv(AT_ONCE)
+    except OSError:
+        return b""
 
 
 class Server:
@@ -233,8 +242,9 @@ class Server:
                 return
             served = self._served[spec]
             program = served._program
-            send_line(connection, {"device": program.device, "sizes": program.sizes})
-            served.add(connection)
+            shape = program.image_shape
+            send_line(connection, {"device": program.device, "sizes": program.sizes, "shape": shape})
+            served.add(connection, shared_memory(connection))
         except (EOFError, OSError, ValueError):
             connection.close()
         finally:
@@ -249,9 +259,7 @@ class Server:
                     send_line(connection, {"error": "the GPU has no decoder"})
                     return
                 send_line(connection, {})
-                _, (file,), _, _ = socket.recv_fds(connection, 1, 1)
-                memory = np.frombuffer(mmap.mmap(file, 0), np.uint8)
-                os.close(file)
+                memory = shared_memory(connection)
                 with self._decoder.pinned(memory):
                     while line := asked.readline():
                         send_line(connection, self._decode(self._decoder, json.loads(line), asked, memory))
@@ -293,7 +301,7 @@ def main() -> None:
     except RuntimeError as error:
         sys.stderr.write(f"videos are not decoded on the GPU: {error}\n")
         decoder = None
-    configure()
+    configure(NO_GRAPHS)
     import jax
 
     device = jax.devices()[0]

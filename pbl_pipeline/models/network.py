@@ -10,6 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import mmap
+import os
+import queue
 import socket
 import threading
 from collections import deque
@@ -25,6 +28,8 @@ from .tflite import NUM_THREADS, LiteModel
 
 #: First line of a connection to the process that owns the GPU whose videos are decoded; of others, a `NetworkSpec`.
 DECODING = {"decoding": True}
+#: Pictures of a process that the GPU process holds at once for a network; they keep it busy while others are cropped.
+AT_ONCE = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,7 +98,7 @@ class Network:
     @property
     def side_by_side(self) -> int:
         """Number of parallel calls that keep the device busy while pictures are cropped for others."""
-        return 16 if self.on_gpu else 1
+        return AT_ONCE if self.on_gpu else 1
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
         remote = self._remote
@@ -132,6 +137,11 @@ class _Remote:
         if "error" in reply:
             raise RuntimeError(reply["error"])
         self.device, self._sizes = str(reply["device"]), [int(n) for n in reply["sizes"]]
+        shape = (AT_ONCE, *reply["shape"])
+        self._pictures = np.frombuffer(share_memory(self._connection, int(np.prod(shape))), np.uint8).reshape(shape)
+        self._free = queue.SimpleQueue[int]()
+        for place in range(AT_ONCE):
+            self._free.put(place)
         self._sending = threading.Lock()
         self._waiting: deque[Future[np.ndarray]] = deque()
         self._broken: BaseException | None = None
@@ -139,12 +149,17 @@ class _Remote:
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
         future: Future[np.ndarray] = Future()
-        with self._sending:
-            if self._broken is not None:
-                raise self._broken
-            self._waiting.append(future)
-            self._connection.sendall(np.ascontiguousarray(image).data)
-        parts = np.split(future.result(), np.cumsum(self._sizes)[:-1])
+        place = self._free.get()
+        try:
+            self._pictures[place] = image
+            with self._sending:
+                if self._broken is not None:
+                    raise self._broken
+                self._waiting.append(future)
+                self._connection.sendall(bytes([place]))
+            parts = np.split(future.result(), np.cumsum(self._sizes)[:-1])
+        finally:
+            self._free.put(place)
         return dict(zip(self._sizes, parts, strict=True))
 
     def _listen(self) -> None:
@@ -157,6 +172,29 @@ class _Remote:
             self._broken = EOFError("the process that owns the GPU ended")
             while self._waiting:
                 self._waiting.popleft().set_exception(self._broken)
+
+
+def share_memory(connection: socket.socket, size: int) -> mmap.mmap:
+    """Return new memory, which the other side of a connection gets by `shared_memory`."""
+    file = os.memfd_create("pictures")
+    try:
+        os.ftruncate(file, size)
+        memory = mmap.mmap(file, size)
+        # The kernel clears its pages now and here; the other process would do it for one connection after another.
+        np.frombuffer(memory, np.uint8)[:: mmap.PAGESIZE] = 0
+        socket.send_fds(connection, [b"m"], [file])
+        return memory
+    finally:
+        os.close(file)
+
+
+def shared_memory(connection: socket.socket) -> np.ndarray:
+    """Return the memory (size,) uint8 that the other side shares."""
+    _, (file,), _, _ = socket.recv_fds(connection, 1, 1)
+    try:
+        return np.frombuffer(mmap.mmap(file, 0), np.uint8)
+    finally:
+        os.close(file)
 
 
 def batches(values: np.ndarray, size: int) -> list[np.ndarray]:

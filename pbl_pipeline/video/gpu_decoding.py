@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import mmap
-import os
 import re
 import socket
 import weakref
@@ -21,7 +19,7 @@ import numpy as np
 from av.bitstream import BitStreamFilterContext
 
 from pbl_pipeline.models import gpu_address
-from pbl_pipeline.models.network import DECODING, receive_line, send_line
+from pbl_pipeline.models.network import DECODING, receive_line, send_line, share_memory
 from pbl_pipeline.models.nvdec import CODECS
 
 from .decode import FFMPEG_ERRORS, Decoder
@@ -45,15 +43,7 @@ class _Connection:
         self._socket.connect(gpu_address.running_server())
         send_line(self._socket, DECODING)
         self._receive()
-        file = os.memfd_create("pictures")
-        try:
-            os.ftruncate(file, size)
-            self._memory = mmap.mmap(file, size)
-            # The kernel clears its pages now and here; the other process would do it for one reader after another.
-            np.frombuffer(self._memory, np.uint8)[:: mmap.PAGESIZE] = 0
-            socket.send_fds(self._socket, [b"m"], [file])
-        finally:
-            os.close(file)
+        self._memory = share_memory(self._socket, size)
         self._last: weakref.ref[np.ndarray] | None = None
 
     def free(self) -> bool:
@@ -126,7 +116,8 @@ def _decoded(decoder: Decoder, room: float) -> list[av.VideoFrame] | None:
     stream, codec = decoder.stream, decoder.stream.codec_context
     size = decoder.n_announced * codec.width * codec.height * 3 // 2
     known = codec.name in CODECS and codec.format is not None and codec.format.name in _FORMATS
-    if not known or codec.width % 2 or codec.height % 2 or not 0 < max(size, decoder.path.stat().st_size) <= room:
+    # Of other heights PyAV makes no picture from given memory.
+    if not known or codec.width % 2 or codec.height % 4 or not 0 < max(size, decoder.path.stat().st_size) <= room:
         return None
     # First, so that a GPU without a decoder does not cost a reading of each file.
     if _connection is None or _connection.size < size or not _connection.free():

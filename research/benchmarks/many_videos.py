@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -41,9 +42,9 @@ def keep_frames() -> None:
     _OPEN.enter_context(frames_kept())
 
 
-def frames_of(video: Path, method: str) -> int:
-    """Detect keypoints in a video; return its number of frames."""
-    return measure(video, None, 1, method)["frames"]
+def measured(video: Path, method: str) -> dict[str, Any]:
+    """Detect keypoints in a video; return the figures of `pbl_pipeline.bench.detect_case`."""
+    return measure(video, None, 1, method)
 
 
 def keypoints_of(video: Path, folder: Path, method: str, device: str) -> Keypoints:
@@ -59,15 +60,15 @@ def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
     return apart[0], 1e3 * apart[1]
 
 
-def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float]:
-    """Return frames a second over all videos, and the seconds of the first round."""
+def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float, list[dict[str, Any]]]:
+    """Return frames a second over all videos, the seconds of the first round, and the figures of each video."""
     with shared_cores(processes), ProcessPoolExecutor(processes, get_context("spawn"), keep_frames) as pool:
         begin = time.perf_counter()
-        list(pool.map(frames_of, videos[:processes], [method] * processes))
+        list(pool.map(measured, videos[:processes], [method] * processes))
         first = time.perf_counter() - begin
         begin = time.perf_counter()
-        frames = sum(pool.map(frames_of, videos, [method] * len(videos)))
-        return frames / (time.perf_counter() - begin), first
+        done = list(pool.map(measured, videos, [method] * len(videos)))
+        return sum(d["frames"] for d in done) / (time.perf_counter() - begin), first, done
 
 
 @click.command()
@@ -85,8 +86,11 @@ def main(
     with new_folder() as folder:
         of = list(videos) or [demo_clip(folder / "demo1080.mp4")]
         some = processes or cores()
-        found, first = rate(of * copies, method, some)
+        found, first, done = rate(of * copies, method, some)
         click.echo(f"{len(of) * copies} videos, {some} processes: {found:.0f} frames/s; first round {first:.1f} s")
+        for stage in done[0]["stages"]:
+            passed, spent = (np.mean([d["stages"][stage][k] for d in done]) for k in ("seconds", "cpu_seconds"))
+            click.echo(f"{stage} of a video: {passed:.2f} s, of which {spent:.2f} s in its process")
         if against_cpu:
             with ProcessPoolExecutor(2, get_context("spawn")) as pool:
                 two = list(pool.map(keypoints_of, [of[0]] * 2, [folder] * 2, [method] * 2, [device, "cpu"]))

@@ -32,6 +32,7 @@ from pbl_pipeline.gait.measurement import (
     change_sd,
     estimate,
     expected_index,
+    load_model,
     measure_error,
 )
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
@@ -579,8 +580,9 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
 @click.argument("folder", type=click.Path(path_type=Path, exists=True))
 @click.option("--norm", default=DEFAULT_NORM, show_default=True, help="Normative set.")
 @click.option("--fit", default="blazepose", show_default=True, help="Method the passes were fitted with.")
+@click.option("--model", "stored", help="Judge this stored model of passes fitted alone instead of the estimated one.")
 @click.option("--write", type=click.Path(path_type=Path), help="Write the model there.")
-def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
+def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | None) -> None:
     """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
     basis, method = load_norm(norm), METHODS[fit]
     seen = read_passes(folder, basis)
@@ -602,6 +604,8 @@ def main(folder: Path, norm: str, fit: str, write: Path | None) -> None:
                 click.echo("\nthe same by models of passes fitted alone")
                 out = left_out_in_turn(parts["tuning", ALONE], own, basis)
                 _echo_left_out(out, models[ALONE].widening, people[1])
+    if stored is not None:
+        models[ALONE] = load_model(stored)
     for (title, fitted), part in parts.items():
         if not part:
             continue

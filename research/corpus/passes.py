@@ -170,7 +170,13 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
 )
 @click.option("--processes", default=os.cpu_count(), help="Processes that see the walks and measure the fits.")
 @click.option("--seconds", default=1e9, help="Begin no further group of walks after so many seconds.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR", help="Write passes-N.npz there.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="Write passes-N.npz there, but for those that are there.",
+)
 def main(
     motions: Path | None,
     people: int,
@@ -191,21 +197,25 @@ def main(
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes, which leave a GPU to this one
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
 
+        def file_of(first: int) -> Path:
+            return out / f"passes-{first}.npz"
+
         def see(first: int) -> AsyncResult[list[list[Fitted]]]:
             some = [(w, detector, kinds or tuple(SESSIONS)) for w in walks[first : first + GROUP]]
             return pool.starmap_async(observed, some, chunksize=1)
 
         def keep(first: int, measured: AsyncResult[list[list[dict]]]) -> None:
             rows = [row for of_session in measured.get() for row in of_session]
-            save_rows(out / f"passes-{first}.npz", rows)
+            save_rows(file_of(first), rows)
             click.echo(f"{min(first + GROUP, len(walks))} of {len(walks)} walks: {len(rows)} passes are kept")
 
         # While a group is fitted, the next one is seen and the one before is measured.
-        ahead, before = see(0), None
-        for first in range(0, len(walks), GROUP):
+        left = [first for first in range(0, len(walks), GROUP) if not file_of(first).exists()]
+        ahead, before = see(left[0] if left else len(walks)), None
+        for first, following in zip(left, [*left[1:], len(walks)], strict=True):
             if time.perf_counter() - begin > seconds:
                 break
-            seen, ahead = [s for found in ahead.get() for s in found], see(first + GROUP)
+            seen, ahead = [s for found in ahead.get() for s in found], see(following)
             ready = time.perf_counter()
             fits = fit_sessions([s.as_input() for s in seen], method)
             done = [(s, f.trials) for s, f in zip(seen, fits, strict=True) if not isinstance(f, PblError)]

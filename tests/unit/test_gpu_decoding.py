@@ -111,6 +111,9 @@ def unusual(folder: Path, kind: str) -> Path:
         return video(folder, codec="libx265", pixel_format="yuv420p10le")
     if kind == "no count of pictures":
         return video(folder, suffix="mkv")
+    if kind == "a height that is no multiple of four":
+        lower = (picture[:62] for picture in noise_frames(12))
+        return write_video(folder / "a.mp4", lower, constant_rate(12))
     if kind == "another codec":
         return video(folder, codec="mpeg4", ticks_per_s=30)
     return video(folder)
@@ -122,6 +125,7 @@ def unusual(folder: Path, kind: str) -> Path:
         "more colour",
         "ten bits",
         "another codec",
+        "a height that is no multiple of four",
         "no count of pictures",
         "more than announced",
         "an error",

@@ -282,7 +282,7 @@ async function start(shown, section) {
   const size = () => { space.resize(host.clientWidth, Math.max(1, host.clientHeight)); later(); };
   new ResizeObserver(size).observe(host);
   size();
-  new IntersectionObserver(([entry]) => { visible = entry.isIntersecting; if (visible) draw(); }).observe(host);
+  new IntersectionObserver((entries) => { visible = entries[entries.length - 1].isIntersecting; if (visible) draw(); }).observe(host);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { space.colours(); later(); });
   canvas.addEventListener("webglcontextlost", fails);
   turnable(host, space.orbit, later, () => look("filmed"));
@@ -299,7 +299,7 @@ if (section) {
     if (!shown) return;
     section.hidden = false;
     // 140 kB of scripts, on first use.
-    const coming = new IntersectionObserver(([entry]) => { if (entry.isIntersecting) { coming.disconnect(); start(shown, section); } }, { rootMargin: "300px" });
+    const coming = new IntersectionObserver((entries) => { if (entries.some((e) => e.isIntersecting)) { coming.disconnect(); start(shown, section); } }, { rootMargin: "300px" });
     coming.observe(section);
   });
 }
