@@ -40,6 +40,21 @@ def opened(page: Any, number: int) -> Any:
     return page
 
 
+def test_the_3d_view_is_drawn_though_it_was_out_of_view_just_before(chromium: Any, walk: int):
+    """A busy browser tells of several changes at once, of which the last one counts."""
+    with web.shown(chromium, size=(1200, 900)) as page:
+        page.add_init_script(
+            "window.IntersectionObserver = class extends IntersectionObserver { constructor(told, options) {"
+            " super((entries) => told([{ isIntersecting: false }, ...entries]), options); } };"
+        )
+        opened(page, walk)
+        page.wait_for_selector(".space canvas[data-frame='0']")
+        page.locator(".space-view").focus()
+        last = page.locator(".space-view").screenshot()
+        page.keyboard.press("ArrowLeft")
+        changed(page, last)
+
+
 def test_the_3d_view_turns_and_follows_the_time_line(chromium: Any, walk: int):
     with web.shown(chromium, size=(1200, 900)) as page:
         opened(page, walk)
