@@ -118,13 +118,16 @@ def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatc
     assert pbl("worker", "--processes", "many").code == 2
 
 
-def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch):
-    """A process for each core, of which one for each GPU fits; for the fit alone one for each GPU."""
+@pytest.mark.parametrize(("gpu_detects", "n"), [(False, 16), (True, 32)])
+def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch, gpu_detects: bool, n: int):
+    """A process for each core, or two where a GPU detects; of them, and for the fit alone, one for each GPU fits."""
     groups(tmp_path, monkeypatch, "0::/", {})
+    monkeypatch.setattr(resources, "memory_bytes", lambda: 128 * GB)
+    monkeypatch.setattr("pbl_pipeline.models.gpu_address.gpu_visible", lambda: gpu_detects)
     whole, fit = (worker_options(monkeypatch, ("0", "1"), *asked) for asked in ((), ("--resource", "gpu")))
     each = [whole.of_process(n) for n in range(whole.processes)]
-    assert [(o.resource, o.gpus) for o in each] == [("all" if n < 2 else "cpu", (str(n % 2),)) for n in range(16)]
-    assert {o.processes for o in each} == {8}
+    assert [(o.resource, o.gpus) for o in each] == [("all" if i < 2 else "cpu", (str(i % 2),)) for i in range(n)]
+    assert {o.processes for o in each} == {n // 2}
     assert [fit.of_process(n).resource for n in range(fit.processes)] == ["gpu", "gpu"]
 
 

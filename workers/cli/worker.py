@@ -35,8 +35,9 @@ class Processes(click.ParamType):
 )
 @click.option(
     "--processes", type=Processes(),
-    help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (1 core and "
-    "4 GB each; of the fit alone one for each GPU). Default: one for each GPU where the fit is served, else 1.",
+    help="Working processes, which divide the cores among them; auto: as many as cores and memory allow (1 core, or "
+    "half of one where a GPU detects, and 4 GB each; of the fit alone one for each GPU). Default: one for each GPU "
+    "where the fit is served, else 1.",
 )  # fmt: skip
 @click.option(
     "--batch",
@@ -109,12 +110,14 @@ def worker(
 
 def options_of(resource: str, processes: int | str | None, batch: int | None = None, **others: Any) -> Options:
     """Options of a worker on this machine. processes, batch: as given on the command line."""
+    from pbl_pipeline.models.gpu_address import gpu_wanted
     from pbl_pipeline.resources import cores, memory_bytes
     from workers.process import Options, given_gpus
 
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
-        room = min(cores(), memory_bytes() // MEMORY_EACH)
+        waits = DETECTOR in GROUPS[resource] and gpu_wanted()
+        room = min((2 if waits else 1) * cores(), memory_bytes() // MEMORY_EACH)
         processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
     return Options(
         resource=resource,
