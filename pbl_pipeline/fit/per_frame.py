@@ -18,6 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline import progress
 from pbl_pipeline.body import Body, scale_multipliers
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.jax_setup import compile_seconds
 
 from .augmented_pelvis import with_augmented_pelvis
@@ -42,14 +43,14 @@ BACKWARDS_FRACTION = 0.2
 
 def solve_per_frame(
     sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]
-) -> Iterator[Solution]:
+) -> Iterator[Solution | PblError]:
     """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device,
     which fits the others while the first solutions are taken.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
     floor or the augmenter's pelvis, a first solution shows when each foot stands and what the augmenter sees, and a
-    second one uses it.
+    second one uses it. Where the augmenter is needed and not available, its error takes the place of the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
@@ -59,20 +60,27 @@ def solve_per_frame(
     solve = functools.partial(_solve, params=params, several=several)
     starts = [_with_detector(s, params) for s in starts]
     found = _facing(sessions, starts, params, functools.partial(solve, last=not twice))
-    traces, told = [np.zeros((0, 2))] * len(sessions), [None] * len(sessions)
+    traces, told, failed = [np.zeros((0, 2))] * len(sessions), [None] * len(sessions), dict[int, PblError]()
     if twice:
         first = list(found)
         traces = [f.trace for f in first]
         problems, starts = zip(*map(_on_floor, sessions, first), strict=True)
         if params.weight_pelvis > 0:
-            states = [f.end.state for f in first]
-            each = zip(sessions, problems, states, strict=True)
-            problems = [with_augmented_pelvis(s, p, x.qpos, np.asarray(scale_multipliers(x.s))) for s, p, x in each]
+            problems = list(problems)
+            for i, (session, f) in enumerate(zip(sessions, first, strict=True)):
+                qpos, scale = f.end.state.qpos, np.asarray(scale_multipliers(f.end.state.s))
+                try:
+                    problems[i] = with_augmented_pelvis(session, problems[i], qpos, scale)
+                except PblError as error:
+                    failed[i] = error
             told = [np.asarray(p.c_pelvis) for p in problems]
         found = solve(sessions, problems, starts, last=True)
     body = sessions[0].body
     spread = by_joint(body.joint_names, params.sd_factor, 1.0), floors_of(body, params.sd_floor)
     for i, (session, f) in enumerate(zip(sessions, found, strict=True)):
+        if i in failed:
+            yield failed[i]
+            continue
         # The cost of the second one has a term more.
         trace = np.concatenate([traces[i], f.trace + np.array([len(traces[i]), 0.0])])
         # The seconds of all sessions add to those of the batch, without what the caller does meanwhile.

@@ -1,5 +1,6 @@
 """The pelvis of a person who sits or squats, as the marker augmenter has it."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import PELVIS_TURNS, body_poses, load_body, marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import METHODS, augmented_pelvis
+from pbl_pipeline.fit import METHODS, augmented_pelvis, per_frame
 from pbl_pipeline.fit.augmented_pelvis import folds, inclination_of, pelvis_of, with_augmented_pelvis
 from pbl_pipeline.fit.checks import _pelvis_told
 from pbl_pipeline.fit.joint_terms import inclination
@@ -94,6 +95,21 @@ def test_a_person_that_the_network_does_not_know_is_fitted_without(monkeypatch):
     monkeypatch.setattr(augmented_pelvis, "_augmenter", lambda: Tipped(gone))
     with pytest.raises(PblError, match="ASSET_MISSING"):
         with_augmented_pelvis(session, session.problem, qpos, np.ones(8))
+
+
+def test_without_the_network_those_who_do_not_sit_are_fitted_all_the_same(monkeypatch: pytest.MonkeyPatch):
+    """The solutions are those of stand-ins."""
+    given = [session_of(task) for task in ("squat", "walk")]
+    sessions = [session for session, _ in given]
+    starts = [dataclasses.replace(per_frame.start_of(session), qpos=qpos) for session, qpos in given]
+    found = [SimpleNamespace(end=SimpleNamespace(state=start), trace=np.zeros((0, 2))) for start in starts]
+    for name in ("_facing", "_solve"):
+        monkeypatch.setattr(per_frame, name, lambda *_, **__: iter(found))
+    monkeypatch.setattr(per_frame, "_on_floor", lambda session, f: (session.problem, f.end.state))
+    monkeypatch.setattr(per_frame, "_solution", lambda *_: "a solution")
+    gone = PblError("ASSET_MISSING", found="no network", expected="a file", next_step="fetch it")
+    monkeypatch.setattr(augmented_pelvis, "_augmenter", lambda: Tipped(gone))
+    assert list(per_frame.solve_per_frame(sessions, METHODS.find("blazepose").params, starts)) == [gone, "a solution"]
 
 
 def test_who_sits_and_could_not_be_asked_about_is_told():
