@@ -111,7 +111,7 @@ def unusual(folder: Path, kind: str) -> Path:
         return video(folder, codec="libx265", pixel_format="yuv420p10le")
     if kind == "no count of pictures":
         return video(folder, suffix="mkv")
-    if kind == "a height that is no multiple of four":
+    if kind == "a height that is not a multiple of four":
         lower = (picture[:62] for picture in noise_frames(12))
         return write_video(folder / "a.mp4", lower, constant_rate(12))
     if kind == "another codec":
@@ -125,7 +125,7 @@ def unusual(folder: Path, kind: str) -> Path:
         "more colour",
         "ten bits",
         "another codec",
-        "a height that is no multiple of four",
+        "a height that is not a multiple of four",
         "no count of pictures",
         "more than announced",
         "an error",
