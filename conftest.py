@@ -105,6 +105,16 @@ def phases_predicted_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def little_optimised() -> Iterator[None]:
+    """For tests that compile much and compute little: XLA takes a third of the time for the same formulas."""
+    import jax
+
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(scope="session")
 def points_seen_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """For files that measure the same recordings: in a run the networks of points look at each crop once."""

@@ -124,7 +124,7 @@ def until(condition: Callable[[], bool], seconds: float) -> None:
             if condition():
                 return
         assert time.monotonic() < end, f"not within {seconds:g} s"
-        time.sleep(0.3)
+        time.sleep(0.1)
 
 
 def _free_ports(n: int) -> list[int]:

@@ -119,6 +119,7 @@ def work(options: Options, pipe: Connection) -> None:
         stop.set()
 
     def end_now(*_: object) -> None:
+        stop.set()
         raise SystemExit(0)  # handlers above put the running job back
 
     signal.signal(signal.SIGTERM, end)

@@ -136,9 +136,15 @@ class Supervisor:
         self._long_waits = False
 
     def _send_due(self) -> None:
-        """Ask the processes to end after their job (SIGTERM), then to put it back (SIGUSR1), then kill them."""
-        while self._due and time.monotonic() >= self._due[0][0]:
+        """Ask the processes to end after their job (SIGTERM), then to put it back (SIGUSR1), then kill them.
+
+        One signal at a time: of two at once another thread than the main one may get the second, and a wait in which
+        the main one is (a sleep, a read) then goes on as if it had not come.
+        """
+        now, signum = time.monotonic(), None
+        while self._due and now >= self._due[0][0]:
             _, signum = self._due.pop(0)
+        if signum is not None:
             event(log, logging.INFO, "stopping", signal=signum.name, grace_s=self.options.grace_s)
             for child in self._children:
                 if signum == signal.SIGKILL:

@@ -22,6 +22,9 @@ from schemas.tables_version import applied, numbered, record, refuse_newer, titl
 
 _error = functools.partial(PblError, "DB_MIGRATION")
 
+#: Time for which a migration waits for the end of another one (s).
+LOCK_S = 5
+
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
@@ -103,7 +106,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
     if dry_run:
         return _plan()
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
-        cursor.execute("SELECT GET_LOCK(%s, 5)", (f"{connection.prefix()}_migrate",))
+        cursor.execute("SELECT GET_LOCK(%s, %s)", (f"{connection.prefix()}_migrate", LOCK_S))
         if (cursor.fetchone() or (0,))[0] != 1:
             raise _error("another process is migrating this database", "one at a time", "wait until it has ended")
         if left := _plan().open:

@@ -17,6 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline.errors import PblError
+from schemas import connection
 from schemas.cli.db import db
 from schemas.operations import embedded
 from schemas.operations.embedded import binaries, process, server
@@ -438,9 +439,11 @@ def test_never_set_up_is_not_running(tmp_path: Path):
 
 
 def test_a_server_that_keeps_silent_is_given_up(tmp_path: Path):
+    assert connection.CONNECT_TIMEOUT_S <= 5.0
+    impatient = f"from schemas import connection; connection.CONNECT_TIMEOUT_S = 1.0; {CONNECT}"
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = str(silent.getsockname()[1])
-        done, seconds = python(tmp_path, CONNECT, DJ_HOST="127.0.0.1", DJ_PORT=port, DJ_USER="u", DJ_PASS="p")
+        done, seconds = python(tmp_path, impatient, DJ_HOST="127.0.0.1", DJ_PORT=port, DJ_USER="u", DJ_PASS="p")
     assert "DB_NOT_RUNNING" in done.stderr
     assert seconds < 10
 

@@ -493,7 +493,8 @@ def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_miss
     assert pbl("status").code == 0
 
 
-def test_one_process_migrates_at_a_time(database: Path):
+def test_one_process_migrates_at_a_time(database: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("schemas.migrations._run.LOCK_S", 1)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 0)", (f"{connection.prefix()}_migrate",))
         assert cursor.fetchone() == (1,)

@@ -13,6 +13,8 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pymysql
 import pytest
@@ -380,11 +382,11 @@ def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(t
 
 def test_a_job_beyond_its_time_limit_is_ended(tables, tmp_path: Path, quick: None):
     ids = register(*videos(tmp_path, "walk1", "hangs", "walk2"))
-    factor = 10.0 / registry.stage_of("VideoInfo").limit_s
+    factor = 4.0 / registry.stage_of("VideoInfo").limit_s
     assert supervise(resource="decode", limit_factor=factor) == 0
     (error,) = pipeline_status().errors
     assert (error.code, error.about) == ("TIME_LIMIT", "hangs.mp4")
-    assert "time limit of 10 s" in error.found
+    assert "time limit of 4 s" in error.found
     assert sorted(video.VideoInfo.to_arrays("video_id")) == [ids[0], ids[2]]
     assert jobs_left()["VideoInfo"] == {"error": 1}
 
@@ -402,6 +404,23 @@ def test_sigterm_lets_the_job_in_hand_end_or_puts_it_back(tables, tmp_path: Path
             lab.Subject.delete(prompt=False, part_integrity="cascade")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
     assert all(w["worker_stopped"] for w in worker.Worker.to_dicts())
+
+
+def test_processes_that_are_to_end_at_once_get_one_signal_and_not_two_together(monkeypatch):
+    sent: list[int] = []
+    monkeypatch.setattr(os, "kill", lambda _, signum: sent.append(signum))
+    for grace_s, expected in ((0.0, [signal.SIGUSR1]), (60.0, [signal.SIGTERM])):
+        boss = Supervisor(Options(grace_s=grace_s))
+        child: Any = SimpleNamespace(process=SimpleNamespace(is_alive=lambda: True, pid=1))
+        boss._children = [child]
+        boss.stop()
+        boss._send_due()
+        boss._send_due()
+        assert sent == expected
+        sent.clear()
+    boss.stop()  # again: no longer wait for the jobs
+    boss._send_due()
+    assert sent == [signal.SIGUSR1]
 
 
 def test_a_phone_does_not_wait_for_the_job_in_hand(tables: None, tmp_path: Path, quick: None):
@@ -423,6 +442,7 @@ def test_a_phone_does_not_wait_for_the_job_in_hand(tables: None, tmp_path: Path,
     phone = seen.pop("waits for a recording of a phone")
     assert phone == os.getpriority(os.PRIO_PROCESS, 0)
     assert [*seen.values()] == [min(phone + BATCH_NICE, 19)]
+    assert all(w["worker_stopped"] for w in worker.Worker.to_dicts())  # neither had to be killed
 
 
 def test_the_process_for_phones_ends_with_the_others(tables: None, tmp_path: Path):

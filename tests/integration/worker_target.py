@@ -1,11 +1,13 @@
 """What the processes of a worker run in tests: the real one, behind stand-ins for the slow stages.
 
 A recording's name says what it does to the process that probes it: `kills` ends it at once, `hangs` never returns,
-`slow` takes seconds. Tracking of an `hour` ends when there is a file of its name and `.go`.
+`slow` ends soon after its process was told to end. Tracking of an `hour` ends when there is a file of its name and
+`.go`.
 """
 
 import os
 import signal
+import threading
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,7 +17,7 @@ import pytest
 
 import pbl_pipeline.tracking
 import pbl_pipeline.video
-from workers import heartbeat, process
+from workers import heartbeat, loop, process
 from workers.process import Options
 
 from . import chain
@@ -34,8 +36,13 @@ def work(options: Options, pipe: Connection) -> None:
         if "hangs" in name:
             time.sleep(3600)
         if "slow" in name:
+            told, told_to_end = threading.Event(), signal.getsignal(signal.SIGTERM)
+            assert callable(told_to_end)
+            signal.signal(signal.SIGTERM, lambda *given: (told.set(), told_to_end(*given)))
             _note(path, "begun")
-            time.sleep(3.0)
+            while not told.is_set():
+                time.sleep(0.05)
+            time.sleep(0.3)
         return real(path)
 
     def track_people(path: Path, *more: Any, **named: Any) -> Any:
@@ -46,6 +53,10 @@ def work(options: Options, pipe: Connection) -> None:
     patch.setattr(pbl_pipeline.video, "probe", probe)
     patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     patch.setattr(heartbeat, "PERIOD_S", 0.2)
+    # Shorter pauses than in production.
+    patch.setattr(loop, "IDLE_S", (0.1, 1.0))
+    patch.setattr(loop, "PHONE_S", 0.2)
+    patch.setattr(loop, "LONG_EVERY_S", 0.5)
     process.work(options, pipe)
 
 

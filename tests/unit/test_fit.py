@@ -40,7 +40,8 @@ TIME_S = np.arange(0, 2.6, 1 / 30)
 def quick(steps: int = 1500) -> Paramset:
     """`implicit-adam` with the demo's priors and full weight on 3D, because the synthetic points are metric."""
     cost = dataclasses.replace(METHODS["blazepose"].params.cost, weight_3d=1.0)
-    params = ImplicitAdamParams(steps=steps, samples_per_trial=64, start="keypoints", cost=cost)
+    small = {"samples_per_trial": 32, "hidden": (256, 256)}
+    params = ImplicitAdamParams(steps=steps, start="keypoints", cost=cost, **small)
     return Paramset.of("fit", "test", 1, params)
 
 

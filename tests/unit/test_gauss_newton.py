@@ -46,7 +46,7 @@ from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import walk_qpos
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("little_optimised")]
 
 TIME_S = np.arange(24) / 30
 

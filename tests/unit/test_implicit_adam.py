@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -57,6 +58,16 @@ def handheld():
         observe(q, TIME_S, seed=i, camera_motion="handheld", noise=NO_NOISE, sensor=still) for i, q in enumerate(qpos)
     ]
     return qpos, seen, session_of(*(s.keypoints for s in seen), motion="handheld")
+
+
+@pytest.fixture
+def few_steps_a_call(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The compiled loop does 5 steps instead of 250."""
+    compiled: Any = implicit._run_chunk
+    monkeypatch.setattr(implicit, "CHUNK", 5)
+    compiled.clear_cache()  # of the same sizes with other steps
+    yield
+    compiled.clear_cache()
 
 
 def test_keypoint_terms_against_the_formula_in_double_precision(handheld):
@@ -148,6 +159,7 @@ def test_time_encoding_covers_the_band_and_is_padded_with_nothing():
     assert np.all(code[:, [5, 6, 7, 13, 14, 15]] == 0)
 
 
+@pytest.mark.usefixtures("little_optimised")
 def test_trajectories_use_the_encoding_again_and_do_not_depend_on_their_number():
     shape = 16, (12, 12, 12, 12), 2, 43
     two, four = initial_trajectories(3, 2, *shape), initial_trajectories(3, 4, *shape)
@@ -179,6 +191,7 @@ def test_the_paper_starts_ahead_of_the_cameras_median_orientation(handheld):
     np.testing.assert_allclose(qpos[6:], (0.5 * (low + high))[6:])
 
 
+@pytest.mark.usefixtures("little_optimised")
 def test_the_solver_begins_at_its_start(handheld):
     """Before the first step the trajectory is nearly constant at the start pose and orientation."""
     _, _, session = handheld
@@ -314,7 +327,8 @@ def test_markers_in_the_world_and_several_cameras_are_fitted(kind):
     assert solution.R_nc.shape[1] == (0 if kind == "markers" else len(views.views))
 
 
-def test_a_loss_that_is_not_finite_is_told(handheld):
+@pytest.mark.usefixtures("little_optimised")
+def test_a_loss_that_is_not_finite_is_told(handheld, few_steps_a_call):
     _, _, session = handheld
     broken = dataclasses.replace(
         session, problem=dataclasses.replace(session.problem, x_cam=session.problem.x_cam * np.nan)
