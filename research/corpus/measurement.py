@@ -519,7 +519,7 @@ def measure_errors(seen: Sequence[Seen]) -> pd.DataFrame:
         for s, o in zip(own, off, strict=True):
             by_walk.setdefault((s.walk, s.view, s.visit), []).append(o)
         pairs = np.array([p for p in by_walk.values() if len(p) == 2]) - pd.DataFrame(off).mean().to_numpy()
-        common = np.sqrt(pd.DataFrame(pairs[:, 0] * pairs[:, 1]).mean().clip(lower=0)).to_numpy()
+        common = np.sqrt(pd.DataFrame(pairs[:, 0] * pairs[:, 1]).mean().clip(lower=0).to_numpy())
         for k, name in enumerate(MEASURES):
             if np.isfinite(off[:, k]).sum() > 10:
                 values = off[:, k]

@@ -109,7 +109,8 @@ def test_without_the_network_those_who_do_not_sit_are_fitted_all_the_same(monkey
     monkeypatch.setattr(per_frame, "_solution", lambda *_: "a solution")
     gone = PblError("ASSET_MISSING", found="no network", expected="a file", next_step="fetch it")
     monkeypatch.setattr(augmented_pelvis, "_augmenter", lambda: Tipped(gone))
-    assert list(per_frame.solve_per_frame(sessions, METHODS.find("blazepose").params, starts)) == [gone, "a solution"]
+    method = METHODS["blazepose"]
+    assert list(method.function(sessions, method.params, starts)) == [gone, "a solution"]
 
 
 def test_who_sits_and_could_not_be_asked_about_is_told():
