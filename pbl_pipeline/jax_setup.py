@@ -62,7 +62,8 @@ def known_flags(version: str, more: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Return the flags that the libraries of this version of JAX know, those of its plugins included."""
     if tuple(int(n) for n in version.split(".")[:2]) > FLAGS_UNTIL:
         return ()
-    return (*GPU_FLAGS, *more) if importlib.util.find_spec("jax_plugins") else (*GPU_FLAGS, CPU_FLAG, *more)
+    cpu_alone = importlib.util.find_spec("jax_plugins") is None
+    return (*GPU_FLAGS, *more, *([CPU_FLAG] if cpu_alone else []))
 
 
 _COMPILED = {"seconds": 0.0}

@@ -41,7 +41,7 @@ MOST_DIFFERENCE = 1e-3
 #: Otherwise XLA records its calls in graphs, and any call of the decoder meanwhile makes the recording fail.
 NO_GRAPHS = "--xla_gpu_enable_command_buffer="
 #: Number of networks that use the device at a time, and of videos that are decoded.
-_AT_ONCE, _VIDEOS_AT_ONCE = 2, 8
+_NETWORKS_AT_ONCE, _VIDEOS_AT_ONCE = 2, 8
 
 
 class Program:
@@ -133,7 +133,7 @@ class _Served:
         while True:
             for key, _ in self._selector.select(1.0):
                 connection, pictures = key.data
-                places = received(connection)
+                places = _places(connection)
                 if not places:
                     self._drop(connection)
                 for place in places:
@@ -174,8 +174,8 @@ class _Served:
                     continue
 
 
-def received(connection: socket.socket) -> bytes:
-    """Return what a connection has sent; nothing if it ended."""
+def _places(connection: socket.socket) -> bytes:
+    """Return where the pictures are that a connection has sent; nothing if it ended."""
     try:
         return connection.recv(AT_ONCE)
     except OSError:
@@ -199,7 +199,7 @@ class Server:
         self._any_device, self._idle_s, self._batch = any_device, idle_s, batch
         self._served: dict[NetworkSpec, _Served] = {}
         self._locks: dict[NetworkSpec, threading.Lock] = {}
-        self._device = threading.Semaphore(_AT_ONCE)
+        self._device = threading.Semaphore(_NETWORKS_AT_ONCE)
         self._decoder, self._decoding = decoder, threading.Semaphore(_VIDEOS_AT_ONCE)
         self._readers = set[socket.socket]()  # connections whose videos are decoded
         self._opening = 0

@@ -10,6 +10,7 @@ do. A first round, of one video a process, loads the networks and is not counted
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import time
 from collections.abc import Sequence
@@ -42,11 +43,6 @@ def keep_frames() -> None:
     _OPEN.enter_context(frames_kept())
 
 
-def measured(video: Path, method: str) -> dict[str, Any]:
-    """Detect keypoints in a video; return the figures of `pbl_pipeline.bench.detect_case`."""
-    return measure(video, None, 1, method)
-
-
 def keypoints_of(video: Path, folder: Path, method: str, device: str) -> Keypoints:
     """Return the keypoints of a video's subject, all networks computed on a device."""
     os.environ["PBL_ONNX_DEVICE"] = device
@@ -62,12 +58,13 @@ def differences(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray]:
 
 def rate(videos: Sequence[Path], method: str, processes: int) -> tuple[float, float, list[dict[str, Any]]]:
     """Return frames a second over all videos, the seconds of the first round, and the figures of each video."""
+    measured = functools.partial(measure, person=None, repeat=1, keypoints=method)
     with shared_cores(processes), ProcessPoolExecutor(processes, get_context("spawn"), keep_frames) as pool:
         begin = time.perf_counter()
-        list(pool.map(measured, videos[:processes], [method] * processes))
+        list(pool.map(measured, videos[:processes]))
         first = time.perf_counter() - begin
         begin = time.perf_counter()
-        done = list(pool.map(measured, videos, [method] * len(videos)))
+        done = list(pool.map(measured, videos))
         return sum(d["frames"] for d in done) / (time.perf_counter() - begin), first, done
 
 

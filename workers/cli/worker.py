@@ -110,13 +110,14 @@ def worker(
 
 def options_of(resource: str, processes: int | str | None, batch: int | None = None, **others: Any) -> Options:
     """Options of a worker on this machine. processes, batch: as given on the command line."""
-    from pbl_pipeline.models.gpu_address import gpu_wanted
     from pbl_pipeline.resources import cores, memory_bytes
     from workers.process import Options, given_gpus
 
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
-        waits = DETECTOR in GROUPS[resource] and gpu_wanted()
+        from pbl_pipeline.models import gpu_wanted
+
+        waits = DETECTOR in GROUPS[resource] and gpu_wanted()  # for the networks, most of the time
         room = min((2 if waits else 1) * cores(), memory_bytes() // MEMORY_EACH)
         processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
     return Options(
