@@ -20,7 +20,7 @@ from pbl_pipeline.temporary import new_folder
 
 from . import progress, settings
 from .errors import PblError
-from .files import one_process
+from .files import one_process, sha256_of
 from .packages import CLIENTS, Package
 from .shipped import shipped_text
 
@@ -181,18 +181,13 @@ def _extract(path: Path, package: Package) -> None:
 
 
 def _check_package(path: Path, package: Package, next_step: str) -> None:
-    found = _sha256(path)
+    found = sha256_of(path)
     if found != package.sha256:
         raise _checksum(package.filename, found, package.sha256, next_step)
 
 
 def _is_pinned(path: Path, sha256: str) -> bool:
-    return path.is_file() and _sha256(path) == sha256
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return path.is_file() and sha256_of(path) == sha256
 
 
 def _missing(asset: Asset, found: str) -> PblError:

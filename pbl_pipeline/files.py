@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 import os
 import time
@@ -23,6 +24,12 @@ Shape = tuple[int | None, ...]
 _WIDEST_PX = 100_000
 _unwritable = functools.partial(PblError, "FILE_UNWRITABLE", next_step="pass another place with --out")
 _bad_field = functools.partial(PblError, "FILE_FORMAT", next_step="write the field as docs/files.md describes it")
+
+
+def sha256_of(path: str | Path) -> str:
+    """SHA-256 of a file as 64 hex digits, computed in pieces. Raises OSError."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:

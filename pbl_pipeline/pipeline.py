@@ -12,6 +12,7 @@ from pathlib import Path
 from pbl_pipeline import progress
 from pbl_pipeline.deidentify import to_show
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import Params as FitParams
 from pbl_pipeline.fit import TrialFit, check_trial, default_fit, fit_session
@@ -31,7 +32,7 @@ from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
-from pbl_pipeline.video import PhoneLog, attitude_of, find_camera, frames_kept, probe, read_phone_log, sha256_of
+from pbl_pipeline.video import PhoneLog, attitude_of, check_file, find_camera, frames_kept, probe, read_phone_log
 from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit, save_visit
 
 
@@ -80,7 +81,7 @@ def run_visit(
     for path, name, log in zip(paths, distinct_names(paths), logs, strict=True):
         one = _Input(path, name, log, out, camera_file, person, people.paramset, keypoints.paramset, method.paramset)
         try:
-            first = seen.setdefault(sha256_of(path), name)
+            first = seen.setdefault(sha256_of(check_file(path)), name)
             if first != name:
                 raise _named_twice(path, first)
         except PblError as error:

@@ -7,13 +7,13 @@ range as it is. Curves are not in it, so it makes no bands and no norm.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from pathlib import Path
 
 import click
 import pandas as pd
 
+from pbl_pipeline.files import sha256_of
 from research.paths import PACKAGE
 
 #: Our angle -> column (deg).
@@ -31,7 +31,7 @@ def build(path: Path) -> dict:
         "source": "138 able-bodied adults of Van Criekinge et al. 2023, as tabulated in "
         "DavidR-CSIC/Proyecto_Modulo1_Human_motion_analysis at commit d4d1ae7",
         "licence": "CC BY 4.0 (the source's); mean and standard deviation of its figures",
-        "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "source_sha256": sha256_of(path),
         "n": len(people),
         "age": [int(age.min()), int(age.max())],
         "speed_m_per_s": [round(float(speed.mean()), 2), round(float(speed.std(ddof=1)), 2)],

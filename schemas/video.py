@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.words import UNUSABLE
 
 from . import lab, session  # noqa: F401  the definitions refer to them
@@ -339,11 +340,11 @@ def unknown_video(video_id: int) -> PblError:
 def registered_file(path: str, sha256: str, key: dict) -> Path:
     """The video file, after checking that it is still the one that was registered. Raises `PblError` VIDEO_MISSING,
     VIDEO_CHANGED."""
-    from pbl_pipeline.video import sha256_of
+    from pbl_pipeline.video import check_file
 
     if not Path(path).is_file():
         raise _missing(path, key)
-    found = sha256_of(path)
+    found = sha256_of(check_file(path))
     if found != sha256:
         raise PblError(
             "VIDEO_CHANGED",

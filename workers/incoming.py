@@ -24,8 +24,9 @@ from pathlib import Path, PurePosixPath
 import pymysql
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
-from pbl_pipeline.video import read_first, read_phone_log, sha256_of
+from pbl_pipeline.video import read_first, read_phone_log
 from schemas import video, worker
 from schemas.connection import dj
 from schemas.intake import OneCamera, Registered, Sensors, VisitRecord, register

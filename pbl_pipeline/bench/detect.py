@@ -70,9 +70,9 @@ def run_detect(
             note("making a clip of 1920x1080 from the demo recording")
             path = demo_clip(folder / "demo1080.mp4")
         else:
-            from pbl_pipeline.video import sha256_of
+            from pbl_pipeline.video import check_file
 
-            sha256_of(video)  # raises what is wrong with the file before anything is measured
+            check_file(video)  # raises what is wrong with the file before anything is measured
             path = video
         for method in keypoints or [""]:
             note(f"measuring {method}".strip())

@@ -18,11 +18,11 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_out_file
+from pbl_pipeline.files import check_out_file, sha256_of
 from pbl_pipeline.render import draw_skeleton
 from pbl_pipeline.runs import ranges
 from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
-from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, sha256_of, write_h264
+from pbl_pipeline.video import VideoInfo, probe, read_frames, read_metadata, write_h264
 
 from .heads_of_video import find_heads
 from .types import REASONS, HeadParams, Heads

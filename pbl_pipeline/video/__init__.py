@@ -15,7 +15,8 @@ from .camera import (
     viewing_ray,
 )
 from .clock import attitude_of, load_attitude
-from .file_facts import check_timing, packet_times, probe, read_first, read_metadata, recorded_utc, sha256_of
+from .decode import check_file
+from .file_facts import check_timing, packet_times, probe, read_first, read_metadata, recorded_utc
 from .frames import read_frames
 from .h264 import write_h264
 from .kept import frames_kept, release_frames

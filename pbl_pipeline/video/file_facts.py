@@ -9,7 +9,6 @@ iPhone exported nothing shows it.
 from __future__ import annotations
 
 import datetime
-import hashlib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from av.video.reformatter import VideoReformatter
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
 from pbl_pipeline.qc import FAIL, PASS, Check
 from pbl_pipeline.runs import runs
@@ -217,15 +217,6 @@ def _at_ends(usual: np.ndarray, ever: np.ndarray) -> tuple[float, float] | None:
     filled = usual[:, across].mean(axis=1)
     sharp = min(filled[top : top + 2].max(), filled[max(0, end - 2) : end].max()) >= _AT_EDGE
     return widths if sharp and max(ever[:top].mean(), ever[end:].mean()) <= _OUTSIDE else None
-
-
-def sha256_of(path: str | Path) -> str:
-    """SHA-256 of a video file as 64 hex digits, computed in pieces.
-
-    Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY.
-    """
-    with check_file(path).open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.body import joint_angles, load_body, load_marker_set
+from pbl_pipeline.files import sha256_of
 from tests.inputs import CALIBRATION, csv_log
 from tests.walking_fit import walking_fit
 
@@ -503,7 +504,6 @@ def use_listing(path: Path) -> None:
     """The files of a backup by their checksums; none of them is there."""
     from pbl_pipeline.errors import PblError
     from schemas.operations import backup
-    from schemas.operations.backup_files import sha256_of
 
     folder = path.parent / "listed"
     folder.mkdir(exist_ok=True)

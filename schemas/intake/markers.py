@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from pbl_pipeline import methods as library_methods
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.temporary import new_folder
 
@@ -73,7 +74,6 @@ class LaboratoryMarkers(Recording):
     def read(self) -> None:
         """Read the markers. Raises `PblError` FILE_MISSING, FILE_FORMAT, MARKER_SET_UNKNOWN, USAGE."""
         from pbl_pipeline.fit import read_markers
-        from pbl_pipeline.video import sha256_of
 
         (path,) = self.paths
         check_path(path)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_height, check_label, check_mass, is_plain
 
 from .. import fit, gait, gdi, kinetics, lab, session, video
@@ -137,14 +138,14 @@ class File:
     def of(cls, path: Path) -> File:
         """Read the bytes of a file. Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY; USAGE for a path that no row can
         hold."""
-        from pbl_pipeline.video import sha256_of
+        from pbl_pipeline.video import check_file
 
         if not os.path.isfile(path):  # not Path.is_file: that raises where a folder on the way may not be entered
             raise _no_video("VIDEO_MISSING", "it is not a file" if os.path.exists(path) else "no such file", path)
         check_path(path)
         if not path.stat().st_size:
             raise _no_video("VIDEO_EMPTY", "0 bytes", path)
-        return cls(path, sha256_of(path), path.stat().st_size)
+        return cls(path, sha256_of(check_file(path)), path.stat().st_size)
 
 
 class Recording:

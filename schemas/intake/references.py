@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import fields_of
+from pbl_pipeline.files import fields_of, sha256_of
 from pbl_pipeline.names import check_label, whole_number
 from pbl_pipeline.paramset import canonical_json
 from pbl_pipeline.temporary import new_folder
@@ -124,8 +124,6 @@ def add_reference(
     `about`: number, path or unique file name of the video. `dataset`, `source`, `origin`: collection it is reported
     with (None: as it was, else "unnamed"), instrument (None: as the file states), origin (None: the path).
     """
-    from pbl_pipeline.video import sha256_of
-
     for what, text in (("dataset", dataset), ("source", source), ("origin", origin)):
         if text is not None:
             check_label(f"--{what}", text, _LONGEST[what], least=1)
@@ -228,7 +226,7 @@ def _insert(row: dict[str, Any], truth: lib.Reference, path: Path, sha256: str, 
 
 def find_video(about: int | str | Path) -> int:
     """Return the number of a registered video by its number, path, or file name. Raises DB_NOT_FOUND, USAGE."""
-    from pbl_pipeline.video import sha256_of
+    from pbl_pipeline.video import check_file
 
     text = str(about)
     if (number := whole_number(text)) is not None:
@@ -237,7 +235,7 @@ def find_video(about: int | str | Path) -> int:
         path = Path(text).absolute()
         found = (video.Video & {"video_path": str(path)}).to_arrays("video_id")
         if not len(found) and path.is_file():
-            found = (video.Video & {"video_sha256": sha256_of(path)}).to_arrays("video_id")
+            found = (video.Video & {"video_sha256": sha256_of(check_file(path))}).to_arrays("video_id")
         if not len(found):
             found = (video.Video & {"video_name": Path(text).name}).to_arrays("video_id")
     if len(found) == 1:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.temporary import new_folder
 
 from .. import keypoints, video
@@ -92,8 +93,6 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
 
 
 def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
-    from pbl_pipeline.video import sha256_of
-
     own = video.WearableImu & key
     if own & {"imu_sha256": sha256_of(path)}:
         return []
@@ -105,8 +104,6 @@ def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
 def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:
     """Insert a copy of a file as the row with this key; return "attached", "replaced" for an older one, or "" for the
     same bytes."""
-    from pbl_pipeline.video import sha256_of
-
     before = (table & key).to_dicts()
     with new_folder() as folder:
         copy = folder / f"{prefix}{path.suffix if path.is_file() else '.zip'}"

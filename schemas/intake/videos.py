@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_label
 from pbl_pipeline.temporary import new_folder
 
@@ -63,7 +64,7 @@ class SeveralCameras(Recording):
         two, or other frames or times), USAGE; RefusedFile: one of the videos cannot be read.
         """
         from pbl_pipeline.keypoints import cameras_of_files, check_same_times
-        from pbl_pipeline.video import load_camera_poses, packet_times, sha256_of
+        from pbl_pipeline.video import load_camera_poses, packet_times
 
         paths, names = self.paths, list(load_camera_poses(self.calibration))
         if len(paths) < 2:

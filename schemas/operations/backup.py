@@ -28,12 +28,13 @@ from pbl_pipeline import progress
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from schemas import connection
 from schemas.operations.folders import make_private, private_folder, write_json
 from schemas.store import check_store, store_error, store_errors
 
 from . import backup_files, catalog
-from .backup_files import PARTS, listed, safe_path, sha256_of, unwritable
+from .backup_files import PARTS, listed, safe_path, unwritable
 from .catalog import Column, quote
 
 FORMAT = 1

@@ -15,7 +15,6 @@ import contextlib
 import dataclasses
 import functools
 import gzip
-import hashlib
 import json
 import os
 import re
@@ -30,6 +29,7 @@ from pymysql.cursors import SSCursor
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError, os_errors_as
+from pbl_pipeline.files import sha256_of
 
 from .catalog import Column, quote
 
@@ -148,12 +148,6 @@ def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
     for line in (folder / f"{part}.sha256").read_text(encoding="utf-8", errors="replace").splitlines():
         sha, _, path = line.partition("  ")
         yield sha, str(safe_path(path))
-
-
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file in hex, without the libraries that `pbl_pipeline.video.sha256_of` loads."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclasses.dataclass

@@ -21,6 +21,7 @@ from typing import Any
 
 from pbl_pipeline import progress, settings, temporary
 from pbl_pipeline.errors import PblError, os_errors_as
+from pbl_pipeline.files import sha256_of
 from schemas import connection, fit, lab, session, video, worker
 from schemas.datajoint_setup import RightMissing, full_path
 from schemas.intake.uploads import Bucket, Folder, Upload, drop_folder
@@ -37,7 +38,7 @@ from .catalog import Column, quote
 
 def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict[str, str]]:
     """Delete videos that are unchanged since registration; return deleted paths, and path -> reason of those kept."""
-    from pbl_pipeline.video import sha256_of
+    from pbl_pipeline.video import check_file
 
     gone, kept = [], {}
     for item in videos:
@@ -48,7 +49,7 @@ def delete_registered(videos: Sequence[dict[str, Any]]) -> tuple[list[str], dict
             kept[str(path)] = "it is not a plain file"
         elif video.Video & {"video_path": str(path)}:
             kept[str(path)] = "another row names this path"
-        elif path.stat().st_size != item["size"] or sha256_of(path) != item["sha256"]:
+        elif path.stat().st_size != item["size"] or sha256_of(check_file(path)) != item["sha256"]:
             kept[str(path)] = "it holds other bytes than were registered: another file took its place"
         else:
             try:

@@ -15,6 +15,7 @@ import pytest
 
 import schemas
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from schemas import connection, gait, lab, load_visit, migrations, video
 from schemas.intake import VisitRecord, ingest
 from schemas.operations import backup, backup_files, embedded
@@ -185,7 +186,7 @@ def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, 
     (saved / "outside").write_bytes((saved / "store" / path).read_bytes())
     (saved / "store.sha256").write_text(listing.replace(path, "../outside", 1))
     manifest = json.loads((saved / "manifest.json").read_text())
-    manifest["sha256"]["store.sha256"] = backup_files.sha256_of(saved / "store.sha256")
+    manifest["sha256"]["store.sha256"] = sha256_of(saved / "store.sha256")
     (saved / "manifest.json").write_text(json.dumps(manifest))
     assert pbl("db", "restore", saved).error_code == "BACKUP_INVALID"
     (saved / "manifest.json").unlink()
@@ -193,7 +194,7 @@ def test_a_changed_backup_is_refused_before_anything_is_written(elsewhere: Any, 
     assert everything() == {}
     # One of before recordings were saved is whole without their number.
     (saved / "store.sha256").write_text(listing)
-    manifest["sha256"]["store.sha256"] = backup_files.sha256_of(saved / "store.sha256")
+    manifest["sha256"]["store.sha256"] = sha256_of(saved / "store.sha256")
     del manifest["n_recordings"]
     (saved / "manifest.json").write_text(json.dumps(manifest))
     assert backup.check(saved)["n_recordings"] == 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.video import sha256_of
+from pbl_pipeline.files import sha256_of
 from research.benchmarks.many_recordings import archived, register_many
 from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
 from schemas.intake import LaboratoryMarkers, Methods, SeveralCameras, VisitRecord, ingest, register

@@ -11,7 +11,8 @@ import pbl_pipeline.deidentify.video_copy
 import schemas
 from pbl_pipeline.deidentify import Head, Heads
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.video import VideoInfo, probe, sha256_of
+from pbl_pipeline.files import sha256_of
+from pbl_pipeline.video import VideoInfo, probe
 from schemas import jobs, privacy
 from schemas.operations.forget import forget
 from schemas.reading.status import pipeline_status

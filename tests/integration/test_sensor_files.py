@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.fit
-import pbl_pipeline.video
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
 from schemas import fit, keypoints, lab, load_visit, qc, video
 from schemas.intake import Sensors, VisitRecord, ingest
@@ -133,7 +133,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     assert list(video.WearableImu.to_arrays("imu_name", order_by="imu")) == ["left.csv", "right.csv"]
     for number, content in ((1, b"left"), (2, b"right")):
         row = (video.WearableImu & {"imu": number}).fetch1()
-        assert row["imu_sha256"] == pbl_pipeline.video.sha256_of(left if number == 1 else right)
+        assert row["imu_sha256"] == sha256_of(left if number == 1 else right)
         with stored_file(file_ref(row["imu_file"])) as kept:
             assert kept.read_bytes() == content
     assert pbl("ingest", path, "--subject", "P001", "--imu", empty).error_code == "FILE_FORMAT"

@@ -8,7 +8,7 @@ from typing import Any
 import av
 import pytest
 
-from pbl_pipeline.video import sha256_of
+from pbl_pipeline.files import sha256_of
 from schemas import fit, privacy
 from schemas.origin import Origin
 from tests.german import REPORT_NAMES, english_of, english_words

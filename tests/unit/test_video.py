@@ -18,9 +18,11 @@ import pytest
 from av.container import OutputContainer
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_pipeline.video import (
     Frame,
     VideoInfo,
+    check_file,
     decode,
     frames,
     frames_kept,
@@ -32,7 +34,6 @@ from pbl_pipeline.video import (
     read_first,
     read_frames,
     release_frames,
-    sha256_of,
 )
 from research.benchmarks.hostile import KINDS
 from tests import refused
@@ -268,7 +269,7 @@ def test_missing_and_empty(tmp_path):
     (tmp_path / "empty.mp4").touch()
     assert code_of(tmp_path / "empty.mp4") == "VIDEO_EMPTY"
     refused("VIDEO_MISSING", read_frames, tmp_path / "absent.mp4")  # at the call, not at the first frame
-    refused("VIDEO_EMPTY", sha256_of, tmp_path / "empty.mp4")
+    refused("VIDEO_EMPTY", check_file, tmp_path / "empty.mp4")
 
 
 def test_not_a_video(tmp_path):

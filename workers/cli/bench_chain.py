@@ -60,12 +60,12 @@ def chain(
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.resources import cores
     from pbl_pipeline.temporary import new_folder
-    from pbl_pipeline.video import sha256_of
+    from pbl_pipeline.video import check_file
 
     if json_path is not None:
         check_out_file(json_path)
     if video is not None:
-        sha256_of(video)  # raises what is wrong with the file before anything is measured
+        check_file(video)  # raises what is wrong with the file before anything is measured
     options = options_of("all", processes, once=True, selftest=False)
     with new_folder() as folder:
         found = _measure(folder, video, videos or 4 * options.processes, options)

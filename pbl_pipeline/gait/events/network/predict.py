@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import PchipInterpolator
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 
 from .features import GRID_HZ, features, heading, leg_length
 
@@ -144,7 +144,7 @@ def check_model(model: str, sha256: str) -> None:
 @functools.cache
 def model_sha256(model: str) -> str:
     """SHA-256 of the weights' file."""
-    return hashlib.sha256(model_path(model).read_bytes()).hexdigest()
+    return sha256_of(model_path(model))
 
 
 @functools.cache
