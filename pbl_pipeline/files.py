@@ -32,14 +32,23 @@ def sha256_of(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def load_npz(path: str | Path, fields: Collection[str]) -> dict[str, Any]:
-    """Those of `fields` that an .npz file has. Reads no other array and never unpickles.
+def load_npz(
+    path: str | Path,
+    fields: Collection[str] = (),
+    needed: Collection[str] = (),
+    next_step: str = "write the fields as docs/files.md describes them",
+) -> dict[str, Any]:
+    """Those of `fields` that an .npz file has, and all of `needed`. Reads no other array and never unpickles.
 
     Raises `PblError` FILE_MISSING: no such file, or it cannot be read. FILE_FORMAT: not an .npz, damaged, with pickled
-    objects, or more than `bounded.MAX_ARRAYS`.
+    objects, more than `bounded.MAX_ARRAYS`, or without a field of `needed` (advice: `next_step`).
     """
     with _coded(path):
-        return read_npz(path, fields)
+        data = read_npz(path, {*fields, *needed})
+    if missing := [k for k in needed if k not in data]:
+        expected = f"the fields {', '.join(needed)}"
+        raise PblError("FILE_FORMAT", f"no {', '.join(missing)}", expected, next_step, path)
+    return data
 
 
 def fields_of(path: str | Path) -> frozenset[str]:

@@ -309,7 +309,7 @@ def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha
     """The `Tracking` from the npz that `save_tracking` wrote and the row's figures. Raises FILE_FORMAT."""
     from pbl_pipeline import tracking as lib
 
-    data = load_npz(path, ("time_s", "person_id", "box_px", "roi_px", "score", "observed"))
+    data = load_npz(path, needed=("time_s", "person_id", "box_px", "roi_px", "score", "observed"))
     n, t = data["person_id"].size, data["time_s"].size
     shapes = {"time_s": (t,), "person_id": (n,), "box_px": (n, t, 4), "roi_px": (n, t, 4)}
     check_numbers(path, data, {**shapes, "score": (n, t), "observed": (n, t)})

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
@@ -60,15 +59,8 @@ def save_curves(cycles: Sequence[GaitCycle], path: Path) -> None:
 
 def load_curves(path: Path) -> dict[int, Curves]:
     """Return the curves by cycle number. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
-    data = load_npz(path, ("cycle_no", "names", "curve", "curve_sd", "error_model"))
-    if missing := {"cycle_no", "names", "curve"} - data.keys():
-        raise PblError(
-            "FILE_FORMAT",
-            found=f"no {', '.join(sorted(missing))}",
-            expected="curves of gait cycles as `pbl run` writes them",
-            next_step="`pbl gait *.fit.npz --out metrics.json` writes them again",
-            key=str(path),
-        )
+    again = "`pbl gait *.fit.npz --out metrics.json` writes them again"
+    data = load_npz(path, ("curve_sd", "error_model"), needed=("cycle_no", "names", "curve"), next_step=again)
     names = texts_of(path, data, "names")
     curves = data["curve"]
     sd = data.get("curve_sd", np.full_like(curves, np.nan))  # absent in files of version 0.1 and before

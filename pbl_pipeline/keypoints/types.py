@@ -28,7 +28,8 @@ _OPTIONAL = (
     *("confidence_curve", "origin", "picture_time_s", "picture_luma", "picture_detail", "crop_px"),
 )
 _NO_SOURCE = "not stated in the keypoints file"
-_format_error = functools.partial(PblError, "FILE_FORMAT", next_step="see docs/files.md, section keypoints.npz")
+_FORMAT = "see docs/files.md, section keypoints.npz"
+_format_error = functools.partial(PblError, "FILE_FORMAT", next_step=_FORMAT)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,10 +169,7 @@ class Keypoints:
 
         Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID, PHONE_LOG.
         """
-        data = load_npz(path, (*_NEEDED, *_ASSUMED, *_OPTIONAL))
-        missing = [k for k in _NEEDED if k not in data]
-        if missing:
-            raise _format_error(f"{path} lacks {', '.join(missing)}", f"the fields {', '.join(_NEEDED)}")
+        data = load_npz(path, (*_ASSUMED, *_OPTIONAL), needed=_NEEDED, next_step=_FORMAT)
         assumed = tuple(k for k in _ASSUMED if k not in data)
         n, j = data["time_s"].size, data["names"].size
         arrays = {"time_s": (n,), "xy_px": (n, j, 2), "xyz_cam_m": (n, j, 3), "confidence": (n, j)}

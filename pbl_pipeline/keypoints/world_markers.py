@@ -23,9 +23,8 @@ _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _HEADER_LINES = 5
 #: Spread of the markers of a frame beyond that of a room, or below that of a body: the stated unit is wrong.
 _WIDEST_M, _NARROWEST_M = 50.0, 0.01
-_format_error = functools.partial(
-    PblError, "FILE_FORMAT", next_step="see docs/files.md, section markers of a laboratory"
-)
+_FORMAT = "see docs/files.md, section markers of a laboratory"
+_format_error = functools.partial(PblError, "FILE_FORMAT", next_step=_FORMAT)
 _damaged = functools.partial(
     PblError,
     "FILE_FORMAT",
@@ -182,10 +181,7 @@ class WorldMarkers:
     @classmethod
     def load(cls, path: str | Path) -> WorldMarkers:
         """Read the .npz of docs/files.md. Raises `PblError` FILE_MISSING, FILE_FORMAT. Never unpickles."""
-        data = load_npz(path, _FIELDS)
-        missing = [k for k in _FIELDS if k not in data]
-        if missing:
-            raise _format_error(f"no {', '.join(missing)}", f"the fields {', '.join(_FIELDS)}", key=path)
+        data = load_npz(path, needed=_FIELDS, next_step=_FORMAT)
         n, j = data["time_s"].size, data["names"].size
         check_numbers(path, data, {"time_s": (n,), "xyz_world_m": (n, j, 3), "confidence": (n, j)})
         names, marker_set = texts_of(path, data, "names"), text_of(path, data, "marker_set")

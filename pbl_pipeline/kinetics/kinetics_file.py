@@ -88,7 +88,7 @@ def load_arrays(path: Path) -> tuple[Series | None, dict[int, dict[str, Any]]]:
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT.
     """
-    data = load_npz(path, [*_SERIES, *_OF_CYCLES])
+    data = load_npz(path, _SERIES, needed=_OF_CYCLES)
     n, names = data["cycle_no"].size, texts_of(path, data, "names")
     curves = {k: (n, len(names), None) for k in ("curve", "curve_sd")}
     check_numbers(path, data, curves)

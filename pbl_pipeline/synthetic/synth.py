@@ -168,7 +168,7 @@ class Truth:
     @classmethod
     def load(cls, path: str | Path) -> Truth:
         """Read `truth.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT."""
-        data = load_npz(path, _FIELDS)
+        data = load_npz(path, needed=_FIELDS, next_step="make one with `pbl synth`")
         try:
             n, j = data["time_s"].size, data["outlier"].shape[-1]
             check_numbers(

@@ -197,16 +197,7 @@ class Reference:
 
         Raises `PblError` FILE_MISSING, FILE_FORMAT, REFERENCE_INPUT.
         """
-        data = load_npz(path, _FIELDS)
-        missing = [k for k in _FIELDS if k not in data]
-        if missing:
-            raise PblError(
-                "FILE_FORMAT",
-                found=f"it lacks {', '.join(missing)}",
-                expected="a file that Reference.save wrote",
-                next_step="see docs/validation.md, section The reference",
-                key=str(path),
-            )
+        data = load_npz(path, needed=_FIELDS, next_step="see docs/validation.md, section The reference")
         t, a = data["time_s"].size, data["names"].size
         check_numbers(path, data, {"time_s": (t,), "angles_deg": (t, a), "pelvis_m": (t, 3)})
         angles = {n: data["angles_deg"][:, i] for i, n in enumerate(texts_of(path, data, "names"))}

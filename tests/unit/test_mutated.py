@@ -86,6 +86,24 @@ def test_faults_in_arrays(tmp_path: Path, kind: str, change: Callable[[dict[str,
 
 
 @pytest.mark.parametrize(
+    ("kind", "field"),
+    [
+        ("walk.keypoints.npz", "names"),
+        ("lab.markers.npz", "confidence"),
+        ("walk.fit.npz", "qpos"),
+        ("walk.truth.npz", "spec"),
+        ("walk.kinetics.npz", "curve"),
+        ("tracking.npz", "observed"),
+        ("walk.reference.npz", "source"),
+    ],
+)
+def test_a_missing_array_is_named(tmp_path: Path, kind: str, field: str):
+    KINDS[kind].write(tmp_path / kind)
+    path = changed(tmp_path / kind, lambda arrays: arrays.pop(field))
+    assert field in refused("FILE_FORMAT", KINDS[kind].use, path).found
+
+
+@pytest.mark.parametrize(
     ("kind", "content", "code"),
     [
         ("metrics.json", '{"session": 3}', "FILE_FORMAT"),
