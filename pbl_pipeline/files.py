@@ -147,6 +147,17 @@ def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
     raise _bad_field(f"image_size_px {size_px.tolist()}", f"width and height in px, 1 to {_WIDEST_PX}", key=path)
 
 
+@contextmanager
+def complete_file(path: Path) -> Iterator[Path]:
+    """Yield a hidden name beside `path` to write to; the file appears as `path` when the block ends without an error."""
+    part = path.with_name(f".part{os.getpid()}-{path.name}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def check_out_folder(path: Path) -> None:
     """Make sure that a folder for results exists or can be made; makes nothing. Raises `PblError` FILE_UNWRITABLE."""
     _check_place(path, path)

@@ -18,7 +18,7 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_out_file, sha256_of
+from pbl_pipeline.files import check_out_file, complete_file, sha256_of
 from pbl_pipeline.render import draw_skeleton
 from pbl_pipeline.runs import ranges
 from pbl_pipeline.settings import DEIDENTIFY, deidentify_how
@@ -210,8 +210,7 @@ def deidentify(
     reasons = tuple(heads.reasons())
     status, reason = _status(heads, reasons)
     sidecar = sidecar_of(out)
-    part, part_of_sidecar = (p.with_name(f"{p.stem}.part{os.getpid()}{p.suffix}") for p in (out, sidecar))
-    try:
+    with complete_file(out) as part, complete_file(sidecar) as part_of_sidecar:
         write_h264(
             part,
             _pictures(video, info, heads, how),
@@ -223,11 +222,6 @@ def deidentify(
         done = Deidentified(out, sidecar, how, len(heads.heads), status, reason, reasons)
         content = _content(done, info, sha256_of(part), params, keep)
         part_of_sidecar.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        part_of_sidecar.replace(sidecar)
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
-        part_of_sidecar.unlink(missing_ok=True)
     return done
 
 

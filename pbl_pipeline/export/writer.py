@@ -17,7 +17,7 @@ from pbl_pipeline.body import Body, load_body
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
-from pbl_pipeline.files import check_out_folder
+from pbl_pipeline.files import check_out_folder, complete_file
 from pbl_pipeline.fit import METHODS, TrialFit
 from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, TrialMetrics
 from pbl_pipeline.methods import Stage
@@ -250,15 +250,11 @@ def _write_tables(
 
 def _written(path: Path, write: Callable[[Path], object]) -> Path:
     """Write a file that appears under its name when it is complete."""
-    part = path.with_name(f".part-{path.name}")
     try:
-        write(part)
-        part.replace(path)
-    except BaseException as error:
-        part.unlink(missing_ok=True)
-        if isinstance(error, PblError):
-            raise error.about(path.name) from error.__cause__
-        raise
+        with complete_file(path) as part:
+            write(part)
+    except PblError as error:
+        raise error.about(path.name) from error.__cause__
     return path
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ import numpy as np
 from pbl_pipeline import progress
 from pbl_pipeline.body import Body, capsules, load_body
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import complete_file
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render.drawing import Strip, capsule_outline, draw_body, draw_keypoints, to_camera
@@ -132,7 +132,6 @@ def render_overlay(
     width, height = _even_size(fit.image_size_px, max_side_px)
     strip_height = 2 * max(40, round(0.08 * height))
     strip = Strip(fit, events, width, strip_height)
-    part = out_path.with_name(f"{out_path.stem}.part{os.getpid()}.mp4")
     out_path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
 
@@ -149,13 +148,10 @@ def render_overlay(
             count += 1
             yield frame.time_s, picture
 
-    try:
+    with complete_file(out_path) as part:
         write_h264(part, pictures(), (width, height + strip_height), fit.time_s, crf=23)
         if count != len(fit.time_s):
             raise _changed(f"{count} frames", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
-        part.replace(out_path)
-    finally:
-        part.unlink(missing_ok=True)
     return out_path
 
 

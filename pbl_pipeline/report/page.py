@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 
@@ -10,6 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pbl_pipeline.code_version import code_version
+from pbl_pipeline.files import complete_file
 from pbl_pipeline.gait import (
     GILLETTE_MODEL,
     Z90,
@@ -411,11 +411,7 @@ def write_report(
     template = shipped_page("report/templates/report.html")
     css = Markup(shipped_text("report/templates/report.css"))  # noqa: S704  our own file
     page = page_of(visit, pictures or {}, title)
-    part = path.with_name(f"{path.name}.part{os.getpid()}")
-    try:
-        html = template.render(page=page, css=css, language=language)
+    html = template.render(page=page, css=css, language=language)
+    with complete_file(path) as part:
         part.write_text(page_in(language, html), encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
     return path

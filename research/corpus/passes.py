@@ -20,6 +20,7 @@ import click
 import numpy as np
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import complete_file
 from pbl_pipeline.fit import METHODS, SessionInput, TrialFit, default_fit, fit_sessions
 from pbl_pipeline.gait import MEASURES, detect_events, feet_from_fit, find_cycles, spatiotemporal
 from pbl_pipeline.keypoints import Keypoints
@@ -157,7 +158,8 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
             out[f"{key}_n"] = np.array([len(v) for v in values])
         else:
             out[key] = np.stack(values)
-    np.savez_compressed(path, allow_pickle=False, **out)
+    with complete_file(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **out)
 
 
 @click.command(epilog="Example: python -m research.corpus.passes --motions motions --people 12 --out passes")

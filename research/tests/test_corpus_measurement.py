@@ -20,6 +20,7 @@ from research.corpus.measurement import (
     widening_of,
     write_model,
 )
+from research.corpus.passes import save_rows
 
 STANCE = MEASURES.index("stance_percent")
 SPEED = MEASURES.index("speed_m_per_s")
@@ -121,3 +122,20 @@ def test_a_written_model_is_read_again(tmp_path: Path, monkeypatch: pytest.Monke
         np.testing.assert_array_equal(found.views[side].anew, shipped.views[side].anew)
     np.testing.assert_array_equal(found.person, shipped.person)
     measurement.load_model.cache_clear()
+
+
+def test_a_file_cut_in_the_middle_of_writing_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    meanwhile: list[Path] = []
+
+    def cut(path: Path, **_: Any) -> None:
+        path.write_bytes(b"PK")
+        meanwhile.extend(tmp_path.glob("passes-*.npz"))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", cut)
+        with pytest.raises(KeyboardInterrupt):
+            save_rows(tmp_path / "passes-0.npz", [{"n": 1}])
+    assert meanwhile == list(tmp_path.iterdir()) == []
+    save_rows(tmp_path / "passes-0.npz", [{"n": 1}])
+    assert [p.name for p in tmp_path.iterdir()] == ["passes-0.npz"]

@@ -29,7 +29,7 @@ from pymysql.cursors import SSCursor
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError, os_errors_as
-from pbl_pipeline.files import sha256_of
+from pbl_pipeline.files import complete_file, sha256_of
 
 from .catalog import Column, quote
 
@@ -233,8 +233,8 @@ def restore_recordings(folder: Path) -> Recordings:
             _private(),
         ):
             path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(folder / RECORDINGS / name, part := path.with_name(f".{path.name}.part"))
-            os.replace(part, path)
+            with complete_file(path) as part:
+                shutil.copyfile(folder / RECORDINGS / name, part)
         done.paths.append(str(path))
         done.n_bytes += path.stat().st_size
     return done
