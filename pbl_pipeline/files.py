@@ -149,7 +149,7 @@ def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
 
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
-    """Yield a hidden name beside `path` to write to; the file appears as `path` when the block ends without an error."""
+    """Yield a hidden name beside `path` to write to. The file appears as `path` when the block ends without error."""
     part = path.with_name(f".part{os.getpid()}-{path.name}")
     try:
         yield part

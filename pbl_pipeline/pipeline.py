@@ -27,7 +27,7 @@ from pbl_pipeline.names import check_height, check_label, check_mass, distinct
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
-from pbl_pipeline.resources import cores, shared_cores
+from pbl_pipeline.resources import processes_at_once, shared_cores
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
@@ -126,26 +126,16 @@ class _Input:
 
 
 def _side_by_side(inputs: Sequence[_Input]) -> Iterator[tuple[Recording, PblError | None]]:
-    """Detect in each video, in order: in `at_once` processes, or in this one."""
-    processes = at_once(sum(i.error is None for i in inputs))
-    if processes < 2:
+    """Detect in each video, in order: in several processes if a GPU computes the networks, else in this one, whose
+    threads use the cores."""
+    videos = sum(i.error is None for i in inputs)
+    n = min(videos, processes_at_once(gpu_detects=True)) if gpu_wanted() else 1
+    if n < 2:
         yield from map(_detected, inputs)
         return
-    with detection_processes(processes) as pool:
-        yield from progress.track(pool.map(_detected, inputs), "videos", total=len(inputs), unit="video")
-
-
-def at_once(videos: int) -> int:
-    """Number of processes that detect in so many videos: one for each core if a GPU computes the networks, else one,
-    whose threads use the cores."""
-    return max(1, min(videos, cores())) if gpu_wanted() else 1
-
-
-@contextlib.contextmanager
-def detection_processes(n: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of processes that share the cores. Not forked: threads of the libraries do not survive that."""
+    # Not forked: threads of the libraries do not survive that.
     with shared_cores(n), ProcessPoolExecutor(n, multiprocessing.get_context("spawn")) as pool:
-        yield pool
+        yield from progress.track(pool.map(_detected, inputs), "videos", total=len(inputs), unit="video")
 
 
 @frames_kept()

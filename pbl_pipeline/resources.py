@@ -86,6 +86,12 @@ def share_of_memory() -> float:
     return memory_bytes() * cores() / max(cores(stated=False), 1)
 
 
+def processes_at_once(gpu_detects: bool) -> int:
+    """Number of processes that use this machine fully: one for each core, or two where a GPU detects, for which a
+    process waits most of the time; 4 GB for each, as a long recording takes."""
+    return max(1, min((2 if gpu_detects else 1) * cores(), memory_bytes() // (4 << 30)))
+
+
 @contextlib.contextmanager
 def shared_cores(processes: int) -> Iterator[None]:
     """Let each of several processes that are started in this block use its share of the cores only, and large pages of

@@ -128,6 +128,7 @@ def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch,
     each = [whole.of_process(n) for n in range(whole.processes)]
     assert [(o.resource, o.gpus) for o in each] == [("all" if i < 2 else "cpu", (str(i % 2),)) for i in range(n)]
     assert {o.processes for o in each} == {n // 2}
+    assert resources.processes_at_once(gpu_detects) == n  # also those of `pbl run`
     assert [fit.of_process(n).resource for n in range(fit.processes)] == ["gpu", "gpu"]
 
 

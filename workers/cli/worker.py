@@ -11,9 +11,6 @@ from workers.registry import DETECTOR, FIT, GROUPS
 if TYPE_CHECKING:
     from workers.process import Options
 
-#: Memory of each process of `--processes auto` (bytes): that of a long recording.
-MEMORY_EACH = 4 * 2**30
-
 
 class Processes(click.ParamType):
     """A number of processes, or `auto`."""
@@ -110,16 +107,16 @@ def worker(
 
 def options_of(resource: str, processes: int | str | None, batch: int | None = None, **others: Any) -> Options:
     """Options of a worker on this machine. processes, batch: as given on the command line."""
-    from pbl_pipeline.resources import cores, memory_bytes
+    from pbl_pipeline.resources import processes_at_once
     from workers.process import Options, given_gpus
 
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":
         from pbl_pipeline.models import gpu_wanted
 
-        waits = DETECTOR in GROUPS[resource] and gpu_wanted()  # for the networks, most of the time
-        room = min((2 if waits else 1) * cores(), memory_bytes() // MEMORY_EACH)
-        processes = len(gpus) if gpus and DETECTOR not in GROUPS[resource] else max(1, len(gpus), room)
+        detects = DETECTOR in GROUPS[resource]
+        room = processes_at_once(detects and gpu_wanted())
+        processes = len(gpus) if gpus and not detects else max(len(gpus), room)
     return Options(
         resource=resource,
         processes=int(processes or len(gpus) or 1),
