@@ -1,5 +1,7 @@
 """Tests of the product."""
 
+import contextlib
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,3 +28,15 @@ def refused(code: str, call: Callable[..., object], *arguments: Any, **named: An
         call(*arguments, **named)
     assert error.value.code == code, error.value.text()
     return error.value
+
+
+def until(condition: Callable[[], bool], seconds: float = 300.0) -> None:
+    """Wait until something holds; fails after so many seconds. Also of a page: Playwright's own wait evaluates texts in
+    it, which its policy forbids."""
+    end = time.monotonic() + seconds
+    while True:
+        with contextlib.suppress(AssertionError):  # a command that a starting server does not answer yet
+            if condition():
+                return
+        assert time.monotonic() < end, f"not within {seconds:g} s"
+        time.sleep(0.05)

@@ -12,9 +12,10 @@ import shutil
 import socket
 import subprocess
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+
+from tests import until
 
 #: Without these there is no cluster.
 PROGRAMS = ("munged", "mungekey", "slurmctld", "slurmd", "sbatch", "scontrol", "scancel", "squeue")
@@ -114,17 +115,6 @@ def cluster(processors: int) -> Iterator[Cluster]:
 
 
 _MUNGE = {"key-file": "key", "socket": "socket", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
-
-
-def until(condition: Callable[[], bool], seconds: float) -> None:
-    """Wait until something holds; fails after so many seconds."""
-    end = time.monotonic() + seconds
-    while True:
-        with contextlib.suppress(AssertionError):  # a command that a starting server does not answer yet
-            if condition():
-                return
-        assert time.monotonic() < end, f"not within {seconds:g} s"
-        time.sleep(0.1)
 
 
 def _free_ports(n: int) -> list[int]:

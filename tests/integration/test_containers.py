@@ -19,8 +19,7 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 from schemas.operations import embedded
-from tests import image
-from tests.slurm import until
+from tests import image, until
 
 from . import chain
 from .test_secrets import encrypted_server

@@ -17,7 +17,7 @@ from pbl_pipeline.bench.detect import numbered
 from schemas import tracking, video
 from schemas.operations import embedded
 from schemas.operations.orphans import orphans
-from tests import slurm
+from tests import slurm, until
 from tests.rows import register
 
 from . import chain
@@ -84,22 +84,22 @@ def test_an_array_of_workers_does_every_job_once(
         return len(tracking.SubjectChoice()) >= n
 
     array = cluster.submit(SCRIPT, "--array=1-12", *options(tmp_path))
-    slurm.until(lambda: have_done(VIDEOS // 8), 300)
+    until(lambda: have_done(VIDEOS // 8), 300)
 
     cluster.set_node("drain")
     *cancelled, requeued = cluster.tasks("R")
     cluster.run("scancel", *cancelled)
     cluster.run("scontrol", "requeue", requeued)  # Slurm starts it again after two minutes
-    slurm.until(lambda: not cluster.tasks("R,CG"), 60)
+    until(lambda: not cluster.tasks("R,CG"), 60)
     assert len(cluster.tasks("PD")) == 12 - len(cancelled)  # nothing starts on a drained node
 
     cluster.set_node("resume")
-    slurm.until(lambda: have_done(VIDEOS // 2), 300)
+    until(lambda: have_done(VIDEOS // 2), 300)
     cluster.set_node("down")  # its jobs are killed, and are to run again
     cluster.set_node("resume")
-    slurm.until(lambda: have_done(VIDEOS), 300)
+    until(lambda: have_done(VIDEOS), 300)
     cluster.run("scancel", array)
-    slurm.until(lambda: not cluster.tasks("R,CG,PD"), 60)
+    until(lambda: not cluster.tasks("R,CG,PD"), 60)
 
     states = Counter(job["JobState"] for job in cluster.accounting())
     summary = f"{time.monotonic() - began:.0f} s; elements that ended: {dict(states)}; jobs left: {jobs_left()}\n"
@@ -115,7 +115,7 @@ def test_an_array_of_workers_does_every_job_once(
 def test_a_worker_ends_by_itself_before_its_time_limit(settings: None, cluster: slurm.Cluster, tmp_path: Path):
     # Slurm may send the signal up to a minute earlier than the minute that the script names.
     cluster.submit(SCRIPT, "--time=3", *options(tmp_path))
-    slurm.until(lambda: bool(cluster.accounting()), 300)
+    until(lambda: bool(cluster.accounting()), 300)
     (job,) = cluster.accounting()
     assert (job["JobState"], job["ExitCode"]) == ("COMPLETED", "0:0")  # not TIMEOUT
     (log,) = tmp_path.glob("*.log")

@@ -16,7 +16,7 @@ from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import IMPORTANT_CHANGE, chances, change_sd
 from schemas import fit, gait, gdi, study
 from schemas.reading import comparison, frames, registered
-from tests import not_none
+from tests import not_none, until
 from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -309,7 +309,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
           const v = f.querySelector("video"), c = f.querySelector("select").selectedOptions[0].dataset;
           const phase = +document.querySelector(".together").dataset.phase;
           return v.seeking ? 9 : (v.currentTime - +c.start) / (+c.end - +c.start) - phase; })"""
-        web.until(lambda: page.evaluate(f"({off})().every((d) => Math.abs(d) < 0.002)"))
+        until(lambda: page.evaluate(f"({off})().every((d) => Math.abs(d) < 0.002)"))
         assert page.locator("#phase-now").inner_text() == "37 %"
         line = page.locator(".phase-line").first
         assert float(line.get_attribute("x1")) == pytest.approx(36 + 0.37 * 236)
@@ -326,7 +326,7 @@ def test_videos_in_step_in_a_browser(visits: None, chromium: Any):
         assert len(worst) > 10
         assert float(np.median(np.abs(worst))) < 0.06
         page.get_by_role("button", name="Pause").click()
-        web.until(lambda: page.evaluate("[...document.querySelectorAll('video')].every((v) => v.paused)"))
+        until(lambda: page.evaluate("[...document.querySelectorAll('video')].every((v) => v.paused)"))
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         # For the record: what is printed has curves and no buttons or videos.
         page.emulate_media(media="print")

@@ -12,6 +12,7 @@ from schemas import fit, gdi, qc, tracking
 from schemas.decisions import review_decisions
 from schemas.jobs import jobs_of
 from schemas.reading.visit_progress import visit_progress
+from tests import until
 from tests.integration import compute_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
@@ -50,7 +51,7 @@ def state(browser: Any, session_id: int) -> str:
 
 
 def ended(browser: Any, session_id: int = 1) -> None:
-    web.until(lambda: not state(browser, session_id))
+    until(lambda: not state(browser, session_id))
 
 
 def mark(browser: Any, number: int) -> None:
@@ -94,7 +95,7 @@ def test_a_visit_waits_for_the_one_before_and_says_so(visits: None, browser: Any
     mark(browser, 1)
     compute(browser, 1)
     compute(browser, 2)
-    web.until(lambda: state(browser, 1) == "running")
+    until(lambda: state(browser, 1) == "running")
     page = browser.get("/visits/1").text
     assert "This visit is being computed" in page
     assert "Compute now" not in page
@@ -118,7 +119,7 @@ def test_a_job_in_other_hands_is_not_taken_twice(visits: None, browser: Any):
     mark(browser, 2)
     (job,) = queue.claim(fit.SessionFit)  # a worker has it: this process
     compute(browser, 1)
-    web.until(lambda: "fit of the body" in browser.get("/visits/1/progress").text)
+    until(lambda: "fit of the body" in browser.get("/visits/1/progress").text)
     time.sleep(3.0)
     assert state(browser, 1) == "running"  # it waits for what follows
     assert len(fit.SessionFit & job.key) == 0

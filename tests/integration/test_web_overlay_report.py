@@ -11,6 +11,7 @@ import pytest
 from pbl_pipeline.files import sha256_of
 from schemas import fit, privacy
 from schemas.origin import Origin
+from tests import until
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.html_page import commands_in
 from tests.integration import web
@@ -38,9 +39,9 @@ def browser(visit: Path) -> Iterator[Any]:
         yield found
 
 
-def until(browser: Any, address: str) -> None:
+def ended(browser: Any, address: str) -> None:
     """Ask as the page's script does, until the file is there or failed."""
-    web.until(lambda: browser.get(address).json()["ended"], 60.0)
+    until(lambda: browser.get(address).json()["ended"], 60.0)
 
 
 def test_an_overlay_is_made_beside_the_page_and_served_when_it_is_whole(visit: Path, browser: Any):
@@ -52,7 +53,7 @@ def test_an_overlay_is_made_beside_the_page_and_served_when_it_is_whole(visit: P
     assert "<video" not in page
     assert browser.get("/visits").status_code == 200  # the pages go on answering
     assert not browser.get("/recordings/1/overlay/state").json()["ended"]
-    until(browser, "/recordings/1/overlay/state")
+    ended(browser, "/recordings/1/overlay/state")
     assert "/recordings/1/overlay/file" in browser.get("/recordings/1/overlay").text
     whole = browser.get("/recordings/1/overlay/file")
     assert whole.headers["content-type"] == "video/mp4"
@@ -65,7 +66,7 @@ def test_an_overlay_is_made_beside_the_page_and_served_when_it_is_whole(visit: P
 def test_a_report_is_served_without_scripts_and_says_what_it_is_of(visit: Path, browser: Any):
     assert "/visits/1/report?result=0" in browser.get("/visits/1").text
     assert "<progress" in browser.get("/visits/1/report").text
-    until(browser, "/visits/1/report/state?result=0")
+    ended(browser, "/visits/1/report/state?result=0")
     report = browser.get("/visits/1/report?result=0")
     assert report.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
     assert "Gait report" in report.text
@@ -80,7 +81,7 @@ def test_a_report_is_in_the_language_of_its_reader(visit: Path, browser: Any, mo
     for language in ("de", "en"):
         monkeypatch.setitem(browser.headers, "accept-language", language)
         browser.get("/visits/1/report?result=0")
-        until(browser, "/visits/1/report/state?result=0")
+        ended(browser, "/visits/1/report/state?result=0")
         report = browser.get("/visits/1/report?result=0").text
         assert f'<html lang="{language}">' in report
         assert not commands_in(report)
@@ -94,7 +95,7 @@ def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
 ):
     """The copy here is black; what is drawn over it must not show the grey of the original."""
     browser.get("/recordings/1/overlay")
-    until(browser, "/recordings/1/overlay/state")
+    ended(browser, "/recordings/1/overlay/state")
     assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # of the original
     monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
     for address in ("/recordings/1/overlay", "/visits/1/report"):
@@ -107,7 +108,7 @@ def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
     privacy.Deidentified.insert1(copied(copy), allow_direct_insert=True)
     try:
         browser.get("/recordings/1/overlay")
-        until(browser, "/recordings/1/overlay/state")
+        ended(browser, "/recordings/1/overlay/state")
         with av.open(io.BytesIO(browser.get("/recordings/1/overlay/file").content), "r") as found:
             frames = [f.to_ndarray(format="gray") for f in found.decode(video=0)]
         assert all(f[:40, :100].max() < 40 for f in frames)  # a corner of the picture

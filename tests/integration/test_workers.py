@@ -33,8 +33,8 @@ from schemas.operations import embedded
 from schemas.reading.status import live_workers, pipeline_status
 from schemas.reading.why import why
 from schemas.rows import utc_now
+from tests import until
 from tests.rows import register
-from tests.slurm import until
 from workers import queue, recover, refresh, registry, requeue, run_job
 from workers.heartbeat import Heartbeat, Silent
 from workers.loop import LEAVE_S, Worker, takes

@@ -4,8 +4,7 @@ import contextlib
 import re
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import uvicorn
@@ -63,15 +62,6 @@ def form_of(browser: TestClient, page: str, action: str) -> dict[str, str]:
     form = form[: form.index("</form>")]
     events = re.findall(r'data-(events)="([^"]*)"', form)
     return dict([*re.findall(r'type="hidden" name="([a-z]+)" value="([^"]*)"', form), *events])
-
-
-def until(holds: Callable[[], bool], seconds: float = 300.0) -> None:
-    """Wait until something holds. Also of a page: Playwright's own wait evaluates texts in it, which its policy
-    forbids."""
-    end = time.monotonic() + seconds
-    while not holds():
-        assert time.monotonic() < end, "it took too long"
-        time.sleep(0.05)
 
 
 @contextlib.contextmanager
