@@ -48,7 +48,7 @@ def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     film = write_video(module_tables / "schirm.mp4", of_screen, constant_rate(60))
     register(film, subject="P005", session_label="2026-02-04")
     populate()
-    register(small_video(module_tables, "neu"), session_label="2026-09-10")
+    register(small_video(module_tables, "neu"))  # of a visit without a label
     study.ClinicalScore.insert({"session_id": i, "instrument": "mJOA", "score_value": 12 + i} for i in (1, 2))
 
 
@@ -79,13 +79,12 @@ PAGES = [
     *(f"/visits/{n}/letter" for n in range(1, 8)),
     "/visits/1/trend",
     "/visits/1/trend?measure=step_time_s",
-    "/visits/1/enter",
     "/visits/new",
-    "/visits/1/facts",
-    "/visits/1/upload",
+    *(f"/visits/{n}/{form}" for n in (1, 7) for form in ("enter", "facts", "upload")),
     *(f"/recordings/{n}" for n in range(1, 8)),
     "/compare?v=1&v=2",
     "/compare?v=1",
+    "/compare?v=1&v=7",
     "/instruments",
     "/operate",
     "/visits/99",

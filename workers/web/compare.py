@@ -21,7 +21,7 @@ from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 from schemas.reading import comparison
 
 from .address import Address, interval, page
-from .pages import Pages, as_json, plain, reader_language
+from .pages import Pages, as_json, plain, reader_language, visit_name
 from .source import Videos
 from .tables import Tables
 
@@ -44,7 +44,8 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
         chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
         wanted = request.query_params.get("ref", "")
         found = await tables.ask(comparison.compare, chosen, _read(wanted) if wanted else None)
-        names = [_name(c) for c in found.compared]
+        language = "en" if as_json(request) else reader_language(request)
+        names = [_name(c, language) for c in found.compared]
         cycles = [c.cycles for c in found.compared]
         shown: dict[int, PblError | None] = {}
         for video_id in {c.video_id for of_result in cycles for c in of_result}:
@@ -64,7 +65,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             measures=[n for n in _names(found) if any(_known(c, n) for c in found.compared)],
             without=without(found),
             of_cycles=[n for n in _names(found) if any(_interval(c, n) is not None for c in found.compared)],
-            charts=charts_of(found, names, reader_language(request)),
+            charts=charts_of(found, names, language),
             plot=charts.CYCLE_PLOT,
             first_cycle=[_first_cycle(c, cycles) for c in cycles],
             videos=shown,
@@ -142,9 +143,9 @@ def without(found: comparison.Comparison) -> dict[tuple[str, ...], list[str]]:
     return out
 
 
-def _name(one: comparison.Side) -> str:
+def _name(one: comparison.Side, language: str) -> str:
     """Return a distinct name of a result, without the person's code."""
-    label = one.about.row.label
+    label = visit_name(language, one.about.row.label)
     if len(one.about.results) < 2 or one.about.result is None:
         return label
     return f"{label}, {one.about.result.kind}, {one.about.result.methods[0]}"

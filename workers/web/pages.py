@@ -24,6 +24,7 @@ from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
 from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
 from schemas.intake.sheets import with_point
 from schemas.reading.shown import ShownVisit
+from schemas.session import UNLABELLED
 
 from .access import HEADERS, HOURS, Session
 from .address import JSON
@@ -145,6 +146,7 @@ class Pages:
         own: dict[str, Any] = {
             "t": functools.partial(texts.text, language),
             "said": functools.partial(texts.on_page, language),
+            "named": functools.partial(visit_name, language),
             "language": language,
             "other_language": next(name for name in texts.LANGUAGES if name != language),
             "session": session,
@@ -183,6 +185,11 @@ class Pages:
         if as_json(request):
             return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
         return self.show(request, "unforeseen.html", 500, HEADERS)
+
+
+def visit_name(language: str, label: str) -> str:
+    """Return the label of a visit; of one that got none, the words for that in a language."""
+    return texts.text(language, "visits.unlabelled") if label == UNLABELLED else label
 
 
 def in_field(language: str, number: str) -> str:
