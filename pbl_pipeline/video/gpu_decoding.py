@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import re
 import socket
 import weakref
 from pathlib import Path
@@ -22,15 +21,13 @@ from pbl_pipeline.models import gpu_address
 from pbl_pipeline.models.network import DECODING, receive_line, send_line, share_memory
 from pbl_pipeline.models.nvdec import CODECS
 
+from .coded_units import is_damaged
 from .decode import FFMPEG_ERRORS, Decoder
 
 #: Formats of the pictures: colour at half the resolution, 8 bits.
 _FORMATS = ("yuv420p", "yuvj420p")
 #: Time to wait for the pictures of a video (s) before FFmpeg decodes it.
 _PATIENCE_S = 120.0
-#: What no coded picture contains (ITU-T H.264, 7.4.1; H.265, 7.4.2): a part of the file is missing. The decoder of the
-#: GPU does not notice all such places.
-_ZEROS = re.compile(rb"\0\0\0[^\1]")
 
 
 class _Connection:
@@ -126,13 +123,11 @@ def _decoded(decoder: Decoder, room: float) -> list[av.VideoFrame] | None:
     packets = [p for p in itertools.islice(decoder.container.demux(stream), decoder.n_announced + 2) if p.size]
     stamps = [p.pts for p in packets if p.pts is not None]  # the filter empties the packets
     usual = len(stamps) == len(packets) == decoder.n_announced > 0
-    if not usual or any(p.is_corrupt or p.is_discard for p in packets):
+    if not usual or any(p.is_corrupt or p.is_discard or is_damaged(codec, bytes(p)) for p in packets):
         return None
     first = next(frame for p in packets for frame in stream.decode(p))
     to_annex_b = BitStreamFilterContext(f"{codec.name}_mp4toannexb", stream)
     pieces = [bytes(q) for p in packets for q in to_annex_b.filter(p)]
-    if any(_ZEROS.search(piece) for piece in pieces):
-        return None
     frames = _connection.decode(codec.name, first, list(zip(stamps, pieces, strict=True)))
     same = frames[0].pts == first.pts and np.array_equal(frames[0].to_ndarray(), first.to_ndarray())
     return [first, *frames[1:]] if same else None

@@ -35,6 +35,7 @@ from pbl_pipeline.video import (
     read_frames,
     release_frames,
 )
+from pbl_pipeline.video.coded_units import is_damaged
 from research.benchmarks.hostile import KINDS
 from tests import refused
 from tests.guard import guarded
@@ -472,14 +473,37 @@ def test_truncation_says_what_is_left_and_what_to_do(whole, tmp_path):
     assert "nothing of it can be read" in refused("VIDEO_TRUNCATED", probe, path).found
 
 
+@pytest.mark.parametrize("n", [64, 6000])
 @pytest.mark.parametrize("name", ["index first", "index first, hevc"])
-def test_damage_inside_is_not_passed_over(whole, tmp_path, name):
+def test_damage_inside_is_not_passed_over(whole, tmp_path, name, n):
     data = bytearray(whole[name].read_bytes())
     middle = len(data) // 2
-    data[middle : middle + 6000] = bytes(6000)
+    data[middle : middle + n] = bytes(n)
     path = tmp_path / f"v{whole[name].suffix}"
     path.write_bytes(data)
     assert code_of(path) == "VIDEO_DAMAGED"
+
+
+@pytest.mark.parametrize(
+    ("codec", "configuration", "slice_", "other"),
+    [("h264", b"\1\0\0\0\xff", b"\x65", b"\x06"), ("hevc", b"\1" + bytes(20) + b"\xff", b"\x26\1", b"\x4e\1")],
+)
+def test_what_no_coded_slice_contains(codec, configuration, slice_, other):
+    def damaged(*units, cut=0):
+        packet = b"".join(len(unit).to_bytes(4, "big") + unit for unit in units)
+        return is_damaged(context, packet[: len(packet) - cut])
+
+    context = av.CodecContext.create(codec, "r")
+    context.extradata = configuration
+    whole = slice_ + b"abc\0\0\3\0d"
+    assert not damaged(other, whole)
+    assert not damaged(whole, whole + bytes(5))  # zeros behind it
+    assert not damaged(other + b"\0\0\0a", whole)  # not of a picture
+    assert damaged(whole, slice_ + b"ab\0\0\0c")
+    assert damaged(whole, whole, cut=1)
+    assert damaged(b"", whole)
+    context.extradata = None
+    assert not damaged(slice_ + b"ab\0\0\0c")  # units with start codes
 
 
 def _with_stamps(path: Path, times_s: list[float]) -> Path:
