@@ -39,13 +39,13 @@ def event(log: logging.Logger, level: int, what: str, job: Any = None, **fields:
     log.log(level, what, extra={_FIELDS: named})
 
 
-def to_stderr(level: int = logging.INFO) -> None:
+def to_stderr() -> None:
     """Send the events of this process to stderr, one JSON line each. Nothing else of the program logs there."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     root = logging.getLogger("pbl")
     root.handlers[:] = [handler]
-    root.setLevel(level)
+    root.setLevel(logging.INFO)
     root.propagate = False
     # DataJoint would print every error row's text; the event and the row say it.
     logging.getLogger("datajoint").setLevel(logging.CRITICAL)

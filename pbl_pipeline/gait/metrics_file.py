@@ -98,7 +98,7 @@ def metrics_of(
     """
     session, model = content["session"], str(content["gdi_model"])
     trials = tuple(_trial(t, model, events.get(t["name"], ()), curves.get(t["name"], {})) for t in content["trials"])
-    checks = _checks(session)
+    checks = checks_of(session)
     n_before = int(session.get("qc_before_gait", len(checks)))
     of_events = {c for t in trials for c in t.events.qc}
     own = tuple(c for c in checks[n_before:] if c not in of_events)
@@ -118,7 +118,7 @@ def metrics_of(
 def _trial(
     content: Mapping[str, Any], model: str, events: Sequence[GaitEvent], curves: Mapping[int, Curves]
 ) -> TrialMetrics:
-    name, checks = str(content["name"]), _checks(content)
+    name, checks = str(content["name"]), checks_of(content)
     return TrialMetrics(
         name=name,
         status=str(content["status"]),
@@ -192,5 +192,6 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
     )
 
 
-def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:
+def checks_of(content: Mapping[str, Any]) -> tuple[Check, ...]:
+    """Return the checks of a trial or session."""
     return tuple(structured(c, Check) for c in content["qc"])

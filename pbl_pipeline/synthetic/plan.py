@@ -137,6 +137,8 @@ def pelvis_joints(angles_rad: Float[np.ndarray, "T 3"], heading_rad: Float[np.nd
 
 #: Motions are planned and solved on a grid of this step (s) and sampled from it by cubic splines.
 GRID_STEP_S = 0.01
+#: The grid begins and ends this long before and after the motion (s).
+MARGIN_S = 0.6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,9 +210,9 @@ class Plan:
         )
 
 
-def grid(seconds: float, margin_s: float = 0.6) -> np.ndarray:
-    """Times of the grid for a motion of `seconds`, with a margin on both sides."""
-    n = round(margin_s / GRID_STEP_S)
+def grid(seconds: float) -> np.ndarray:
+    """Times of the grid for a motion of `seconds`, with `MARGIN_S` on both sides."""
+    n = round(MARGIN_S / GRID_STEP_S)
     return GRID_STEP_S * np.arange(-n, round(np.ceil(seconds / GRID_STEP_S)) + n + 1)
 
 
@@ -218,3 +220,9 @@ def ease(x: np.ndarray) -> np.ndarray:
     """From 0 at x <= 0 to 1 at x >= 1 with the least jerk."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def fade(x: np.ndarray) -> np.ndarray:
+    """From 0 at x <= 0 to 1 at x >= 1, a cubic with level ends."""
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)

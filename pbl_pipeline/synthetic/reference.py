@@ -14,7 +14,7 @@ from pbl_pipeline.gait import BODY_ANGLES, LEG_ANGLES, PLUG_IN_GAIT, offset_deg
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm, harmonic_sum
 
 from .impair import Style
-from .plan import GRID_STEP_S, MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, Plan, swing, wander, within
+from .plan import GRID_STEP_S, MIDDLE_CURVES_DEG, OFFSET_SD_DEG, SIDE_CURVES_DEG, Plan, fade, swing, wander, within
 
 #: Curves that drive the pelvis (sign, joint), by the right side's cycle; the model's tilt and list count the other way.
 PELVIS = {"pelvis_tilt": (-1, "tilt"), "pelvis_obliquity": (-1, "list"), "pelvis_rotation": (1, "rotation")}
@@ -101,7 +101,7 @@ def reference(
     t = plan.grid_s
     speed = plan.speed_m_per_s / np.sqrt(GRAVITY * leg_m)
     # How much of a walk it is: below half of the slowest group the curves fade to standing.
-    walks = _fade(speed / (0.5 * norm.speed[0]))
+    walks = fade(speed / (0.5 * norm.speed[0]))
     phases = side_phases(plan, foot_off)
     swings = {s: swing_bump(plan, s) for s in "rl"}
     posture = {k: np.broadcast_to(plan.posture_deg.get(k, v), t.shape) for k, v in STANDING_DEG.items()}
@@ -215,8 +215,3 @@ def _rest(angle: str, posture: dict[str, np.ndarray], swing: np.ndarray) -> np.n
     if angle == "ankle_dorsiflexion":
         return posture["ankle_angle"]
     return np.zeros(len(swing))
-
-
-def _fade(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)

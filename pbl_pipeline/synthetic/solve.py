@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter1d
 from pbl_pipeline.body import SCALE_NAMES, load_body, scaled_model
 
 from .physique import SOLE_M
-from .plan import GRID_STEP_S, Plan, Step, pelvis_joints
+from .plan import GRID_STEP_S, Plan, Step, fade, pelvis_joints
 
 #: Points of the sole in the frames of their bodies (right side; m, unscaled): those that the contact holds.
 SOLE_POINTS: dict[str, tuple[str, tuple[float, float, float]]] = {
@@ -268,7 +268,8 @@ class _Soles:
                 # Also before it stands: what is not held has weight 0.
                 target[t >= (own[k - 1].up_s if k else -np.inf), i] = self._spot(i, step)
                 for axis_sd, (start, stop) in _holds(point, step):
-                    weight[:, i] = np.maximum(weight[:, i], _hold(t, start, stop)[:, None] / np.array(axis_sd))
+                    held = fade(np.minimum(t - start, stop - t) / RAMP_S)
+                    weight[:, i] = np.maximum(weight[:, i], held[:, None] / np.array(axis_sd))
                 if k:
                     fraction = np.clip((t - own[k - 1].up_s) / (step.down_s - own[k - 1].up_s), 0, 1)
                     floor[:, i] += CLEARANCE_M * np.sin(np.pi * fraction) ** 2
@@ -305,9 +306,3 @@ def _holds(point: str, step: Step) -> list[tuple[tuple[float, float, float], tup
         last = (step.ball_s[1] - RAMP_S, step.up_s)
         return [((TOE_M, TOE_M, HELD_M), step.toe_s), ((HELD_M, HELD_M, HELD_M), last)]
     return [((never, never, ROLL_M), step.ball_s)]
-
-
-def _hold(t: np.ndarray, start_s: float, stop_s: float) -> np.ndarray:
-    """0 outside, 1 inside, with smooth ends inside."""
-    inside = np.clip(np.minimum(t - start_s, stop_s - t) / RAMP_S, 0, 1)
-    return inside * inside * (3 - 2 * inside)

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.normative import GRAVITY, gait_norm
 
 from .impair import Style
-from .plan import GRID_STEP_S, Plan, Step, ease, grid, wander, within
+from .plan import GRID_STEP_S, MARGIN_S, Plan, Step, ease, grid, wander, within
 
 #: How strides differ within a walk: step time (fraction), footprint along and across (m). The project's own numbers, of
 #: the size that is usual in healthy adults (a few percent).
@@ -296,6 +296,6 @@ def _cut(plan: Plan, seconds: float | None, end_s: float) -> Plan:
     return plan
 
 
-def duration_s(plan: Plan, margin_s: float = 0.6) -> float:
+def duration_s(plan: Plan) -> float:
     """Duration of the motion of a plan (s), without the margins of its grid."""
-    return float(plan.grid_s[-1] - margin_s)
+    return float(plan.grid_s[-1] - MARGIN_S)

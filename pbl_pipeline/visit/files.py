@@ -20,7 +20,7 @@ from pbl_pipeline.files import load_npz
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.fit.angles_file import write_angles_csv
 from pbl_pipeline.gait import Condition, GaitEvent, TrialMetrics, load_events
-from pbl_pipeline.gait.metrics_file import Curves, load_curves, metrics_of, save_curves
+from pbl_pipeline.gait.metrics_file import Curves, checks_of, load_curves, metrics_of, save_curves
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.kinetics.kinetics_file import kinetics_of, load_arrays, save_arrays, save_content
@@ -136,7 +136,7 @@ def load_visit(folder: Path, *, measures: bool = True) -> Visit:
                 *(Recording(n, **_told(r, None)) for n, r in facts.items() if n not in names),
             ),
             solution=_solution(content) if "solver" in content else None,
-            fit_checks=(_checks_unknown(names),) if found and not (folder / METRICS).is_file() else _checks(content),
+            fit_checks=(_checks_unknown(names),) if found and not (folder / METRICS).is_file() else checks_of(content),
             subject=str(told.get("subject", "-")),
             label=str(told.get("label", "")),
             date=str(told.get("date", "")),
@@ -333,10 +333,6 @@ def _solution(content: Mapping[str, Any]) -> Solution:
     own["scale"] = [content["scale"][n] for n in SCALE_NAMES]
     own["loss_trace"] = np.reshape(content["loss_trace"], (-1, 2))
     return structured({**own, "software": content.get("code_version", "")}, Solution)
-
-
-def _checks(content: Mapping[str, Any]) -> tuple[Check, ...]:
-    return tuple(structured(c, Check) for c in content["qc"])
 
 
 def _checks_unknown(names: Sequence[str]) -> Check:

@@ -128,7 +128,6 @@ def _show(frame: pd.DataFrame, where: Sequence[str], out: Path | None, in_databa
     if out is None:
         return
     _write(out, made, errors=chosen)
-    click.echo(f"tables, and the errors they are made from (errors.csv): {out}")
     if in_database:
         from schemas.reading.frames import validation_curves
 
@@ -145,9 +144,10 @@ def _write(out: Path, made: dict[str, Any], **frames: pd.DataFrame | None) -> No
     from pbl_pipeline.validation import write_tables
 
     write_tables(made, out)
-    for name, frame in frames.items():
-        if frame is not None:
-            (out / f"{name}.csv").write_bytes(frame_to_csv(frame).encode())
+    known = {f"{name}.csv": frame for name, frame in frames.items() if frame is not None}
+    for name, frame in known.items():
+        (out / name).write_bytes(frame_to_csv(frame).encode())
+    click.echo(f"tables, and what they are made from ({', '.join(known)}): {out}")
 
 
 @validate.command(epilog="Example: pbl validate index --where method=paper-2025-v1 --out agreement")
@@ -178,7 +178,6 @@ def index(out: Path | None, where: tuple[str, ...]) -> None:
     print_tables(made)
     if out is not None:
         _write(out, made, pairs=pairs)
-        click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 
 @validate.command(
@@ -233,7 +232,6 @@ def bridge(old: str, new: str | None, in_tables: bool, keep: Path | None, out: P
         click.echo(f"{(comparisons['what'] == 'old').sum()} more have only {old} in common (pbl reprocess adds {new})")
     if out is not None:
         _write(out, made, pairs=pairs, comparisons=comparisons)
-        click.echo(f"table, and the pairs that it is made from (pairs.csv): {out}")
 
 
 def _bridge_values(name: str, keep: Path) -> pd.DataFrame:
