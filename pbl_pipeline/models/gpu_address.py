@@ -1,6 +1,7 @@
-"""Address and start of the process that owns the GPU for detection and decoding; the first that needs it starts it.
+"""Addresses and start of the processes that own the GPU (`gpu_server`); the first that needs one starts it.
 
-It is separate because many processes that decode share one GPU, and ends by itself after a while without connections.
+They are separate because many processes that detect share one GPU, and end by themselves after a while without
+connections.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from pbl_pipeline.temporary import private_folder
 
 from .devices import asked_device
 
+#: The two processes, by what they own.
+NETWORKS, DECODER = "networks", "decoder"
 #: Time after which a GPU process that does not listen has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
@@ -42,8 +45,8 @@ def gpu_wanted() -> bool:
     return gpu_visible() and asked_device() != "cpu"
 
 
-def running_server() -> str:
-    """Return the address of the GPU process, which is started if none listens.
+def running_server(what: str) -> str:
+    """Return the address of the process of the `NETWORKS` or the `DECODER`, which is started if none listens.
 
     Raises
     ------
@@ -54,12 +57,12 @@ def running_server() -> str:
     """
     import fcntl  # not on Windows, where JAX sees no GPU
 
-    folder = private_folder("gpu")
-    address = str(folder / f"{_name()}.sock")
-    with (folder / f"{_name()}.lock").open("wb") as lock:
+    base = private_folder("gpu") / f"{_name()}-{what}"
+    address = str(base.with_suffix(".sock"))
+    with base.with_suffix(".lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not _listens(address):
-            _start(address, folder / f"{_name()}.log")
+            _start(what, address, base.with_suffix(".log"))
     return address
 
 
@@ -81,14 +84,14 @@ def _listens(address: str) -> bool:
     return True
 
 
-def _start(address: str, log: Path) -> None:
+def _start(what: str, address: str, log: Path) -> None:
     env = dict(os.environ)
     # The fit may be another process on the same GPU.
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
     with log.open("wb") as out:
         # -P: do not import from the current folder, which may hold another checkout.
-        command = [sys.executable, "-P", "-m", "pbl_pipeline.models.gpu_server", address]
+        command = [sys.executable, "-P", "-m", "pbl_pipeline.models.gpu_server", what, address]
         process = subprocess.Popen(
             command, env=env, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True
         )

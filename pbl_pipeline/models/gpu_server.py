@@ -1,14 +1,16 @@
-"""The process that owns the GPU for detection and decoding: `python -m pbl_pipeline.models.gpu_server ADDRESS`.
+"""The processes that own the GPU for detection: `python -m pbl_pipeline.models.gpu_server networks|decoder ADDRESS`.
 
-Each connection is of one network, or of a process that reads videos. It begins with a line of JSON, answered by one.
+Each connection begins with a line of JSON, answered by one.
 
 - A network: its `NetworkSpec`; then the file of memory for `AT_ONCE` pictures, and for each picture a byte that says
   where in it the picture is, answered with the network's outputs as float32 in the order of these bytes. The pictures
   that wait on all connections of a network are one batch. Each network has one batch size, so that one program is
   compiled for it; a batch that is not full is padded, and a picture's result does not depend on the others.
 - A reader of videos: `DECODING`; then the file of its memory, and for each video a line of JSON and its packets. The
-  pictures are written into that memory, and the answer is a line with their stamps. Networks and decoder share the
-  process, because the GPU would serve two in turns.
+  pictures are written into that memory, and the answer is a line with their stamps.
+
+Decoder and networks are two processes: XLA records its calls in graphs, to start many at once, and a call of the
+decoder in the same process, of whatever thread, makes the recording fail.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 
+from .gpu_address import DECODER
 from .network import AT_ONCE, DECODING, NetworkSpec, batches, receive_line, send_line, shared_memory
 from .nvdec import Nvdec
 from .tflite import LiteModel, read_network
@@ -38,8 +41,6 @@ BATCH, LEAST_BATCH = 16, 4
 IDLE_S = 60.0
 #: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
-#: Otherwise XLA records its calls in graphs, and any call of the decoder meanwhile makes the recording fail.
-NO_GRAPHS = "--xla_gpu_enable_command_buffer="
 #: Number of networks that use the device at a time, and of videos that are decoded.
 _NETWORKS_AT_ONCE, _VIDEOS_AT_ONCE = 2, 8
 
@@ -291,23 +292,26 @@ class Server:
 
 
 def main() -> None:
-    """Run the process. Ends at once if JAX finds no GPU."""
-    address = Path(sys.argv[1])
+    """Run the process. That of the networks ends at once if JAX finds no GPU."""
+    what, address = sys.argv[1], Path(sys.argv[2])
     address.unlink(missing_ok=True)
+    if what == DECODER:
+        try:
+            decoder = Nvdec()
+        except RuntimeError as error:
+            sys.stderr.write(f"videos are not decoded on the GPU: {error}\n")
+            decoder = None
+        Server(str(address), decoder=decoder).run()
+        return
     from pbl_pipeline.jax_setup import configure
 
-    try:
-        decoder = Nvdec()  # before JAX, which would choose how threads wait for the GPU
-    except RuntimeError as error:
-        sys.stderr.write(f"videos are not decoded on the GPU: {error}\n")
-        decoder = None
-    configure(NO_GRAPHS)
+    configure()
     import jax
 
     device = jax.devices()[0]
     if device.platform != "gpu":
         raise SystemExit(f"JAX finds no GPU, only {device.device_kind}")
-    Server(str(address), decoder=decoder).run()
+    Server(str(address)).run()
 
 
 if __name__ == "__main__":

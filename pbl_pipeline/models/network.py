@@ -85,7 +85,7 @@ class Network:
             self._lite = self._load()
             return
         try:
-            self._remote = _Remote(gpu_address.running_server(), self._spec)
+            self._remote = _Remote(gpu_address.running_server(gpu_address.NETWORKS), self._spec)
             self.device = self._remote.device
         except (OSError, EOFError, RuntimeError) as error:
             self._fall_back(error)

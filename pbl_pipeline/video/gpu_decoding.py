@@ -37,7 +37,7 @@ class _Connection:
         self.size = size
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.settimeout(_PATIENCE_S)
-        self._socket.connect(gpu_address.running_server())
+        self._socket.connect(gpu_address.running_server(gpu_address.DECODER))
         send_line(self._socket, DECODING)
         self._receive()
         self._memory = share_memory(self._socket, size)

@@ -58,7 +58,7 @@ def decoder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FFmpegD
     address = str(tmp_path / "gpu.sock")
     found.server = Server(address, any_device=True, idle_s=float("inf"), decoder=cast(nvdec.Nvdec, found))
     threading.Thread(target=found.server.run, daemon=True).start()
-    monkeypatch.setattr(gpu_address, "running_server", lambda: address)
+    monkeypatch.setattr(gpu_address, "running_server", lambda what: address)
     monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
     yield found
     gpu_decoding.release()

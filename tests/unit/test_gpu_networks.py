@@ -99,7 +99,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     server = Server(address, any_device=True, idle_s=float("inf"), batch=4)
     threading.Thread(target=server.run, daemon=True).start()
     monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
-    monkeypatch.setattr(gpu_address, "running_server", lambda: address)
+    monkeypatch.setattr(gpu_address, "running_server", lambda what: address)
     yield server
     server.close()
 
