@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import io
 import sys
 import traceback
@@ -19,18 +20,22 @@ from pbl_pipeline.errors import PblError
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
+#: Every question of it reads the list of all installed packages, and a help asks once for each command.
+installed = functools.cache(entry_points)
+
+
 class Commands(click.Group):
     """A group of its own commands and of those that other packages register under an entry-point group."""
 
     entries = "pbl.commands"
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({*self.commands, *(e.name for e in entry_points(group=self.entries))})
+        return sorted({*self.commands, *(e.name for e in installed(group=self.entries))})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in self.commands:
             return self.commands[cmd_name]
-        for entry in entry_points(group=self.entries):
+        for entry in installed(group=self.entries):
             if entry.name == cmd_name:
                 return entry.load()
         return None
