@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests import SHARED
+from tests import SHARED, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
 
@@ -105,14 +105,11 @@ def phases_predicted_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def little_optimised() -> Iterator[None]:
-    """For tests that compile much and compute little: XLA takes a third of the time for the same formulas."""
-    import jax
-
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+@pytest.fixture(name="little_optimised")
+def _little_optimised() -> Iterator[None]:
+    """For tests that compile much and compute little (`compiled.little_optimised`)."""
+    with compiled.little_optimised():
+        yield
 
 
 @pytest.fixture(scope="session")
