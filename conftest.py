@@ -55,7 +55,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for."""
+    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for; the demo comes
+    first: it takes longest, and what it compiles others find, if they do not compile it at the same time."""
+    items.sort(key=lambda item: item.path.name != "test_demo.py")
     for item in items:
         names = getattr(item, "fixturenames", ())
         if "database" in names:
