@@ -7,7 +7,7 @@ import functools
 import io
 import sys
 import traceback
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import click
@@ -20,8 +20,11 @@ from pbl_pipeline.errors import PblError
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
-#: Every question of it reads the list of all installed packages, and a help asks once for each command.
-installed = functools.cache(entry_points)
+@functools.cache
+def _installed(group: str) -> EntryPoints:
+    """Return the entry points of a group; each question reads the list of all installed packages, and a help asks once
+    for each command."""
+    return entry_points(group=group)
 
 
 class Commands(click.Group):
@@ -30,12 +33,12 @@ class Commands(click.Group):
     entries = "pbl.commands"
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({*self.commands, *(e.name for e in installed(group=self.entries))})
+        return sorted({*self.commands, *(e.name for e in _installed(self.entries))})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in self.commands:
             return self.commands[cmd_name]
-        for entry in installed(group=self.entries):
+        for entry in _installed(self.entries):
             if entry.name == cmd_name:
                 return entry.load()
         return None
