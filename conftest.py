@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests import SHARED
+from tests import SHARED, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
 
@@ -55,7 +55,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for."""
+    """Mark `database` and `browser` by the fixtures; skip tests that run only where they are asked for; the demo comes
+    first: it takes longest, and what it compiles others find, if they do not compile it at the same time."""
+    items.sort(key=lambda item: item.path.name != "test_demo.py")
     for item in items:
         names = getattr(item, "fixturenames", ())
         if "database" in names:
@@ -105,14 +107,11 @@ def phases_predicted_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def little_optimised() -> Iterator[None]:
-    """For tests that compile much and compute little: XLA takes a third of the time for the same formulas."""
-    import jax
-
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
+@pytest.fixture(name="little_optimised")
+def _little_optimised() -> Iterator[None]:
+    """For tests that compile much and compute little (`compiled.little_optimised`)."""
+    with compiled.little_optimised():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -90,7 +90,7 @@ def record(execute: Callable[..., object], number: int, name: str, statements: C
 def check_version() -> None:
     """Refuse tables of another version; on a server without any, record the migrations that new ones need not go
     through. Call it before the tables are declared. Raises `PblError` DB_MIGRATION."""
-    if any(not table.startswith("~") for _, table in catalog.tables()):
+    if any(not table.startswith("~") for _, table in catalog.names()):
         refuse_other_version()
     elif not applied():
         query = connection.connect().query
@@ -102,10 +102,9 @@ def check_version() -> None:
 def refuse_other_version() -> None:
     """Refuse tables of a newer version (a migration was applied that this one lacks) or an older one (a migration, or a
     column of a definition, is missing). A server without tables is neither. Raises `PblError` DB_MIGRATION."""
-    refuse_newer()
-    if not any(not table.startswith("~") for _, table in catalog.tables()):
+    have = refuse_newer()
+    if not any(not table.startswith("~") for _, table in catalog.names()):
         return
-    have = {(a.number, a.name) for a in applied()}
     lacking = [f"migration {title(*m)}" for m in numbered() if m not in have] + missing_columns()
     if lacking:
         more = f" and {len(lacking) - 12} more" if len(lacking) > 12 else ""
@@ -118,11 +117,11 @@ def refuse_other_version() -> None:
         )
 
 
-def refuse_newer() -> None:
-    """Refuse tables that went through a migration which this version does not have, by number and name. Raises
-    `PblError` DB_MIGRATION."""
-    ours = numbered()
-    newer = [a for a in applied() if (a.number, a.name) not in ours]
+def refuse_newer() -> set[tuple[int, str]]:
+    """Refuse tables that went through a migration which this version does not have, by number and name; return those
+    that they went through. Raises `PblError` DB_MIGRATION."""
+    ours, have = numbered(), applied()
+    newer = [a for a in have if (a.number, a.name) not in ours]
     if newer:
         raise PblError(
             "DB_MIGRATION",
@@ -131,6 +130,7 @@ def refuse_newer() -> None:
             next_step=f"use the pbl-pipeline that applied it ({newer[-1].version}) or a newer one; stop "
             "workers and pages of this version",
         )
+    return {(a.number, a.name) for a in have}
 
 
 def missing_columns() -> list[str]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import errno
+import functools
 import io
 import sys
 import traceback
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import click
@@ -19,18 +20,25 @@ from pbl_pipeline.errors import PblError
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
 
 
+@functools.cache
+def _installed(group: str) -> EntryPoints:
+    """Return the entry points of a group; each question reads the list of all installed packages, and a help asks once
+    for each command."""
+    return entry_points(group=group)
+
+
 class Commands(click.Group):
     """A group of its own commands and of those that other packages register under an entry-point group."""
 
     entries = "pbl.commands"
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted({*self.commands, *(e.name for e in entry_points(group=self.entries))})
+        return sorted({*self.commands, *(e.name for e in _installed(self.entries))})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name in self.commands:
             return self.commands[cmd_name]
-        for entry in entry_points(group=self.entries):
+        for entry in _installed(self.entries):
             if entry.name == cmd_name:
                 return entry.load()
         return None

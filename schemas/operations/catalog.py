@@ -34,18 +34,29 @@ def schemas() -> list[str]:
     return [str(row[0]) for row in rows.fetchall()]
 
 
-def tables() -> dict[tuple[str, str], list[Column]]:
-    """Return (schema, table) -> columns for every table under the prefix, including DataJoint's own (`~...`)."""
+def names() -> list[tuple[str, str]]:
+    """Return (schema, table) of every table under the prefix, including DataJoint's own (`~...`)."""
     rows = connection.connect().query(
-        "SELECT c.table_schema, c.table_name, c.column_name, c.data_type, c.column_comment "
-        "FROM information_schema.columns c JOIN information_schema.tables t USING (table_schema, table_name) "
-        "WHERE c.table_schema LIKE %s AND t.table_type = 'BASE TABLE' AND c.extra NOT LIKE '%%GENERATED%%' "
-        "ORDER BY c.table_schema, c.table_name, c.ordinal_position",
+        "SELECT table_schema, table_name FROM information_schema.tables "
+        "WHERE table_schema LIKE %s AND table_type = 'BASE TABLE' ORDER BY table_schema, table_name",
         args=(f"{pattern()}%",),
     )
-    found: dict[tuple[str, str], list[Column]] = {}
+    return [(str(schema), str(table)) for schema, table in rows.fetchall()]
+
+
+def tables() -> dict[tuple[str, str], list[Column]]:
+    """Return (schema, table) -> columns for every table under the prefix, including DataJoint's own (`~...`)."""
+    found: dict[tuple[str, str], list[Column]] = {name: [] for name in names()}
+    # In a query of its own: joined with that of the names it takes the server five times as long.
+    rows = connection.connect().query(
+        "SELECT table_schema, table_name, column_name, data_type, column_comment FROM information_schema.columns "
+        "WHERE table_schema LIKE %s AND extra NOT LIKE '%%GENERATED%%' "
+        "ORDER BY table_schema, table_name, ordinal_position",
+        args=(f"{pattern()}%",),
+    )
     for schema, table, name, kind, comment in rows.fetchall():
-        found.setdefault((schema, table), []).append(Column(name, kind.lower(), comment))
+        if (schema, table) in found:  # neither a view nor made meanwhile
+            found[schema, table].append(Column(name, kind.lower(), comment))
     return found
 
 

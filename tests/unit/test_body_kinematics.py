@@ -25,6 +25,8 @@ from pbl_pipeline.body import (
     mjx_frames,
 )
 
+pytestmark = pytest.mark.usefixtures("little_optimised")
+
 #: body -> group, written out so that it does not come from the code under test.
 GROUP = {"pelvis": "pelvis", "torso": "overall", "head": "overall"}
 for _side, _word in (("r", "right"), ("l", "left")):

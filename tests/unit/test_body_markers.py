@@ -9,6 +9,8 @@ from pbl_pipeline.body import MARKER_SETS, MarkerSet, load_body, load_marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MarkerAugmenter
 
+pytestmark = pytest.mark.usefixtures("little_optimised")
+
 BLAZEPOSE = (
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear "
     "mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist left_pinky "

@@ -311,22 +311,20 @@ def test_toml(tmp_path: Path, words: str, text: str):
     refused("CAMERA_INVALID", load_camera_poses, path)
 
 
-MILLION = ",".join(f"c{i}" for i in range(1_000_000))
-
-
 def test_a_million_columns(tmp_path: Path):
+    million = ",".join(f"c{i}" for i in range(1_000_000))
     path = tmp_path / "a.csv"
-    wide = f"time_s,side,event,probability,{MILLION}\n" + "1,left,foot_up,1\n" * 20_000
+    wide = f"time_s,side,event,probability,{million}\n" + "1,left,foot_up,1\n" * 20_000
     path.write_text(wide)
     refused("FILE_FORMAT", load_events, path)
     refused("PHONE_LOG", read_phone_log, path)
     path.write_text(f"name,body,x,y,z,{','.join('a' * 60_000)}\n" + "hip,pelvis,0,0,0\n" * 600)
     refused("FILE_FORMAT", load_marker_set, path)
     motion = tmp_path / "a.mot"
-    motion.write_text(f"inDegrees=yes\nendheader\ntime {MILLION.replace(',', ' ')}\n" + "1 2\n" * 1000)
+    motion.write_text(f"inDegrees=yes\nendheader\ntime {million.replace(',', ' ')}\n" + "1 2\n" * 1000)
     refused("FILE_FORMAT", reference_of_mot, motion)
     trc = tmp_path / "a.trc"
-    names = MILLION.replace(",", "\t\t\t")
+    names = million.replace(",", "\t\t\t")
     head = "PathFileType\t4\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n100\t100\t2\t1000000\tmm\n"
     trc.write_text(f"{head}Frame#\tTime\t{names}\n" + "1\t0\t1\t2\t3\n" * 1000)
     refused("FILE_FORMAT", read_trc, trc)

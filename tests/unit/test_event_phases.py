@@ -13,6 +13,7 @@ from pbl_pipeline.gait.events.network.transformer import Architecture, PhaseTran
 from pbl_pipeline.gait.events.phase_filter import crossings, smooth_phases
 from pbl_pipeline.gait.events.walking import turn_deg_per_stride, walking_stretches
 from pbl_pipeline.paramset import Paramset
+from tests.compiled import little_optimised
 
 UP = np.array([0.0, 0.0, 1.0])
 SMALL = Architecture(width=16, blocks=1, heads=2, hidden=32)
@@ -233,10 +234,12 @@ def test_a_bend_ends_a_slow_walk_and_not_a_fast_one():
 @pytest.fixture(scope="module")
 def model() -> PhaseTransformer:
     """A small network with random weights."""
-    return eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
+    with little_optimised():
+        return eqx.filter_jit(PhaseTransformer)(SMALL, jax.random.key(3))
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("little_optimised")
 def test_the_network_is_saved_and_read_again(model, tmp_path):
     save_model(tmp_path / "m.npz", model, {"seed": 3})
     again, about = load_model(tmp_path / "m.npz")
@@ -249,6 +252,7 @@ def test_the_network_is_saved_and_read_again(model, tmp_path):
         load_model(tmp_path / "other.npz")
 
 
+@pytest.mark.usefixtures("little_optimised")
 def test_frames_that_are_not_seen_do_not_change_the_others_much(model):
     """Attention leaves them out; only the convolution of the frames beside them sees their zeros."""
     x = jax.random.normal(jax.random.key(0), (80, N_FEATURES))

@@ -36,6 +36,8 @@ from tests.exported import keypoints_of, marked_fit, with_markers
 from tests.unit.visits import solution_of
 from tests.walking_fit import foot_events, walking_fit
 
+pytestmark = pytest.mark.usefixtures("little_optimised")
+
 #: Forces need a mass and kinetics: tests/unit/test_export_forces.py.
 ALL = [f for f in FORMATS if f != "forces"]
 SCALAR = ("scope", "trial", "measure", "statistic")

@@ -243,6 +243,7 @@ def test_four_cameras():
     np.testing.assert_allclose(fit.trials[0].camera_position_m, trial.poses[0].p_nc, atol=1e-6)
 
 
+@pytest.mark.usefixtures("little_optimised")
 def test_laboratory_markers():
     scale, offset = person(9)
     trial = observe_markers(walk(9), TIME_S, scale=scale, site_offset_m=offset)

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ def pictures(size: int, n: int) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("little_optimised")
 @pytest.mark.parametrize(
     "name",
     [
@@ -54,7 +56,7 @@ def test_jax_function_has_litert_s_numbers(name: str) -> None:
     spec = spec_of(name)
     model = read_model(read_network(spec.path, spec.sha256, spec.outputs))
     shown = [spec.entered(p) for p in pictures(model.image_shape[0], 2)]
-    got = model(model.weights, jnp.stack(shown))
+    got = jax.jit(lambda weights, images: model(weights, images))(model.weights, jnp.stack(shown))
     lite = LiteModel(spec.path, spec.sha256, spec.outputs)
     for i, picture in enumerate(shown):
         expected = lite(picture)

@@ -99,6 +99,7 @@ def test_four_cameras_see_one_person(shared_data):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("little_optimised")
 def test_a_second_of_walking_from_laboratory_markers(walk):
     """The issue's bars, on a walk whose cluster places were estimated from the other one."""
     xyz, confidence = walk.xyz_world_m[WALK_FRAMES], walk.confidence[WALK_FRAMES]
