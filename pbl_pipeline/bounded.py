@@ -54,6 +54,8 @@ _MAX_HEADER = 10_000
 #: Digits of a number: all integers of 308 are finite floats.
 _LONG_NUMBER = re.compile(r"\d{309}")
 _LARGEST_INT = 10**308
+#: A text in JSON, also one that does not end; brackets outside of such.
+_JSON_TEXT, _BRACKETS = re.compile(r'"(?:[^"\\]|\\.?)*+"?', re.DOTALL), re.compile(r"[][{}]")
 _HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
 
 #: Errors that readers of packed files raise for damaged ones; RuntimeError: for one with a password.
@@ -105,14 +107,15 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 def parse_json(text: str) -> Any:
     """The content of a JSON text; not nested beyond `MAX_DEPTH`, all integers fit a float, all texts are Unicode."""
-    if text.count("[") + text.count("{") > MAX_CONTAINERS:
+    containers = text.count("[") + text.count("{")
+    if containers > MAX_CONTAINERS:
         raise ValueError(f"more than {MAX_CONTAINERS:,} lists and objects")
     if _LONG_NUMBER.search(text):
         raise ValueError("a number of more than 308 digits")
-    try:
-        content = json.loads(text)
-    except RecursionError as error:
-        raise ValueError(f"nested more than {MAX_DEPTH} deep") from error
+    # Before the parser, which would nest its own calls to Python's limit, where the destructor of any object fails.
+    if containers > MAX_DEPTH and _depth(text) > MAX_DEPTH:
+        raise ValueError(f"nested more than {MAX_DEPTH} deep")
+    content = json.loads(text)
     halves = _HALF_LETTER.search(text) is not None
     for values in _levels(content):
         if halves:
@@ -120,6 +123,12 @@ def parse_json(text: str) -> Any:
                 if isinstance(value, str) and not value.isascii():
                     value.encode()  # halves of a letter of UTF-16, which no file can hold: a ValueError
     return content
+
+
+def _depth(text: str) -> int:
+    """Return how deeply the lists and objects of a JSON text are nested."""
+    brackets = _BRACKETS.findall(_JSON_TEXT.sub("", text))
+    return max(itertools.accumulate(1 if b in "[{" else -1 for b in brackets), default=0)
 
 
 def _levels(content: Any) -> Iterator[Iterator[Any]]:

@@ -208,6 +208,16 @@ def test_json_that_is_sound_is_read():
     for _ in range(bounded.MAX_DEPTH):
         deep = [deep]
     assert bounded.parse_json(json.dumps(deep)) == deep
+    texts = ["[" * 99, '{"' * 99, '"[', "\\"]
+    assert bounded.parse_json(json.dumps(texts)) == texts
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 33 + "1" + "}" * 33, "[" * 33 + '"'])
+def test_nested_json_is_refused_before_it_is_parsed(monkeypatch: pytest.MonkeyPatch, text: str):
+    """The parser would nest its calls to Python's limit, where the destructors of other objects fail."""
+    monkeypatch.setattr(json, "loads", pytest.fail)
+    with pytest.raises(ValueError, match="deep"):
+        bounded.parse_json(text)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
 from pbl_pipeline import texts
+from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
 from pbl_pipeline.words import capital
@@ -148,8 +149,8 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def begin(request: Request) -> Response:
         try:
-            stated = json.loads(await _body(request, "application/json", BODY_BYTES))
-        except (ValueError, RecursionError):
+            stated = parse_json((await _body(request, "application/json", BODY_BYTES)).decode())
+        except ValueError:
             raise Refused("form") from None
         sent = await tables.ask(phone_recordings.begin, request.state.phone, stated)
         return await told(request, sent)
