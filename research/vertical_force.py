@@ -25,7 +25,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline.body import load_body, stature_m
-from pbl_pipeline.kinetics import GRAVITY, contact_of, inverse_dynamics, segment_inertia, smooth_motion
+from pbl_pipeline.kinetics import GRAVITY, contact_of, inverse_dynamics, smooth_motion
 from pbl_pipeline.kinetics import vertical as stage
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
 from pbl_pipeline.kinetics.types import WIDTH_SD
@@ -93,7 +93,7 @@ def children() -> list[Person]:
         fit = fit_walk(walk)
         one, two = sorted(steps_of(walk, fit, 6.0), key=lambda s: s.time_s[s.stance][0])
         motion = smooth_motion(fit.time_s, fit.qpos, 6.0)[0]
-        centre = inverse_dynamics(body, fit.scale, segment_inertia(body, fit.scale), motion).centre_m
+        centre = inverse_dynamics(body, fit.scale, motion).centre_m
         feet = np.sum(contact_of(motion.time_s, walk.events) == 1, axis=1)
         known = slice(np.flatnonzero(one.alone)[0], np.flatnonzero(two.alone)[-1] + 1)
         phase, total = stage.support_phase(_two(feet))[known], (one.force + two.force)[known, 2] / GRAVITY

@@ -72,7 +72,12 @@ def capsules(body: Body, qpos: np.ndarray, scale: np.ndarray) -> Capsules:
 def stature_m(body: Body, scale: np.ndarray) -> float:
     """Height (m) of the body with scale multipliers (8,), standing at `qpos = 0`: from its soles to the top of its
     head, as its shapes have them (1.80 m unscaled)."""
-    shapes = capsules(body, np.zeros((1, len(body.joint_names))), scale)
+    return _stature_m(body, tuple(np.asarray(scale, np.float64).tolist()))
+
+
+@functools.lru_cache(maxsize=64)
+def _stature_m(body: Body, scale: tuple[float, ...]) -> float:
+    shapes = capsules(body, np.zeros((1, len(body.joint_names))), np.array(scale))
     z, r = np.concatenate([shapes.start, shapes.end])[..., 2], shapes.radius_m
     return float((z + r).max() - (z - r).min())
 

@@ -20,7 +20,6 @@ from pbl_pipeline.shipped import shipped_text
 
 from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
 from .ground import GroundReaction, contact_of, ground_reaction, needed_vertical
-from .inertia import Inertia, segment_inertia
 from .joints import knee_adduction, leg_moments
 from .measures import cycle_table, split_table
 from .types import (
@@ -123,9 +122,8 @@ def trial_kinetics(fit: TrialFit, gait: Walk, params: KineticsParams, *, aid: st
     if code:
         return TrialKinetics(fit.name, EMPTY, code, REASONS[code])
     body = load_body()
-    inertia = segment_inertia(body, fit.scale)
     qpos = np.asarray(fit.qpos, float)
-    series = trial_series(body, fit, inertia, qpos, gait.events.events, params)
+    series = trial_series(body, fit, qpos, gait.events.events, params)
     if series is None:
         return TrialKinetics(fit.name, EMPTY, "TOO_SHORT", REASONS["TOO_SHORT"])
     table = cycle_table(series, gait.cycles)
@@ -133,7 +131,7 @@ def trial_kinetics(fit: TrialFit, gait: Walk, params: KineticsParams, *, aid: st
     drawn = [
         cycle_table(s, gait.cycles)
         for noise in _noise(fit, params)
-        if (s := trial_series(body, fit, inertia, qpos + noise, gait.events.events, params, rng)) is not None
+        if (s := trial_series(body, fit, qpos + noise, gait.events.events, params, rng)) is not None
     ]
     samples = np.array(drawn) if drawn else None
     sd = np.full_like(table, np.nan) if samples is None else samples.std(axis=0, ddof=1)
@@ -163,7 +161,6 @@ def _code_against(fit: TrialFit, gait: Walk, aid: str) -> str:
 def trial_series(
     body: Body,
     fit: TrialFit,
-    inertia: Inertia,
     qpos: np.ndarray,
     events: Sequence[GaitEvent],
     params: KineticsParams,
@@ -173,7 +170,7 @@ def trial_series(
     `rng` the vertical force is drawn from its posterior, else it is the mean."""
     parts = []
     for motion in smooth_motion(fit.time_s, qpos, params.cutoff_hz):
-        d = inverse_dynamics(body, fit.scale, inertia, motion)
+        d = inverse_dynamics(body, fit.scale, motion)
         contact = contact_of(motion.time_s, events)
         vertical = _vertical(body, fit, d, contact, load_vertical_model(params.vertical_model), rng)
         parts.append(series_of(body, motion, d, ground_reaction(body, fit.scale, d, contact, vertical)))

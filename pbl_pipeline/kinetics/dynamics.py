@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Body, scaled_model
 from pbl_pipeline.gait.events.signal import uniform_segments
 
-from .inertia import Inertia
+from .inertia import segment_inertia
 
 #: Standard gravity (m/s^2); a force of 1 body weight is this per kilogram.
 GRAVITY = 9.80665
@@ -73,20 +74,26 @@ def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz:
     return motions
 
 
-def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inertia, motion: Motion) -> Dynamics:
+def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], motion: Motion) -> Dynamics:
     """Return the force that a motion needs (`mj_inverse` in each frame, without contacts and joint limits)."""
-    model = _dynamic_model(body, scale, inertia)
+    model = _dynamic_model(body, tuple(np.asarray(scale, np.float64).tolist()))
     data = mujoco.MjData(model)
     n, q, b = len(motion.time_s), model.nv, model.nbody - 1
     generalised, axis, anchor = np.empty((n, q)), np.empty((n, q, 3)), np.empty((n, q, 3))
     centre = np.empty((n, 3))
     xpos, xmat = np.empty((n, b, 3)), np.empty((n, b, 3, 3))
+    given = [(data.qpos, motion.qpos), (data.qvel, motion.qvel), (data.qacc, motion.qacc)]
+    # Each access to a field of `data` makes a new array.
+    found = [
+        *((generalised, data.qfrc_inverse), (axis, data.xaxis), (anchor, data.xanchor), (centre, data.subtree_com[0])),
+        *((xpos, data.xpos[1:]), (xmat, data.xmat[1:].reshape(-1, 3, 3))),
+    ]
     for i in range(n):
-        data.qpos[:], data.qvel[:], data.qacc[:] = motion.qpos[i], motion.qvel[i], motion.qacc[i]
+        for field, values in given:
+            field[:] = values[i]
         mujoco.mj_inverse(model, data)
-        generalised[i], axis[i], anchor[i] = data.qfrc_inverse, data.xaxis, data.xanchor
-        centre[i] = data.subtree_com[0]
-        xpos[i], xmat[i] = data.xpos[1:], data.xmat[1:].reshape(-1, 3, 3)
+        for values, field in found:
+            values[i] = field
     slides = [body.joint_names.index(name) for name in SLIDES]
     turns = [body.joint_names.index(name) for name in PELVIS_TURNS]
     # The generalised forces are projections: of the force on each slide, of the moment about the pelvis on each turn.
@@ -96,9 +103,10 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], inertia: Inerti
     return Dynamics(force, moment, centre, generalised, axis, anchor, xpos, xmat)
 
 
-def _dynamic_model(body: Body, scale: np.ndarray, inertia: Inertia) -> mujoco.MjModel:
+@functools.lru_cache(maxsize=8)
+def _dynamic_model(body: Body, scale: tuple[float, ...]) -> mujoco.MjModel:
     """Return the scaled body with its inertia, free of contacts and joint limits."""
-    model = scaled_model(body, scale)
+    model, inertia = scaled_model(body, np.array(scale)), segment_inertia(body, np.array(scale))
     model.body_mass[1:] = inertia.mass
     model.body_ipos[1:] = inertia.centre_m
     model.body_inertia[1:] = inertia.moment_m2

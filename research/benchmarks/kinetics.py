@@ -50,7 +50,6 @@ from pbl_pipeline.kinetics import (
     ground_reaction,
     inverse_dynamics,
     leg_moments,
-    segment_inertia,
     smooth_motion,
 )
 from pbl_pipeline.kinetics.compute import series_of
@@ -193,7 +192,7 @@ def steps_of(walk: Walk, fit: TrialFit, cutoff_hz: float) -> Iterator[Step]:
     """Yield the stances of a walk that a plate saw."""
     body = load_body()
     motion = smooth_motion(fit.time_s, fit.qpos, cutoff_hz)[0]
-    dynamics = inverse_dynamics(body, fit.scale, segment_inertia(body, fit.scale), motion)
+    dynamics = inverse_dynamics(body, fit.scale, motion)
     contact = contact_of(motion.time_s, walk.events)
     ours = ground_reaction(body, fit.scale, dynamics, contact)
     moment, _ = leg_moments(body, dynamics, ours, motion)

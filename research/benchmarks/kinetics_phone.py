@@ -34,7 +34,7 @@ from pbl_pipeline.fit import TrialFit, default_fit, fit_session
 from pbl_pipeline.gait import GaitCycle, GaitEvents, find_cycles, gait_metrics
 from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.gait.laboratory import read_lab_trial
-from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, segment_inertia, visit_kinetics
+from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, visit_kinetics
 from pbl_pipeline.kinetics.compute import HEALTHY_SD, METHOD_SD, too_uncertain, trial_series
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
 from pbl_pipeline.kinetics.types import WIDTH_SD
@@ -111,10 +111,7 @@ def vertical_rms(walk: Walk, fit: TrialFit, exact: TrialFit) -> float:
     """Return the root mean square error of the vertical force of a foot on the floor (% BW), under the true events,
     over the times at which the phone saw the walker."""
     body, params = load_body(), METHODS.find().params
-    ours, true = (
-        trial_series(body, f, segment_inertia(body, f.scale), np.asarray(f.qpos, float), walk.events, params)
-        for f in (fit, exact)
-    )
+    ours, true = (trial_series(body, f, np.asarray(f.qpos, float), walk.events, params) for f in (fit, exact))
     assert ours is not None
     assert true is not None
     up = np.stack([np.interp(true.time_s, ours.time_s, ours.force_bw[:, k, 2]) for k in (0, 1)], axis=1)

@@ -65,7 +65,7 @@ def still(n: int = 5, **joints: float) -> Motion:
 
 
 def dynamics_of(motion: Motion, scale: np.ndarray = ONE) -> Dynamics:
-    return inverse_dynamics(BODY, scale, segment_inertia(BODY, scale), motion)
+    return inverse_dynamics(BODY, scale, motion)
 
 
 # ------------------------------------------------------------------------------------------------------------- inertia
@@ -139,7 +139,7 @@ def test_the_force_is_the_change_of_momentum_of_a_walker() -> None:
     truth = synthesise(SynthSpec(seed=3, seconds=4, fps=100, noise="none")).truth
     motion = smooth_motion(truth.time_s, truth.qpos, 6.0)[0]
     inertia = segment_inertia(BODY, truth.scale)
-    d = inverse_dynamics(BODY, truth.scale, inertia, motion)
+    d = inverse_dynamics(BODY, truth.scale, motion)
     centres = d.xpos + np.einsum("nbij,bj->nbi", d.xmat, inertia.centre_m)
     centre = np.einsum("b,nbi->ni", inertia.mass, centres)
     change = make_interp_spline(motion.time_s, centre, k=5).derivative(2)(motion.time_s) + np.array([0, 0, GRAVITY])
@@ -491,8 +491,7 @@ def test_only_one_camera_with_known_noise_and_a_stated_error_is_weighed(walk: Tr
 
     def vertical(**changes) -> np.ndarray:
         changed = dataclasses.replace(fit, **changes)
-        inertia = segment_inertia(BODY, fit.scale)
-        series = trial_series(BODY, changed, inertia, np.asarray(fit.qpos, float), events, params)
+        series = trial_series(BODY, changed, np.asarray(fit.qpos, float), events, params)
         return not_none(series).force_bw[:, :, 2].sum(axis=1)
 
     needed = vertical(orientation_source="measured: calibration")
