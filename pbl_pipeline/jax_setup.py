@@ -25,9 +25,8 @@ FLAGS_UNTIL = (0, 12)
 
 
 @functools.cache
-def configure(*flags: str) -> None:
-    """Set JAX up for the fit and the networks of detection, `flags` of XLA included. Call before the first array;
-    idempotent.
+def configure() -> None:
+    """Set JAX up for the fit and the networks of detection. Call before the first array; idempotent.
 
     Compiled programs are kept in `jax/` of the user's cache folder. JAX's own settings win: those of
     `JAX_COMPILATION_CACHE_DIR` and `JAX_PERSISTENT_CACHE_*`, those that a program made in `jax.config` before, and XLA
@@ -51,19 +50,19 @@ def configure(*flags: str) -> None:
     # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
     # On a CPU, XLA's newer compiler of fused operations takes longer, and its programs are not faster
     # (docs/benchmarks.md). Read when the first device is asked for.
-    for flag in known_flags(jax.__version__, flags):
+    for flag in known_flags(jax.__version__):
         given = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in given:
             os.environ["XLA_FLAGS"] = f"{given} {flag}".strip()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 
 
-def known_flags(version: str, more: tuple[str, ...] = ()) -> tuple[str, ...]:
+def known_flags(version: str) -> tuple[str, ...]:
     """Return the flags that the libraries of this version of JAX know, those of its plugins included."""
     if tuple(int(n) for n in version.split(".")[:2]) > FLAGS_UNTIL:
         return ()
     cpu_alone = importlib.util.find_spec("jax_plugins") is None
-    return (*GPU_FLAGS, *more, *([CPU_FLAG] if cpu_alone else []))
+    return (*GPU_FLAGS, CPU_FLAG) if cpu_alone else GPU_FLAGS
 
 
 _COMPILED = {"seconds": 0.0}
