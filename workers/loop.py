@@ -179,26 +179,26 @@ class Worker:
             longs = [p for table in self.tables if (p := queue.most_urgent(table, _IS_LONG)) is not None]
             if longs and min(longs) < min((p for p, *_ in ranked), default=math.inf):
                 self.long_waits()
-        # What is near its end first: a session that is nearly done should not wait for all others to begin.
-        for urgent, _, table in sorted(ranked, key=lambda r: r[:2]):
-            stage = registry.stage_of(table)
-            n = self.batch if stage.resource == registry.FIT else stage.batch
-            if self.limit is not None:
-                n = min(n, self.limit - self._taken[table.__name__])
-            jobs = self._claim(table, n, urgent, conditions[table]) if n > 0 else []
-            if jobs:
-                self._taken[table.__name__] += len(jobs)
-                self._do(jobs, conditions[table])
-                return len(jobs)
+        ranked.sort(key=lambda r: r[:2])
+        # First the recording whose pictures are in memory, which another process would decode again. Then what is near
+        # its end: a session that is nearly done should not wait for all others to begin.
+        for mine in (True, False) if self._in_hand is not None else (False,):
+            for urgent, _, table in ranked:
+                where = conditions[table]
+                if mine:
+                    if urgent > ranked[0][0] or "video_id" not in jobs_of(table).primary_key:
+                        continue
+                    where = f"priority={urgent} AND video_id={self._in_hand}" + (f" AND {where}" if where else "")
+                stage = registry.stage_of(table)
+                n = self.batch if stage.resource == registry.FIT else stage.batch
+                if self.limit is not None:
+                    n = min(n, self.limit - self._taken[table.__name__])
+                jobs = queue.claim(table, n, where) if n > 0 else []
+                if jobs:
+                    self._taken[table.__name__] += len(jobs)
+                    self._do(jobs, conditions[table])
+                    return len(jobs)
         return 0
-
-    def _claim(self, table: Any, n: int, urgent: int, where: str | None) -> list[Claim]:
-        """Reserve jobs: of the recording in hand, whose pictures are in memory, where no other is more urgent."""
-        if self._in_hand is not None and "video_id" in jobs_of(table).primary_key:
-            own = f"priority={urgent} AND video_id={self._in_hand}" + (f" AND {where}" if where else "")
-            if jobs := queue.claim(table, n, own):
-                return jobs
-        return queue.claim(table, n, where)
 
     def _conditions(self) -> dict[Any, str | None]:
         """Return the tables whose jobs may be taken, with the condition on their keys."""

@@ -20,7 +20,7 @@ from av.sidedata.sidedata import SideDataContainer
 from av.video.reformatter import VideoReformatter
 
 from .decode import Decoder, check_file
-from .kept import kept
+from .kept import decode_on_gpu, kept
 from .types import Frame, cut_samples, square, to_blocks
 
 
@@ -199,6 +199,7 @@ def _frames(path: Path, start: int, stop: int | None, step: int, threads: int | 
         pictures = kept(path)
         if pictures is None:
             decoder = stack.enter_context(Decoder(path, threads))
+            decode_on_gpu(decoder)
             time_base, stamped = decoder.time_base, iter(decoder)
         else:
             time_base, stamped = pictures.time_base, iter(pictures.stamped)

@@ -72,14 +72,23 @@ def kept(path: Path) -> Pictures | None:
     return pictures if pictures is not None and pictures.file == _identity(path) else None
 
 
+def decode_on_gpu(decoder: Decoder) -> float:
+    """Let the GPU decode the pictures, where it can and they are to be kept or no others are. Return the bytes that
+    they may take."""
+    room = share_of_memory() * _FRACTION
+    if _shelf.wanted and _shelf.pictures is None:
+        decoder.pictures = gpu_decoding.decoded(decoder.path, room)
+    return room
+
+
 def keeping(decoder: Decoder) -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield the pictures of a decoder, and keep them if that is wanted and the end is reached."""
     release_frames(memory=False)
     if not _shelf.wanted:
         yield from decoder
         return
-    room, file, stamped = share_of_memory() * _FRACTION, _identity(decoder.path), []
-    decoder.pictures = gpu_decoding.decoded(decoder.path, room)
+    file, stamped = _identity(decoder.path), []
+    room = decode_on_gpu(decoder)
     keep_large_blocks(True)
     for pts, frame in decoder:
         size = sum(plane.buffer_size for plane in frame.planes)

@@ -172,6 +172,26 @@ def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
     assert jobs_left() == {"VideoInfo": {"pending": 6}}
 
 
+@pytest.mark.parametrize("priority", [registry.NEW, registry.FIRST])
+def test_who_has_the_pictures_takes_all_that_needs_them_unless_another_job_is_more_urgent(
+    tables: None, tmp_path: Path, priority: int
+):
+    taken: list[queue.Claim] = []
+    one = Worker(schemas.computed_tables(), Silent(), report=lambda job, end: taken.extend([] if end else [job]))
+    other = queued(tmp_path, keypoints.Keypoints, "other")
+    held = queue.claim(keypoints.Keypoints)[0]  # by another worker
+    mine = queued(tmp_path, video.VideoInfo, "mine")
+    one.step()
+    queue.put_back(held)
+    keypoints.Keypoints.jobs.update1({**held.key, "priority": priority})
+    while not order_of("Keypoints", taken)[1:]:
+        one.step()
+    expected = [("VideoInfo", mine), ("Tracking", mine), ("SubjectChoice", mine), ("Keypoints", mine)]
+    expected.insert(1 if priority == registry.FIRST else 4, ("Keypoints", other))
+    of_pictures = [name for name, _ in expected]
+    assert [(j.table.__name__, j.key["video_id"]) for j in taken if j.table.__name__ in of_pictures] == expected
+
+
 def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
     """Run a supervisor while a thread does this, which stops it then; the exit code."""
 

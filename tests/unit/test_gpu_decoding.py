@@ -104,6 +104,22 @@ def test_memory_serves_the_next_video_once_no_picture_is_used(decoder: FFmpegDec
         assert (decoder.n_videos, decoder.n_connections) == (6, 2)
 
 
+def test_a_stage_alone_is_decoded_by_the_gpu_and_leaves_what_is_kept(decoder: FFmpegDecoder, tmp_path: Path) -> None:
+    path, other = video(tmp_path), video(tmp_path, "b", crf=40)
+    expected, of_other = pictures(path)[2:7], pictures(other)
+    with frames_kept():
+        for n in (1, 2):
+            assert [(f.time_s, f.image.tobytes()) for f in read_frames(path, 2, 7)] == expected
+            assert decoder.n_videos == n  # nothing of it is kept
+        probe(path)
+        assert pictures(other) == of_other
+        assert decoder.n_videos == 3
+        assert [(f.time_s, f.image.tobytes()) for f in read_frames(path, 2, 7)] == expected
+        assert decoder.n_videos == 3
+    assert pictures(path)[2:7] == expected
+    assert decoder.n_videos == 3
+
+
 def unusual(folder: Path, kind: str) -> Path:
     if kind == "more colour":
         return video(folder, pixel_format="yuv444p")
