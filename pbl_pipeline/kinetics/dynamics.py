@@ -75,7 +75,8 @@ def smooth_motion(time_s: np.ndarray, qpos: Float[np.ndarray, "T Q"], cutoff_hz:
 
 
 def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], motion: Motion) -> Dynamics:
-    """Return the force that a motion needs (`mj_inverse` in each frame, without contacts and joint limits)."""
+    """Return the force that a motion needs, without contacts and joint limits: `mj_inverse` in each frame, by the parts
+    of it that a body without damping, springs and armature needs."""
     model = _dynamic_model(body, tuple(np.asarray(scale, np.float64).tolist()))
     data = mujoco.MjData(model)
     n, q, b = len(motion.time_s), model.nv, model.nbody - 1
@@ -85,13 +86,15 @@ def inverse_dynamics(body: Body, scale: Float[np.ndarray, " S"], motion: Motion)
     given = [(data.qpos, motion.qpos), (data.qvel, motion.qvel), (data.qacc, motion.qacc)]
     # Each access to a field of `data` makes a new array.
     found = [
-        *((generalised, data.qfrc_inverse), (axis, data.xaxis), (anchor, data.xanchor), (centre, data.subtree_com[0])),
+        *((axis, data.xaxis), (anchor, data.xanchor), (centre, data.subtree_com[0])),
         *((xpos, data.xpos[1:]), (xmat, data.xmat[1:].reshape(-1, 3, 3))),
     ]
     for i in range(n):
         for field, values in given:
             field[:] = values[i]
-        mujoco.mj_inverse(model, data)
+        for part in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            part(model, data)
+        mujoco.mj_rne(model, data, 1, generalised[i])
         for values, field in found:
             values[i] = field
     slides = [body.joint_names.index(name) for name in SLIDES]

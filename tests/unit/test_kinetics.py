@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -33,6 +34,7 @@ from pbl_pipeline.kinetics import (
     visit_kinetics,
 )
 from pbl_pipeline.kinetics.compute import HEALTHY_SD, trial_series
+from pbl_pipeline.kinetics.dynamics import _dynamic_model
 from pbl_pipeline.kinetics.ground import PROGRESS, TRANSIENT
 from pbl_pipeline.kinetics.vertical import (
     Noise,
@@ -133,6 +135,16 @@ def test_a_swinging_shank_is_a_pendulum(angle: float) -> None:
         moment_of_inertia += turned @ (inertia.moment_m2[b] * turned) + inertia.mass[b] * across @ across
         weight += np.cross(lever, [0, 0, -GRAVITY * inertia.mass[b]]) @ axis
     assert d.generalised[0, knee] == pytest.approx(moment_of_inertia * -4.2 - weight, abs=1e-6)
+
+
+def test_the_generalised_forces_are_mujocos() -> None:
+    truth = synthesise(SynthSpec(seed=3, seconds=2, fps=100, noise="none")).truth
+    (motion,), model = smooth_motion(truth.time_s, truth.qpos, 6.0), _dynamic_model(BODY, tuple(truth.scale.tolist()))
+    data, found = mujoco.MjData(model), dynamics_of(motion, truth.scale).generalised
+    for row, *values in zip(found, motion.qpos, motion.qvel, motion.qacc, strict=True):
+        data.qpos, data.qvel, data.qacc = values
+        mujoco.mj_inverse(model, data)
+        assert row == pytest.approx(data.qfrc_inverse, abs=1e-9)
 
 
 def test_the_force_is_the_change_of_momentum_of_a_walker() -> None:
