@@ -9,9 +9,12 @@ turn: a new person is found within one turn, and `backtrack` then adds the frame
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
+
+from pbl_pipeline.paramset import later
 
 from .associate import Trail
 from .tiling import Window, tiles
@@ -35,6 +38,10 @@ class WatchParams:
     known_hits: int = 4
     near: float = 0.6
     window_sizes: float = 1.6  # side of the window around a person, in sides of the region of interest
+    # Distance of the places at which such a window can lie, in sides; its side is a power of 2 ** (1 / 8). Rounding of a
+    # network moves no such window, and else moves one by a pixel now and then, which changes what is detected in it and
+    # in the next ones. 0: whole pixels.
+    window_grid: float = later(0.0)
     covered: float = 0.8  # tiles covered by such windows to this fraction are not searched
 
 
@@ -57,12 +64,12 @@ class Watch:
         """Trails that are to be detected in this frame, and those that lie in the window of one of them."""
         now = time_s + self._slack
         due = [t for t in live if last or now >= t.due_s]
-        windows = [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
+        windows = [window_around(t.predict(time_s), self._params) for t in due]
         return [t for t in live if t in due or any(_inside(t.predict(time_s), w) for w in windows)]
 
     def around(self, time_s: float, due: Sequence[Trail]) -> list[Window]:
         """Windows around these people."""
-        return [window_around(t.predict(time_s), self._params.window_sizes) for t in due]
+        return [window_around(t.predict(time_s), self._params) for t in due]
 
     def elsewhere(self, time_s: float, live: Sequence[Trail]) -> list[Window]:
         """Windows in which new people are searched for in this frame; the first time all of them."""
@@ -96,10 +103,15 @@ class Watch:
             trail.due_s = time_s + interval
 
 
-def window_around(state: np.ndarray, sizes: float) -> Window:
-    """Square of `sizes` regions of interest around a body with this state (`measure`)."""
-    half = 0.5 * sizes * float(np.exp(state[2]))
-    return round(state[0] - half), round(state[1] - half), round(state[0] + half), round(state[1] + half)
+def window_around(state: np.ndarray, params: WatchParams) -> Window:
+    """Square of `window_sizes` regions of interest around a body with this state (`measure`)."""
+    x, y, side = float(state[0]), float(state[1]), params.window_sizes * float(np.exp(state[2]))
+    if params.window_grid:
+        side = 2 ** (round(8 * math.log2(side)) / 8)
+        step = params.window_grid * side
+        x, y = step * round(x / step), step * round(y / step)
+    half = 0.5 * side
+    return round(x - half), round(y - half), round(x + half), round(y + half)
 
 
 def _close(trail: Trail, time_s: float, live: Sequence[Trail], params: WatchParams) -> bool:

@@ -8,6 +8,7 @@ from pbl_pipeline.methods import Stage
 
 from .associate import AssociationParams
 from .blazepose import blazepose
+from .detection_schedule import WatchParams
 from .params import TrackingParams
 from .walker_score import SubjectParams, choose_walker
 from .yolox import yolox
@@ -50,7 +51,12 @@ def detector_params(name: str) -> TrackingParams:
 
 #: A family is a person detector: a function from `TrackingParams` to a `PersonDetector`.
 METHODS: Stage[TrackingParams] = Stage("tracking", "detector", "blazepose-tiles", RegisteredDetectors())
-METHODS.register("blazepose-tiles", 4, TrackingParams(cut_windows=True, exact_ends=True), blazepose)
+METHODS.register(
+    "blazepose-tiles",
+    5,
+    TrackingParams(cut_windows=True, exact_ends=True, watch=WatchParams(window_grid=1 / 16)),
+    blazepose,
+)
 METHODS.register_family("yolox", TrackingParams, yolox)
 
 #: A family is a way to choose: a function as `choose_walker`.

@@ -19,7 +19,7 @@ from pbl_pipeline.video import Frame
 
 from .appearance import appearance_similarity, mean_appearance, with_appearance
 from .associate import AssociationParams, Trail, measure, pair_cost, same_body
-from .detection_schedule import window_around
+from .detection_schedule import WatchParams, window_around
 from .identity_swaps import line_near
 from .tiling import detect_in
 from .types import PersonDetector, Scene
@@ -33,7 +33,7 @@ def backtrack(
     kept: Sequence[tuple[int, float, Scene]],
     others: Sequence[Trail],
     detector: PersonDetector,
-    window_sizes: float,
+    watch: WatchParams,
     params: AssociationParams,
 ) -> Trail:
     """Extend a trail to earlier frames, `kept` (index, time_s, picture) in order of time.
@@ -45,7 +45,7 @@ def backtrack(
         return [measure(d) for t in others for d in t.detections[_at(t, index)]]
 
     before = [k for k in reversed(kept) if k[1] < trail.times[0]]
-    return _with_sightings(trail, before, taken, detector, window_sizes, params)
+    return _with_sightings(trail, before, taken, detector, watch, params)
 
 
 def with_exact_ends(
@@ -54,7 +54,7 @@ def with_exact_ends(
     frames: Callable[[int, int], Iterable[Frame]],
     within_s: float,
     detector: PersonDetector,
-    window_sizes: float,
+    watch: WatchParams,
     params: AssociationParams,
 ) -> list[Trail]:
     """Extend the trails to the first and the last frame in which the person is found, up to `within_s` at either end.
@@ -81,7 +81,7 @@ def with_exact_ends(
                 shown, others = scenes.pop((i, part)), [*out[:i], *out[i + 1 :]]
                 shown = shown if frame.index > out[i].frames[0] else shown[::-1]
                 taken = functools.partial(_between_sightings, others)
-                out[i] = _with_sightings(out[i], shown, taken, detector, window_sizes, params)
+                out[i] = _with_sightings(out[i], shown, taken, detector, watch, params)
     return out
 
 
@@ -95,7 +95,7 @@ def _with_sightings(
     shown: Sequence[tuple[int, float, Scene]],
     taken: Callable[[int, float], Sequence[np.ndarray]],
     detector: PersonDetector,
-    window_sizes: float,
+    watch: WatchParams,
     params: AssociationParams,
 ) -> Trail:
     """Extend a trail with sightings in frames (index, time_s, picture), which are before it in reverse order, or after
@@ -106,7 +106,7 @@ def _with_sightings(
     more, misses = Trail.of(trail.frames[end], sign * trail.times[end], trail.detections[end]), 0
     for index, time_s, scene in shown:
         at = sign * time_s
-        found = detect_in(detector, scene, [window_around(more.predict(at), window_sizes)])
+        found = detect_in(detector, scene, [window_around(more.predict(at), watch)])
         others = taken(index, time_s)
         free = [d for d in found if not any(same_body(measure(d), o) for o in others)]
         # As in `Associator`: the gate widens with time, but not for detections that are not sure.

@@ -61,7 +61,7 @@ def track_people(
         frames = functools.partial(read_frames, video_path)
         watch = params.watch
         within_s = max(watch.search_interval_s, watch.rest_interval_s)
-        trails = with_exact_ends(trails, info.time_s, frames, within_s, finder, watch.window_sizes, params.association)
+        trails = with_exact_ends(trails, info.time_s, frames, within_s, finder, watch, params.association)
     people = join_trails(undo_swaps(trails, params.uncross), size, params.join)
     longest = params.association.max_gap_s
     persons = tuple(_to_track(i + 1, t, info.time_s, size, longest) for i, t in enumerate(people))
@@ -108,8 +108,8 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
             sure = _confirmed(new, detector, scene, now, associator.live, params)
             if sure is not None:
                 trail = Trail.of(frame.index, now, sure)
-                sizes = params.watch.window_sizes
-                associator.begin(backtrack(trail, kept, associator.trails(), detector, sizes, params.association))
+                taken = associator.trails()
+                associator.begin(backtrack(trail, kept, taken, detector, params.watch, params.association))
         watch.detected(now, due, associator.live)
         if elsewhere:
             kept.append((frame.index, now, scene))
@@ -140,7 +140,7 @@ def _confirmed(
     known = [t.predict(time_s) for t in live]
     if any(same_body(measure(new), k) for k in known):
         return None
-    window = window_around(measure(new), params.watch.window_sizes)
+    window = window_around(measure(new), params.watch)
     again = [d for d in detect_in(detector, scene, [window]) if d.score >= params.association.sure_score]
     if not again:
         return None

@@ -160,7 +160,7 @@ def _timed(path: Path, part: VideoInfo, params: TrackingParams, detector: Counte
     before, start = detector.calls, time.process_time()
     whole: Callable = tracks.read_frames
     # Only the first frames: the tracker reads to the end of what was probed.
-    tracks.read_frames = lambda p: whole(p, stop=part.n_frames)
+    tracks.read_frames = lambda p, start=0, stop=None: whole(p, start, min(stop or part.n_frames, part.n_frames))
     try:
         tracking = track_people(path, params, detector, part)
     finally:
@@ -180,8 +180,8 @@ def memory(minutes: float, every: int) -> None:
         start, processor = time.monotonic(), time.process_time()
         whole: Callable = tracks.read_frames
 
-        def told(p: Path) -> Iterator:
-            for frame in whole(p):
+        def told(p: Path, *part: int) -> Iterator:
+            for frame in whole(p, *part):
                 if frame.index % every == 0:
                     click.echo(f"  frame {frame.index:>6}: {_resident_mb():.0f} MB")
                 yield frame

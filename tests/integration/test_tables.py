@@ -317,7 +317,7 @@ def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: P
     assert (tracking.TrackingSelection & {"video_id": row.video_id}).fetch1("tracking_method") == "crowd-v2"
     populate(["VideoInfo", "Tracking"])
     assert len(tracking.Tracking & {"video_id": row.video_id, "tracking_method": "crowd-v2"}) == 1
-    assert resolve_method(tracking.TrackingMethod, "blazepose-tiles") == "blazepose-tiles-v4"
+    assert resolve_method(tracking.TrackingMethod, "blazepose-tiles") == "blazepose-tiles-v5"
 
 
 def test_unknown_methods_are_refused_with_the_names_there_are(tables: None, tmp_path: Path):

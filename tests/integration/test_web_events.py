@@ -80,7 +80,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     row = gait.EventCorrection.fetch1()
     assert (row["video_id"], row["gait_method"], row["correction_no"]) == (1, visit, 1)
     assert (row["correction_changed"], row["correction_by"], row["correction_withdrawn"]) == (1, "A. First", 0)
-    assert (row["correction_person"], row["correction_tracking"]) == (1, "blazepose-tiles-v4")
+    assert (row["correction_person"], row["correction_tracking"]) == (1, "blazepose-tiles-v5")
     by_hand = gait.EventCorrection.Event & "corrected_probability is null"
     set_by_hand = by_hand.fetch1("corrected_time", "corrected_side", "corrected_kind")
     assert set_by_hand == (pytest.approx(time + 0.1, abs=1e-4), side, kind)

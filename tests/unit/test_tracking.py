@@ -24,6 +24,7 @@ from pbl_pipeline.tracking import (
     track_people,
 )
 from pbl_pipeline.tracking.associate import Associator, Trail
+from pbl_pipeline.tracking.detection_schedule import WatchParams, window_around
 from pbl_pipeline.tracking.reidentify import join_trails
 from pbl_pipeline.tracking.tiling import detect_in, merge, tile_starts, tiles
 from pbl_pipeline.video import probe
@@ -58,6 +59,24 @@ def test_circle_rotation_is_clockwise_and_zero_when_upright(rim, turn):
 def test_body_box_turns_with_the_body():
     np.testing.assert_allclose(body_box(np.array([100, 200, 50, 0.0])), [90, 175, 110, 225])
     np.testing.assert_allclose(body_box(np.array([100, 200, 50, np.pi / 2])), [75, 190, 125, 210])
+
+
+def test_rounding_of_a_network_moves_no_window_around_a_person():
+    rng, n = np.random.default_rng(5), 4000
+    states = np.column_stack([rng.uniform(0, 1920, n), rng.uniform(0, 1080, n), np.log(rng.uniform(60, 1000, n))])
+    other = states + rng.normal(0, 1, (n, 3)) * [4e-4, 4e-4, 1e-6]
+
+    def windows(states: np.ndarray, grid: float) -> np.ndarray:
+        return np.array([window_around(s, WatchParams(window_grid=grid)) for s in states])
+
+    found = windows(states, 1 / 16)
+    assert np.mean((found != windows(other, 1 / 16)).any(axis=1)) < 5e-4
+    assert np.mean((windows(states, 0.0) != windows(other, 0.0)).any(axis=1)) > 1e-3
+    half = 0.5 * np.exp(states[:, 2:])
+    assert (found[:, :2] < states[:, :2] - half).all()
+    assert (found[:, 2:] > states[:, :2] + half).all()
+    twice = windows(np.column_stack([2 * states[:, :2], states[:, 2] + np.log(2)]), 1 / 16)  # in a larger picture
+    assert np.mean(np.abs(twice - 2 * found).max(axis=1) <= 2) > 0.999
 
 
 @pytest.mark.parametrize(("width", "height"), [(1768, 994), (1080, 1920), (720, 1280), (64, 64), (4000, 500)])
