@@ -38,9 +38,9 @@ class WatchParams:
     known_hits: int = 4
     near: float = 0.6
     window_sizes: float = 1.6  # side of the window around a person, in sides of the region of interest
-    # Distance of the places at which such a window can lie, in sides; its side is a power of 2 ** (1 / 8). Rounding of a
-    # network moves no such window, and else moves one by a pixel now and then, which changes what is detected in it and
-    # in the next ones. 0: whole pixels.
+    # Distance of the places at which such a window can lie, in its sides, which are powers of 2 ** (1 / 8): rounding of
+    # a network moves no such window. It does move one of whole pixels (0) now and then, and so what is detected in it
+    # and in those that follow.
     window_grid: float = later(0.0)
     covered: float = 0.8  # tiles covered by such windows to this fraction are not searched
 

@@ -1,5 +1,8 @@
 """Forces and moments against closed forms, the motion's own momentum, and what must not be computed."""
 
+# MuJoCo is a compiled module without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 import dataclasses
 from pathlib import Path
 
