@@ -179,26 +179,31 @@ class Worker:
             longs = [p for table in self.tables if (p := queue.most_urgent(table, _IS_LONG)) is not None]
             if longs and min(longs) < min((p for p, *_ in ranked), default=math.inf):
                 self.long_waits()
+        # What is near its end first: a session that is nearly done should not wait for all others to begin.
         ranked.sort(key=lambda r: r[:2])
-        # First the recording whose pictures are in memory, which another process would decode again. Then what is near
-        # its end: a session that is nearly done should not wait for all others to begin.
-        for mine in (True, False) if self._in_hand is not None else (False,):
-            for urgent, _, table in ranked:
-                where = conditions[table]
-                if mine:
-                    if urgent > ranked[0][0] or "video_id" not in jobs_of(table).primary_key:
-                        continue
-                    where = f"priority={urgent} AND video_id={self._in_hand}" + (f" AND {where}" if where else "")
-                stage = registry.stage_of(table)
-                n = self.batch if stage.resource == registry.FIT else stage.batch
-                if self.limit is not None:
-                    n = min(n, self.limit - self._taken[table.__name__])
-                jobs = queue.claim(table, n, where) if n > 0 else []
-                if jobs:
-                    self._taken[table.__name__] += len(jobs)
-                    self._do(jobs, conditions[table])
-                    return len(jobs)
+        anyones = [(table, conditions[table]) for _, _, table in ranked]
+        for table, where in [*self._of_recording_in_hand(ranked, conditions), *anyones]:
+            stage = registry.stage_of(table)
+            n = self.batch if stage.resource == registry.FIT else stage.batch
+            if self.limit is not None:
+                n = min(n, self.limit - self._taken[table.__name__])
+            jobs = queue.claim(table, n, where) if n > 0 else []
+            if jobs:
+                self._taken[table.__name__] += len(jobs)
+                self._do(jobs, conditions[table])
+                return len(jobs)
         return 0
+
+    def _of_recording_in_hand(
+        self, ranked: Sequence[tuple[int, int, Any]], conditions: dict[Any, str | None]
+    ) -> list[tuple[Any, str]]:
+        """Return the tables that have a job as urgent as any, with the condition on those of the recording whose
+        pictures are in memory: another process would decode it again."""
+        if self._in_hand is None or not ranked:
+            return []
+        most, mine = ranked[0][0], f"priority={ranked[0][0]} AND video_id={self._in_hand}"
+        tables = [t for urgent, _, t in ranked if urgent == most and "video_id" in jobs_of(t).primary_key]
+        return [(t, f"{mine} AND {conditions[t]}" if conditions[t] else mine) for t in tables]
 
     def _conditions(self) -> dict[Any, str | None]:
         """Return the tables whose jobs may be taken, with the condition on their keys."""

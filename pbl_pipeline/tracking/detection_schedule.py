@@ -64,7 +64,7 @@ class Watch:
         """Trails that are to be detected in this frame, and those that lie in the window of one of them."""
         now = time_s + self._slack
         due = [t for t in live if last or now >= t.due_s]
-        windows = [window_around(t.predict(time_s), self._params) for t in due]
+        windows = self.around(time_s, due)
         return [t for t in live if t in due or any(_inside(t.predict(time_s), w) for w in windows)]
 
     def around(self, time_s: float, due: Sequence[Trail]) -> list[Window]:

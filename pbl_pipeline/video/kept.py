@@ -73,8 +73,8 @@ def kept(path: Path) -> Pictures | None:
 
 
 def decode_on_gpu(decoder: Decoder) -> float:
-    """Let the GPU decode the pictures, where it can and they are to be kept or no others are. Return the bytes that
-    they may take."""
+    """Let the GPU decode the pictures, where it can, within `frames_kept` and while no others are kept. Return the
+    bytes that they may take."""
     room = share_of_memory() * _FRACTION
     if _shelf.wanted and _shelf.pictures is None:
         decoder.pictures = gpu_decoding.decoded(decoder.path, room)

@@ -10,12 +10,12 @@ Networks are loaded before the time that counts. MediaPipe's wheel is without th
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -26,7 +26,7 @@ CORES = 2
 def mediapipe_seconds(video: str) -> tuple[int, int, float]:
     """Return frames, those with a person, and seconds of MediaPipe's solution; run by the Python that has it."""
     import cv2
-    import mediapipe
+    import mediapipe  # pyright: ignore[reportMissingImports]
 
     shown = n = 0
     seconds = 0.0
@@ -44,17 +44,18 @@ def main(python: str, video: str | None = None, rounds: int = 3) -> None:
     """Print frames a second of both, a line a round."""
     from pbl_pipeline import assets
     from pbl_pipeline.bench.detect import demo_clip
+    from pbl_pipeline.temporary import new_folder
 
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:CORES])
     where = "import mediapipe, pathlib; print(pathlib.Path(mediapipe.__file__).parent / 'modules/pose_landmark')"
     folder = Path(subprocess.run([python, "-c", where], check=True, capture_output=True, text=True).stdout.strip())
     heavy = assets.fetch("blazepose_landmarks_heavy")
     shutil.copy(heavy, folder / heavy.name)
-    with tempfile.TemporaryDirectory(prefix="pbl-bench-") as name:
-        film, result = Path(video) if video else demo_clip(Path(name) / "clip.mp4"), Path(name) / "result.json"
+    with new_folder() as work:
+        film, result = Path(video) if video else demo_clip(work / "clip.mp4"), work / "result.json"
         case = {"video": str(film), "person": None, "repeat": 2, "keypoints": "blazepose-heavy", "result": str(result)}
         for _ in range(rounds):
-            theirs = subprocess.run([python, __file__, "--", film], check=True, capture_output=True, text=True).stdout
+            theirs = subprocess.run([python, __file__, "-", film], check=True, capture_output=True, text=True).stdout
             n, shown, seconds = json.loads(theirs.splitlines()[-1])
             subprocess.run([sys.executable, "-m", "pbl_pipeline.bench.detect_case", json.dumps(case)], check=True)
             ours = json.loads(result.read_text())
@@ -66,7 +67,11 @@ def main(python: str, video: str | None = None, rounds: int = 3) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "--":
-        print(json.dumps(mediapipe_seconds(sys.argv[2])))  # noqa: T201
+    parser = argparse.ArgumentParser(description="Frames a second of MediaPipe's own pose solution and here.")
+    parser.add_argument("python", help="the Python that has mediapipe; - for this one, to measure it alone")
+    parser.add_argument("video", nargs="?", help="default: the demo recording's walk at 1080p")
+    asked = parser.parse_args()
+    if asked.python == "-":
+        print(json.dumps(mediapipe_seconds(asked.video)))  # noqa: T201
     else:
-        main(*sys.argv[1:3])
+        main(asked.python, asked.video)

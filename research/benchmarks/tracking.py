@@ -36,7 +36,6 @@ from pbl_pipeline.tracking import (
     PersonTrack,
     Tracking,
     TrackingParams,
-    WatchParams,
     body_box,
     track_people,
 )
@@ -52,12 +51,17 @@ WAYS = {
     "watch": USUAL,
     "often": dataclasses.replace(
         USUAL,
-        watch=WatchParams(follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0),
+        watch=dataclasses.replace(USUAL.watch, follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0),
     ),
     "throughout": dataclasses.replace(
         USUAL,
-        watch=WatchParams(
-            follow_interval_s=0.0, rest_interval_s=0.0, close_interval_s=0.0, search_interval_s=0.0, search_windows=99
+        watch=dataclasses.replace(
+            USUAL.watch,
+            follow_interval_s=0.0,
+            rest_interval_s=0.0,
+            close_interval_s=0.0,
+            search_interval_s=0.0,
+            search_windows=99,
         ),
     ),
 }
