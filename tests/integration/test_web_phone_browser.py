@@ -266,14 +266,30 @@ def test_films_without_network_and_sends_when_it_is_back(camera: Any, visit: int
     assert len(video.Video() & {"session_id": visit}) == 1
 
 
+#: In the page: as if it had been killed between writing the facts of a take and cutting off what they replace.
+FACTS_FOLLOWED_BY_OLDER_ONES = """
+async () => {
+  for await (const [name, file] of (await navigator.storage.getDirectory()).entries()) {
+    if (!name.endsWith(".json")) continue;
+    const writable = await file.createWritable({keepExistingData: true});
+    await writable.seek((await file.getFile()).size);
+    await writable.write('"older": 1}}');
+    await writable.close();
+  }
+}
+"""
+
+
 def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     with filming(camera, visit) as page:
         start(page)
         page.wait_for_timeout(4500)
         page.evaluate("window.addEventListener('pagehide', (e) => e.stopImmediatePropagation(), true)")
+        page.evaluate(FACTS_FOLLOWED_BY_OLDER_ONES)
         page.reload()
         page.wait_for_selector("main[data-ready]")
-        page.get_by_role("button", name="Keep and send").last.click()
+        # A slow finger: the page asks the server every 3 s meanwhile, and does not make the button anew.
+        page.get_by_role("button", name="Keep and send").last.click(delay=4000)
         arrived(page)
     assert film_of(visit).n_frames > 30
 

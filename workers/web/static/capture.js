@@ -188,7 +188,7 @@ function lead(steps) {
   else chosen = now ?? chosen;
   $(".protocol").hidden = !steps.length;
   $(".complete").textContent = steps.length && !open ? t("complete") : "";
-  $(".steps").replaceChildren(...steps.map((step) => {
+  fill($(".steps"), steps.map((step) => {
     const line = document.createElement("li"), button = document.createElement("button");
     const of = (/** @type {string} */ name) => (texts[`is_${step[name]}`] ? t(`is_${step[name]}`) : step[name]);
     button.type = "button";
@@ -212,6 +212,7 @@ async function show() {
   const lines = found.filter((one) => one.name !== taken?.name || !take).map((one) => {
     const own = one.visit !== visit ? t("other_visit") : one.about.why ?? states.get(one.name) ?? t("on_phone");
     const line = item(new Date(one.made).toLocaleTimeString(language), own);
+    line.dataset.name = one.name;
     if (one.complete && !one.about.why) return line;
     const buttons = [[t("remove"), () => remove(one.name)]];
     if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => keep({ ...one, complete: true }).then(sendAll, () => say("full"))]);
@@ -231,7 +232,7 @@ async function show() {
   else if (told) tell(".latest", told.recordings[0]?.verdict ?? "");
   if (told) tell(".next", told.next);
   if (told && !take) lead(told.protocol);
-  list.replaceChildren(...(lines.length ? lines : [item("", t("none_yet"))]));
+  fill(list, lines.length ? lines : [item("", t("none_yet"))]);
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
   $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toLocaleString(language, { maximumFractionDigits: 1 }) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
@@ -240,6 +241,13 @@ async function show() {
 /** A screen reader reads it again only where it is another. @param {string} at @param {string} text */
 function tell(at, text) {
   if ($(at).textContent !== text) $(at).textContent = text;
+}
+
+/** A list is made again only where it is another: a button that is replaced under a finger loses the tap.
+ * @param {Element} at @param {Element[]} lines */
+function fill(at, lines) {
+  const html = (/** @type {Element[]} */ all) => all.map((one) => one.outerHTML).join();
+  if (html([...at.children]) !== html(lines)) at.replaceChildren(...lines);
 }
 
 /** @param {string} head @param {string} text */

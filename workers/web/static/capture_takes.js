@@ -29,9 +29,10 @@ export async function newFile(name) {
   };
 }
 
-/** @param {Facts} facts */
+/** In one line: where the page ended while the file was written again, what is left of a longer one follows.
+ * @param {Facts} facts */
 export function keep(facts) {
-  return ask("put", `${facts.name}.json`, { bytes: new TextEncoder().encode(JSON.stringify(facts)) });
+  return ask("put", `${facts.name}.json`, { bytes: new TextEncoder().encode(`${JSON.stringify(facts)}\n`) });
 }
 
 /** @param {string} name */
@@ -46,7 +47,8 @@ export async function all() {
   for await (const name of folder.keys()) {
     if (!name.endsWith(".json")) continue;
     const film = await (await folder.getFileHandle(name.replace(".json", ".mp4"))).getFile().catch(() => null);
-    const facts = await (await folder.getFileHandle(name)).getFile().then((/** @type {File} */ f) => f.text()).then(JSON.parse).catch(() => null);
+    const facts = await (await folder.getFileHandle(name)).getFile().then((/** @type {File} */ f) => f.text())
+      .then((/** @type {string} */ text) => JSON.parse(text.split("\n", 1)[0])).catch(() => null);
     if (film?.size && facts) found.push(facts);
     else await remove(name.replace(".json", ""));
   }
