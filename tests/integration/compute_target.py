@@ -5,11 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-import pytest
-
-from workers.web.computing import compute_visit
-
-from . import chain
+from workers.on_request import compute_visit
 
 
 def compute(session_id: int, again: bool) -> None:
@@ -19,6 +15,10 @@ def compute(session_id: int, again: bool) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
     while (folder / "hold").exists():
         time.sleep(0.05)
+    import pytest
+
+    from . import chain
+
     chain.install(pytest.MonkeyPatch())
     compute_visit(session_id, again)
 

@@ -12,7 +12,7 @@ from schemas.review import Decision
 from tests.integration import compute_target, web
 from tests.integration.chain import small_video
 from tests.unit.test_blazepose import asset
-from workers.web.computing import compute_visit
+from workers.on_request import compute_visit
 
 
 @pytest.fixture(params=["stand-ins", pytest.param("real", marks=[pytest.mark.long, pytest.mark.slow])])

@@ -11,8 +11,9 @@ import uvicorn
 from starlette.testclient import TestClient
 
 from schemas.connection import dj
+from workers.on_request import compute_visit
 from workers.web import Options, ResultsFolder, Where, create_app
-from workers.web.computing import Target, compute_visit
+from workers.web.computing import Target
 from workers.web.serve import config
 
 BASE = "http://127.0.0.1:8484"

@@ -20,6 +20,7 @@ from starlette.types import Receive, Scope, Send
 from pbl_pipeline import settings, texts
 from pbl_pipeline.errors import PblError
 
+from ..on_request import compute_visit
 from ..process_queue import ProcessQueue
 from . import (
     access,
@@ -42,7 +43,7 @@ from . import (
 from .accounts import Accounts, Attempts, SignIn
 from .accounts import routes as sign_in_routes
 from .address import OPEN, Address, own_address
-from .computing import Target, compute_visit
+from .computing import Target
 from .pages import Pages
 from .source import Source, TablesSource, Videos
 from .tables import Asks, Files, Tables

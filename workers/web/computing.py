@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import signal
 from collections.abc import Callable
 
 from starlette.requests import Request
@@ -25,21 +24,6 @@ END_S = 15.0
 
 #: Function that the process runs, of session_id and whether errors are tried again.
 Target = Callable[[int, bool], None]
-
-
-def compute_visit(session_id: int, again: bool) -> None:
-    """Compute the missing results of a visit, as `pbl populate --visit` does; a signal puts the running job back."""
-
-    def end(*_: object) -> None:
-        raise SystemExit(0)
-
-    signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGINT, end)
-    import schemas
-    from workers.populate import populate
-
-    schemas.activate()
-    populate(visit=session_id, retry_errors=again)
 
 
 def begin(computing: ProcessQueue, target: Target, session_id: int, again: bool) -> None:

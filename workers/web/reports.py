@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
@@ -16,14 +15,12 @@ from pbl_pipeline.errors import PblError
 from schemas import privacy, video
 from schemas.reading import shown as reading
 
+from .. import on_request
 from ..process_queue import ProcessQueue, Task, Work
 from .access import REPORT_POLICY
 from .address import Address, number_of, shown_of
 from .pages import Pages, reader_language
 from .tables import Tables
-
-if TYPE_CHECKING:
-    from pbl_pipeline.visit import Recording, Visit
 
 #: Time (s) and memory (byte) that one file may take: a minute of 4K video is drawn in a few minutes.
 SECONDS, N_BYTES = 3600.0, 8 * 2**30
@@ -104,7 +101,7 @@ def load_overlay(video_id: int) -> Task:
     found = reading.shown_recording(video_id).fitted().loaded()
     with contextlib.ExitStack() as stack:
         path = stack.enter_context(privacy.shown(video_id)) or video.present_file(video_id)
-        return _task("overlay.mp4", _draw, stack.pop_all(), dataclasses.replace(found, shown=path))
+        return _task("overlay.mp4", on_request.draw_overlay, stack.pop_all(), dataclasses.replace(found, shown=path))
 
 
 def report_key(session_id: int, shown: int, language: str) -> tuple[Any, ...]:
@@ -122,7 +119,7 @@ def load_report(session_id: int, shown: int, language: str) -> Task:
     assert about.visit is not None
     with contextlib.ExitStack() as stack:
         visit = to_show(about.visit, stack).loaded()
-        return _task("report.html", _write, stack.pop_all(), visit, language)
+        return _task("report.html", on_request.write_report, stack.pop_all(), visit, language)
 
 
 def _task(file: str, function: Callable[..., None], open_files: contextlib.ExitStack, *args: Any) -> Task:
@@ -141,16 +138,3 @@ def _not_made(found: str) -> PblError:
 
 def _copy_of(video_id: int) -> str:
     return "".join(str(h) for h in (privacy.Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))
-
-
-# -------------------------------------------------------------------------------------------- in separate processes
-def _draw(out: Path, recording: Recording) -> None:
-    from pbl_pipeline.pipeline import draw_overlay
-
-    draw_overlay(recording, out)
-
-
-def _write(out: Path, visit: Visit, language: str) -> None:
-    from pbl_pipeline.pipeline import write_visit_report
-
-    write_visit_report(out, visit, language=language)
