@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import multiprocessing
 import os
 import threading
 import time
@@ -12,6 +11,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+
+from . import processes
 
 
 class LimitExceeded(Exception):
@@ -35,7 +36,7 @@ def limited(
     function, args
         Importable by name; arguments and exceptions that can be pickled.
     seconds
-        Time it may take, the start of the process (about a second) included.
+        Time it may take, the start of the process (about a second, the first one more) included.
     n_bytes
         Memory the process may allocate in addition to what its imports take; None: any amount.
     returns
@@ -50,9 +51,10 @@ def limited(
     LimitExceeded
         Too much time or memory, or the process was stopped or died. Exceptions of `function` are raised here.
     """
-    context = multiprocessing.get_context("spawn")
+    context = processes.context()
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_call, args=(theirs, n_bytes, seconds, returns, function, args), daemon=True)
+    call = processes.InThisEnvironment(_call)
+    process = context.Process(target=call, args=(theirs, n_bytes, seconds, returns, function, args), daemon=True)
     process.start()
     theirs.close()
     try:
