@@ -56,7 +56,7 @@ def crashed(job: Claim, reason: str) -> bool:
     whether the job was still that process's."""
     n = job.attempts + 1
     if n < CRASHES:
-        return queue.put_back(job, f"its process died ({reason})", 1.0, attempts=n)
+        return queue.put_back(job, f"its process died ({reason})", attempts=n)
     return queue.fail(job, _crash(job, n, reason))
 
 

@@ -469,7 +469,8 @@ def test_the_process_for_phones_ends_with_the_others(tables: None, tmp_path: Pat
     register(*videos(tmp_path, "walk"))
     assert Supervisor(Options("decode", max_jobs=1, selftest=False, phones=True), target=worker_target.work).run() == 0
     assert len(video.VideoInfo()) == 1
-    assert len(worker.Worker & "worker_stopped IS NOT NULL") == 2
+    assert len(worker.Worker & "worker_stopped IS NOT NULL") >= 1  # it may be told to end before it has its row
+    assert len(worker.Worker & "worker_stopped IS NULL") == 0
 
 
 def test_jobs_of_dead_workers_elsewhere_are_freed(tables: None, tmp_path: Path):
