@@ -1,5 +1,5 @@
-"""What `pbl web` has made in processes of their own (`process_queue`): each imports what it needs and no page, which
-would take every one of them seconds."""
+"""What `pbl web` makes in separate processes (`process_queue`). They import no page, which takes seconds of processor
+time; each function imports what it needs."""
 
 from __future__ import annotations
 

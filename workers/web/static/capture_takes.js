@@ -29,7 +29,7 @@ export async function newFile(name) {
   };
 }
 
-/** In one line: where the page ended while the file was written again, what is left of a longer one follows.
+/** One line; where the page was killed while the file was written again, the end of an older, longer one follows it.
  * @param {Facts} facts */
 export function keep(facts) {
   return ask("put", `${facts.name}.json`, { bytes: new TextEncoder().encode(`${JSON.stringify(facts)}\n`) });
