@@ -265,12 +265,13 @@ class Worker:
         or working on our recordings."""
         if self.only is not None:
             scope = self.only()
-            found = refresh.refresh_scope(scope)
+            # Asked first: what a job makes computable that ends after this is found in the next round.
+            held = any(len(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None)
+            found = refresh.refresh_scope(self.only())
             self.found.add(found)
             if found.queued or found.freed:
                 return True
-            held = [(jobs_of(t).reserved & where) for t in self.tables if (where := scope.where(t)) is not None]
-            return None if any(len(jobs) for jobs in held) else False
+            return None if held else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
         tables_version.refuse_newer()  # after a migration meanwhile this worker ends, and its successor does not start

@@ -16,7 +16,7 @@ from tests import until
 from tests.integration import compute_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
-from workers import queue, run_job
+from workers import queue, refresh, run_job
 from workers.populate import populate
 from workers.web.computing import told
 
@@ -127,6 +127,25 @@ def test_a_job_in_other_hands_is_not_taken_twice(visits: None, browser: Any):
     ended(browser)
     assert len(qc.SessionQc & job.key) == 1
     assert len(jobs_of(fit.SessionFit)) == 0
+
+
+def test_a_job_that_ends_just_after_it_was_looked_for_is_followed(
+    visits: None, browser: Any, monkeypatch: pytest.MonkeyPatch
+):
+    mark(browser, 2)
+    (job,) = queue.claim(fit.SessionFit)
+    real, looks = refresh.refresh_scope, []
+
+    def look(scope: Any) -> Any:
+        found = real(scope)
+        looks.append(scope)
+        if len(looks) == 2:  # the first is before the worker
+            assert run_job.run(job).what == run_job.DONE
+        return found
+
+    monkeypatch.setattr(refresh, "refresh_scope", look)
+    populate(visit=1)
+    assert len(qc.SessionQc & job.key) == 1
 
 
 def test_a_failure_is_shown_with_its_next_step_and_tried_again(visits: None, browser: Any, tmp_path: Path):

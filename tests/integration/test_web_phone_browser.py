@@ -294,6 +294,33 @@ def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     assert film_of(visit).n_frames > 30
 
 
+#: In the page: a recording is listed whenever that is asked for, also while its facts are written.
+FACTS_READ_WHILE_WRITTEN = """
+async () => {
+  const { all, keep, newFile, remove } = await import("/static/capture_takes.js");
+  const facts = {name: "take-read", visit: -1, made: 1, about: {}, log: null, complete: false};
+  const file = await newFile(facts.name);
+  await file.write(0, new Uint8Array(9));
+  await file.close();
+  await keep(facts);
+  let missing = 0;
+  for (let n = 0; n < 300; n++) {
+    const written = keep({...facts, log: "x".repeat(1e5 * (n % 3))});
+    const found = await Promise.all([all(), all()]);
+    missing += found.filter((takes) => !takes.some((take) => take.name === facts.name)).length;
+    await written;
+  }
+  await remove(facts.name);
+  return missing;
+}
+"""
+
+
+def test_a_recording_whose_facts_are_read_while_they_are_written_stays(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        assert page.evaluate(FACTS_READ_WHILE_WRITTEN) == 0
+
+
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     with filming(camera, visit, orientation=False) as page:
         page.get_by_text("does not report its orientation").wait_for()

@@ -29,10 +29,20 @@ export async function newFile(name) {
   };
 }
 
+let last = Promise.resolve();
+/** One after the other: a file that is written while it is read cannot be read.
+ * @template T @param {() => Promise<T>} act @returns {Promise<T>} */
+function alone(act) {
+  const done = last.then(act);
+  last = done.then(() => {}, () => {});
+  return done;
+}
+
 /** One line; where the page was killed while the file was written again, the end of an older, longer one follows it.
  * @param {Facts} facts */
 export function keep(facts) {
-  return ask("put", `${facts.name}.json`, { bytes: new TextEncoder().encode(`${JSON.stringify(facts)}\n`) });
+  const bytes = new TextEncoder().encode(`${JSON.stringify(facts)}\n`);
+  return alone(() => ask("put", `${facts.name}.json`, { bytes }));
 }
 
 /** @param {string} name */
@@ -41,18 +51,23 @@ export async function remove(name) {
   for (const end of [".mp4", ".json"]) await folder.removeEntry(name + end).catch(() => {});
 }
 
-/** What lies on the phone, the oldest first. @returns {Promise<Facts[]>} */
-export async function all() {
-  const folder = /** @type {any} */ (await navigator.storage.getDirectory()), found = [];
-  for await (const name of folder.keys()) {
-    if (!name.endsWith(".json")) continue;
-    const film = await (await folder.getFileHandle(name.replace(".json", ".mp4"))).getFile().catch(() => null);
-    const facts = await (await folder.getFileHandle(name)).getFile().then((/** @type {File} */ f) => f.text())
-      .then((/** @type {string} */ text) => JSON.parse(text.split("\n", 1)[0])).catch(() => null);
-    if (film?.size && facts) found.push(facts);
-    else await remove(name.replace(".json", ""));
-  }
-  return found.sort((a, b) => a.made - b.made);
+/** What lies on the phone, the oldest first. Removes what holds no picture, and nothing that cannot be read now.
+ * @returns {Promise<Facts[]>} */
+export function all() {
+  return alone(async () => {
+    const folder = /** @type {any} */ (await navigator.storage.getDirectory()), found = [];
+    const text = async (/** @type {any} */ file) => (await file.getFile()).text();
+    for await (const [name, file] of folder.entries()) {
+      if (!name.endsWith(".json")) continue;
+      try {
+        const film = name.replace(".json", ".mp4");
+        if ((await (await folder.getFileHandle(film, { create: true })).getFile()).size)
+          found.push(JSON.parse((await text(file)).split("\n", 1)[0]));
+        else for (const empty of [film, name]) await folder.removeEntry(empty);  // not of a take that begins: it is open
+      } catch {}  // it is read again in a few seconds
+    }
+    return found.sort((a, b) => a.made - b.made);
+  });
 }
 
 /** An answer of the server that says why it does not take a recording. */
