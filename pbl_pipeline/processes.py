@@ -17,15 +17,14 @@ _preloaded: list[str] = []
 
 
 def preload(*modules: str) -> None:
-    """Let copies begin with these modules, which may start no thread; without effect once there was a copy."""
+    """Let copies begin with these modules, which may not set the environment; without effect once there was a copy."""
     _preloaded.extend(modules)
     multiprocessing.set_forkserver_preload(list(_preloaded))
 
 
-def context(own_environment: bool = False) -> Any:
-    """Return the context of `multiprocessing` that makes processes. own_environment: they import for themselves, as
-    libraries need that read their number of threads or their devices from the environment meanwhile."""
-    return multiprocessing.get_context("spawn" if own_environment or sys.platform != "linux" else "forkserver")
+def context() -> Any:
+    """Return the context of `multiprocessing` that makes processes."""
+    return multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
 
 
 class InThisEnvironment:

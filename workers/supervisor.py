@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import multiprocessing
 import os
 import signal
 import time
@@ -23,7 +24,6 @@ from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from pbl_pipeline import processes
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import shared_cores
 from schemas import connection
@@ -68,9 +68,6 @@ class _Child:
             self.jobs.pop(name, None)
 
 
-processes.preload("workers.loop", "workers.selftest", "pbl_pipeline.pipeline")
-
-
 class Supervisor:
     """Keeps `options.all_processes` working processes alive until told to stop; `run` returns the exit code."""
 
@@ -87,6 +84,8 @@ class Supervisor:
         self._due: list[tuple[float, signal.Signals]] = []  # signals that are still to be sent, with their time
         self._unsettled: list[Callable[[], Any]] = []  # what is to become of jobs of processes that died
         self._settle_at = 0.0
+        # Not fork: threads of the numerical libraries do not survive it.
+        self._start = multiprocessing.get_context("spawn")
 
     def stop(self, *_: object) -> None:
         """Let the running jobs end within the grace period; called again, do not wait for them."""
@@ -117,12 +116,10 @@ class Supervisor:
 
     # ------------------------------------------------------------------------------------------------- processes
     def _launch(self, number: int) -> _Child:
+        here, there = self._start.Pipe(duplex=False)
         options = self.options.of_process(number)
-        context = processes.context(own_environment=options.phone or bool(options.gpus))
-        here, there = context.Pipe(duplex=False)
+        process = self._start.Process(target=self.target, args=(options, there), name="pbl-worker")
         with shared_cores(1 if options.phone else self.options.processes + options.long):
-            call = processes.InThisEnvironment(self.target)
-            process = context.Process(target=call, args=(options, there), name="pbl-worker")
             process.start()
         if self.options.phones and not options.phone and process.pid and hasattr(os, "setpriority"):  # not on Windows
             # From here, before its libraries start threads, which keep the priority they began with.

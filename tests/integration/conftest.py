@@ -8,12 +8,9 @@ from typing import Any
 import pytest
 
 import schemas
-from pbl_pipeline import processes
 from tests.rows import Saved, remove_all
 
 from . import chain
-
-processes.preload("tests.integration.worker_target", "schemas.computed_tables")
 
 
 @pytest.fixture(scope="module")

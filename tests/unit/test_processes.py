@@ -1,6 +1,7 @@
 """Processes that begin as copies of one that has imported."""
 
 import os
+import sys
 
 import pytest
 
@@ -16,9 +17,18 @@ def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(monkeypatch
     assert limited(os.getenv, "PBL_TEST_COPY", returns=True) is None
 
 
-@pytest.mark.parametrize(("platform", "own_environment", "kind"), [
-    ("linux", False, "forkserver"), ("linux", True, "spawn"), ("darwin", False, "spawn"),
-])  # fmt: skip
-def test_who_imports_for_itself(monkeypatch: pytest.MonkeyPatch, platform: str, own_environment: bool, kind: str):
+@pytest.mark.parametrize(("platform", "kind"), [("linux", "forkserver"), ("darwin", "spawn")])
+def test_who_imports_for_itself(monkeypatch: pytest.MonkeyPatch, platform: str, kind: str):
     monkeypatch.setattr("sys.platform", platform)
-    assert processes.context(own_environment).get_start_method() == kind
+    assert processes.context().get_start_method() == kind
+
+
+def test_what_is_preloaded_sets_no_environment():
+    """A copy would lose it: `jax_setup` sets XLA's flags when it is imported."""
+    assert not limited(_loaded, "pbl_pipeline.jax_setup", returns=True)
+
+
+def _loaded(module: str) -> bool:
+    import pbl_pipeline.video  # noqa: F401
+
+    return module in sys.modules

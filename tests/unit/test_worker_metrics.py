@@ -301,7 +301,7 @@ def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: p
             started.append(self.options)
 
     boss = Supervisor(Options(processes=2, gpus=("4", "7"), once=True))
-    monkeypatch.setattr("multiprocessing.get_context", lambda _: SimpleNamespace(Process=Process, Pipe=Pipe))
+    monkeypatch.setattr(boss, "_start", SimpleNamespace(Process=Process, Pipe=Pipe))
     monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
     assert boss.run() == 0
     assert [options.gpus for options in started] == [("4",), ("7",), ("7",)]
