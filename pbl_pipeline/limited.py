@@ -1,9 +1,15 @@
-"""Run a function in a separate process, which is killed when it takes too much time or memory."""
+"""Run a function in a separate process, which is killed when it takes too much time or memory.
+
+On Linux it is a copy of a process that has only imported ("forkserver"): a second of imports happens once. A module
+named to `multiprocessing.set_forkserver_preload` may not set the environment when it is imported: copies lose that.
+"""
 
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
+import sys
 import threading
 import time
 import traceback
@@ -11,8 +17,6 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
-
-from . import processes
 
 
 class LimitExceeded(Exception):
@@ -36,7 +40,7 @@ def limited(
     function, args
         Importable by name; arguments and exceptions that can be pickled.
     seconds
-        Time it may take, the start of the process (about a second, the first one more) included.
+        Time it may take. The first call waits for imports before that; elsewhere than on Linux they are included.
     n_bytes
         Memory the process may allocate in addition to what its imports take; None: any amount.
     returns
@@ -51,10 +55,10 @@ def limited(
     LimitExceeded
         Too much time or memory, or the process was stopped or died. Exceptions of `function` are raised here.
     """
-    context = processes.context()
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
     ours, theirs = context.Pipe(duplex=False)
-    call = processes.InThisEnvironment(_call)
-    process = context.Process(target=call, args=(theirs, n_bytes, seconds, returns, function, args), daemon=True)
+    how = (theirs, dict(os.environ), n_bytes, seconds, returns, function, args)
+    process = context.Process(target=_call, args=how, daemon=True)
     process.start()
     theirs.close()
     try:
@@ -86,12 +90,15 @@ def limited(
 
 def _call(
     pipe: Connection,
+    environment: dict[str, str],
     n_bytes: int | None,
     seconds: float,
     returns: bool,
     function: Callable[..., object],
     args: tuple,
 ) -> None:
+    os.environ.clear()  # a copy has that of the first one
+    os.environ.update(environment)
     if n_bytes is not None:
         _limit_memory(n_bytes)
     if math.isfinite(seconds):

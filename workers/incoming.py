@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import multiprocessing
 import os
 import random
 import secrets
@@ -23,7 +24,6 @@ from pathlib import Path, PurePosixPath
 
 import pymysql
 
-from pbl_pipeline import processes
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
@@ -59,7 +59,7 @@ _OPEN_S, _OPEN_BYTES = 60.0, 2**31
 #: Space on the archive's disk that uploads do not fill (bytes).
 KEPT_FREE = 10**9
 _BLOCK = 2**20
-processes.preload("pbl_pipeline.video")  # for those in which files are opened
+multiprocessing.set_forkserver_preload(["pbl_pipeline.video"])  # for the processes that open files (`limited`)
 #: Errors of the installation, which end a run: other uploads would meet them as well.
 _OURS = ("DB_NOT_RUNNING", "DB_UNAVAILABLE", "DB_REFUSED", "STORE_UNAVAILABLE")
 

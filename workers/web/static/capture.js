@@ -215,7 +215,7 @@ async function show() {
     line.dataset.name = one.name;
     if (one.complete && !one.about.why) return line;
     const buttons = [[t("remove"), () => remove(one.name)]];
-    if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => keep({ ...one, complete: true }).then(sendAll, () => say("full"))]);
+    if (!one.about.why && one.visit === visit) buttons.unshift([t("keep"), () => complete(one.name).then(sendAll, () => say("full"))]);
     for (const [label, act] of buttons) {
       const button = document.createElement("button");
       button.textContent = label;
@@ -236,6 +236,13 @@ async function show() {
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();
   const battery = await /** @type {any} */ (navigator).getBattery?.().catch(() => null);
   $(".room").textContent = t("room", { gb: ((quota - usage) / 1e9).toLocaleString(language, { maximumFractionDigits: 1 }) }) + (battery ? ` · ${t("battery", { n: Math.round(100 * battery.level) })}` : "");
+}
+
+/** Its facts as they are now, not as they were when its line was made: another page may have ended it since.
+ * @param {string} name */
+async function complete(name) {
+  const facts = (await all()).find((one) => one.name === name);
+  if (facts) await keep({ ...facts, complete: true });
 }
 
 /** A screen reader reads it again only where it is another. @param {string} at @param {string} text */

@@ -56,13 +56,12 @@ export async function remove(name) {
 export function all() {
   return alone(async () => {
     const folder = /** @type {any} */ (await navigator.storage.getDirectory()), found = [];
-    const text = async (/** @type {any} */ file) => (await file.getFile()).text();
     for await (const [name, file] of folder.entries()) {
       if (!name.endsWith(".json")) continue;
       try {
         const film = name.replace(".json", ".mp4");
         if ((await (await folder.getFileHandle(film, { create: true })).getFile()).size)
-          found.push(JSON.parse((await text(file)).split("\n", 1)[0]));
+          found.push(JSON.parse((await (await file.getFile()).text()).split("\n", 1)[0]));
         else for (const empty of [film, name]) await folder.removeEntry(empty);  // not of a take that begins: it is open
       } catch {}  // it is read again in a few seconds
     }

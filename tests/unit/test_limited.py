@@ -1,11 +1,10 @@
-"""Processes that begin as copies of one that has imported."""
+"""Functions in processes that begin as copies of one that has imported."""
 
 import os
 import sys
 
 import pytest
 
-from pbl_pipeline import processes
 from pbl_pipeline.limited import limited
 
 
@@ -15,12 +14,6 @@ def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(monkeypatch
         assert limited(os.getenv, "PBL_TEST_COPY", returns=True) == value
     monkeypatch.delenv("PBL_TEST_COPY")
     assert limited(os.getenv, "PBL_TEST_COPY", returns=True) is None
-
-
-@pytest.mark.parametrize(("platform", "kind"), [("linux", "forkserver"), ("darwin", "spawn")])
-def test_who_imports_for_itself(monkeypatch: pytest.MonkeyPatch, platform: str, kind: str):
-    monkeypatch.setattr("sys.platform", platform)
-    assert processes.context().get_start_method() == kind
 
 
 def test_what_is_preloaded_sets_no_environment():
