@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -91,16 +91,14 @@ class Data(eqx.Module):
 
 
 def solve_sessions(
-    sessions: Sequence[Session], params: ImplicitAdamParams, starts: Sequence[State]
-) -> list[Solution | PblError]:
+    sessions: Iterable[Session], params: ImplicitAdamParams, starts: Iterable[State]
+) -> Iterator[Solution | PblError]:
     """Fit sessions one after the other, from the paramset's own start; an error takes the place of a failed one."""
-    out: list[Solution | PblError] = []
-    for session in sessions:
+    for session, _ in zip(sessions, starts, strict=True):
         try:
-            out.append(solve_implicit(session, params))
+            yield solve_implicit(session, params)
         except PblError as error:
-            out.append(error)
-    return out
+            yield error
 
 
 def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:

@@ -1,7 +1,8 @@
 """The compiled solve of one problem, and of many side by side on a GPU, each for as long as it takes.
 
 Problems differ in how many iterations they need (8 to 43 of 256 walks), and a batch that is solved together waits for
-its slowest. So a program has lanes: after every few iterations those that have ended make room for the next.
+its slowest. So a program has lanes: after every few iterations those that have ended make room for the next, which may
+have become ready meanwhile.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from jaxtyping import Array, Float
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
-from .problem import Problem, State, power_of_2
+from .problem import Problem, State
 from .solution import Outcome, outcome
 from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
 from .solvers.linear import marginal_variance
@@ -27,17 +28,26 @@ from .solvers.result import Result
 from .weights import Weights
 
 #: Lanes of a program: enough to fill a GPU, where an iteration takes longer with each lane from 16 on; and of the one
-#: for few problems, which the last ones move to. No others: each takes most of a minute to compile.
+#: for few problems. No others: each takes most of a minute to compile.
 LANES, FEW = 32, 8
 #: Most frames of all lanes together, which bounds the memory.
 MOST_FRAMES = 32768
-#: Most problems held on the device for each lane; their number is padded to a power of 2, for few programs.
-HELD = 4
+#: Problems that go to the device in one call; fewer are filled up to as many.
+MOVED = 8
 #: Iterations between two looks at which have ended: a lane that has ended idles until the next one.
 ROUND = 2
 
 #: Problems and where each stands.
 _Lanes = tuple[Problem, Progress]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """A problem and where its fit starts; `last`: its end is wanted with variances and the outcome."""
+
+    problem: Problem
+    start: State
+    last: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,87 +93,116 @@ def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F
 begin_one = jax.jit(begin_of, static_argnames="body")
 fit_one = jax.jit(fit_problem, static_argnames="body")
 _finish_one = jax.jit(finish)
-_finish_many = jax.jit(jax.vmap(finish))
 
 
 def fetch(p: Problem, end: Progress, last: bool) -> Found:
     """Fetch the end of an iteration to the host."""
-    return Found(*jax.device_get(_wanted(_finish_one, p, end, last)))
+    rest = (None, *_finish_one(p, end.latest, end.state.R_nc)) if last else (end.latest.x,)
+    return Found(*jax.device_get((_kept(end), *rest)))
 
 
-def _wanted(finished: Callable[..., Any], p: Problem, end: Progress, last: bool) -> tuple[Any, ...]:
-    """The fields of `Found`, still on the device."""
-    kept = dataclasses.replace(end, latest=None, candidate=None, direction=None)
-    return (kept, None, *finished(p, end.latest, end.state.R_nc)) if last else (kept, end.latest.x)
+def _kept(end: Progress) -> Progress:
+    return dataclasses.replace(end, latest=None, candidate=None, direction=None)
 
 
 def fit_many(
-    body: Body, given: Sequence[tuple[Problem, State]], w: Weights, limits: Limits, last: bool
-) -> Iterator[Found]:
-    """Fit problems of the same sizes from their starts: see `Found`, in their order, while the device fits the others.
+    body: Body, ready: Callable[[int], Sequence[Task]], w: Weights, limits: Limits
+) -> Iterator[tuple[Task, Found]]:
+    """Fit problems of the same sizes: each with its end as soon as that is known, while the device fits the others.
 
-    The result does not depend on which problems are given together beyond rounding.
+    `ready(n)` returns up to n that are ready now, and is asked again while lanes are free; when none is ready and all
+    have ended, this ends. The result does not depend on which problems are fitted together beyond rounding.
     """
-    frames = given[0][0].weight.shape[0]
-    n = min(LANES if len(given) > FEW else FEW, max(1, MOST_FRAMES // frames))
-    if len(given) > HELD * n:
-        for i in range(0, len(given), HELD * n):
-            yield from fit_many(body, given[i : i + HELD * n], w, limits, last)
+    new = ready(LANES)
+    if not new:
         return
-    size = min(HELD * n, max(n, power_of_2(len(given))))
-    # Stacked on the host, so that each array goes to the device once.
-    rows = [*given, *[given[-1]] * (size - len(given))]
-    held = jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows))
-    waiting = iter(range(len(given)))
-    holds = [next(waiting, None) for _ in range(n)]
-    lanes, ended = (_begin(body, w, held, np.arange(n) % len(given)) for _ in range(2))
-    slots = list[int]()  # which problem each slot of `ended` holds
-    found, due = dict[int, Found](), list(range(len(given)))[::-1]
-    to_fetch: list[tuple[list[int], tuple[Any, ...]]] = []
+    frames = new[0].problem.weight.shape[0]
+    most, few = (min(n, max(1, MOST_FRAMES // frames)) for n in (LANES, FEW))
+    holds = list[Task | None]([None] * (most if len(new) > few else few))
+    lanes, ended = (_begin(body, w, _stacked(new[:MOVED]), np.zeros(len(holds), int)) for _ in range(2))
+    room, slots = len(holds), list[Task]()  # of `ended`, and what they hold
+    to_fetch = list[tuple[list[Task], tuple[Any, ...]]]()
 
     def take_ended() -> None:
-        to_fetch.append((slots.copy(), _wanted(_finish_many, ended[0], ended[1], last)))
+        to_fetch.append((slots.copy(), _finished(*ended)))
         slots.clear()
 
-    def fetched() -> Iterator[Found]:
-        for problems, wanted in to_fetch:
+    def fetched() -> Iterator[tuple[Task, Found]]:
+        for tasks, wanted in to_fetch:
             here = jax.device_get(wanted)
-            for k, i in enumerate(problems):
-                found[i] = Found(*jax.tree.map(lambda a, k=k: a[k], here))
+            for k, task in enumerate(tasks):
+                yield task, Found(*jax.tree.map(lambda a, k=k: a[k], here))
         to_fetch.clear()
-        while due and due[-1] in found:
-            yield found.pop(due.pop())
 
-    most = min(int(limits.iterations), MOST_ITERATIONS)
-    while any(i is not None for i in holds):
+    bound = min(int(limits.iterations), MOST_ITERATIONS)
+    while True:
+        busy = [k for k, task in enumerate(holds) if task is not None]
+        if len(busy) + len(new) < most:
+            new = [*new, *ready(most - len(busy) - len(new))]
+        n = most if len(busy) + len(new) > few else few
+        if n != len(holds) and (busy or new):
+            lanes = _some(lanes, np.asarray([*busy, *[0] * n][:n]))
+            holds = [*(holds[k] for k in busy), *[None] * (n - len(busy))]
+        while new:
+            now, new = new[:MOVED], new[MOVED:]
+            free = [k for k, task in enumerate(holds) if task is None][: len(now)]
+            lanes = _filled(body, w, lanes, _stacked(now), np.asarray([*free, *[n] * (MOVED - len(now))]))
+            for k, task in zip(free, now, strict=True):
+                holds[k] = task
+        if not any(holds):
+            if slots:
+                take_ended()
+            if not to_fetch:
+                return
+            yield from fetched()
+            continue
         lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits, ROUND)
         yield from fetched()  # while the device iterates
         result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
-        ends = (result != Result.BOUND) | (iteration >= most)
-        over = [(k, i) for k, i in enumerate(holds) if i is not None and ends[k]]
-        if over:
-            if len(slots) + len(over) > n:
+        ends = (result != Result.BOUND) | (iteration >= bound)
+        over = [(k, task) for k, task in enumerate(holds) if task is not None and ends[k]]
+        last, others = ([(k, task) for k, task in over if task.last is of] for of in (True, False))
+        if others:
+            at = [k for k, _ in others]
+            to_fetch.append(([task for _, task in others], _reached(lanes[1], np.asarray([*at, *[0] * n][:n]))))
+        for part in (last[i : i + room] for i in range(0, len(last), room)):
+            if len(slots) + len(part) > room:
                 take_ended()
-            slot, row = np.full(len(holds), n), np.full(len(holds), size)  # beyond the end: a lane stays
-            for k, i in over:
-                slot[k] = len(slots)
-                slots.append(i)
-                holds[k] = following = next(waiting, None)
-                row[k] = size if following is None else following
-            lanes, ended = _exchange(body, w, lanes, ended, held, slot, row)
-        busy = [lane for lane, i in enumerate(holds) if i is not None]
-        if 0 < len(busy) <= FEW < len(holds):  # a lane is empty only where none waits
-            at = (busy * FEW)[:FEW]
-            lanes, holds = _some(lanes, np.asarray(at)), [holds[i] for i in busy] + [None] * (FEW - len(busy))
-    take_ended()
-    yield from fetched()
+            slot = np.full(n, room)  # beyond the end: stays behind
+            slot[[k for k, _ in part]] = np.arange(len(slots), len(slots) + len(part))
+            slots += [task for _, task in part]
+            ended = _moved(ended, lanes, slot)
+        for k, _ in over:
+            holds[k] = None
+
+
+def _stacked(tasks: Sequence[Task]) -> tuple[Problem, State]:
+    """Problems and starts on the device, filled up to `MOVED`; stacked on the host, so that each array goes once."""
+    rows = [(t.problem, t.start) for t in tasks]
+    return jax.device_put(jax.tree.map(lambda *a: np.stack(a), *rows, *[rows[-1]] * (MOVED - len(rows))))
 
 
 @functools.partial(jax.jit, static_argnames="body")
-def _begin(body: Body, w: Weights, held: tuple[Problem, State], rows: Any) -> _Lanes:
+def _begin(body: Body, w: Weights, given: tuple[Problem, State], rows: Any) -> _Lanes:
     """Some rows of the problems and starts, before their first iteration."""
-    p, start = _some(held, rows)
+    p, start = _some(given, rows)
     return p, jax.vmap(functools.partial(begin_of, body), in_axes=(0, None, 0))(p, w, start)
+
+
+@functools.partial(jax.jit, static_argnames="body", donate_argnames="lanes")
+def _filled(body: Body, w: Weights, lanes: _Lanes, given: tuple[Problem, State], lane: Any) -> _Lanes:
+    """The lanes with each of the given problems in its lane; where that lies beyond the end, nowhere."""
+    return _placed(lanes, lane, _begin(body, w, given, np.arange(MOVED)))
+
+
+@functools.partial(jax.jit, donate_argnames="ended")
+def _moved(ended: _Lanes, lanes: _Lanes, slot: Any) -> _Lanes:
+    """`ended` with each lane in its slot; where that lies beyond the end, nowhere."""
+    return _placed(ended, slot, lanes)
+
+
+def _placed(rows: Any, at: Any, given: Any) -> Any:
+    return jax.tree.map(lambda a, b: a.at[at].set(b, mode="drop"), rows, given)
 
 
 @functools.partial(jax.jit, static_argnames="body", donate_argnames="at")
@@ -177,16 +216,16 @@ def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, ite
     return jax.vmap(more)(p, at)
 
 
-@functools.partial(jax.jit, static_argnames="body", donate_argnames="lanes")
-def _exchange(
-    body: Body, w: Weights, lanes: _Lanes, ended: _Lanes, held: tuple[Problem, State], slot: Any, row: Any
-) -> tuple[_Lanes, _Lanes]:
-    """Move each lane to its slot of `ended` and the problem of its row into it; where these lie beyond the end, it
-    stays."""
-    ended = jax.tree.map(lambda a, b: a.at[slot].set(b, mode="drop"), ended, lanes)
-    stays = row >= held[0].weight.shape[0]
-    among = lambda a, b: jnp.where(stays.reshape(-1, *[1] * (a.ndim - 1)), a, b)  # noqa: E731
-    return jax.tree.map(among, lanes, _begin(body, w, held, row)), ended
+@jax.jit
+def _finished(p: Problem, end: Progress) -> tuple[Any, ...]:
+    """The fields of `Found` of last ends: copies, because the arrays of `end` are given away."""
+    return jax.tree.map(jnp.copy, _kept(end)), None, *jax.vmap(finish)(p, end.latest, end.state.R_nc)
+
+
+@jax.jit
+def _reached(end: Progress, at: Any) -> tuple[Any, ...]:
+    """The fields of `Found` of some lanes whose ends are not the last."""
+    return _some((_kept(end), end.latest.x), at)
 
 
 @jax.jit

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -24,7 +26,7 @@ from pbl_pipeline.jax_setup import compile_seconds
 from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
-from .lanes import Found, begin_one, fetch, fit_many, fit_one
+from .lanes import Found, Task, begin_one, fetch, fit_many, fit_one
 from .params import GaussNewtonParams
 from .phone_error import phone_variance
 from .problem import Problem, State, pixels_alone
@@ -42,10 +44,10 @@ BACKWARDS_FRACTION = 0.2
 
 
 def solve_per_frame(
-    sessions: Sequence[Session], params: GaussNewtonParams, starts: Sequence[State]
+    sessions: Iterable[Session], params: GaussNewtonParams, starts: Iterable[State]
 ) -> Iterator[Solution | PblError]:
     """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device,
-    which fits the others while the first solutions are taken.
+    which fits the others while the first solutions are taken and is given more where the iterables then have more.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
@@ -54,62 +56,70 @@ def solve_per_frame(
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
-    begin, compiled = time.perf_counter(), compile_seconds()
-    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
-    several = len(sessions) > 1  # then in lanes, also for a part of them: each way compiles other programs
-    solve = functools.partial(_solve, params=params, several=several)
-    starts = [_with_detector(s, params) for s in starts]
-    found = _facing(sessions, starts, params, functools.partial(solve, last=not twice))
-    traces, told, failed = [np.zeros((0, 2))] * len(sessions), [None] * len(sessions), dict[int, PblError]()
-    if twice:
-        first = list(found)
-        traces = [f.trace for f in first]
-        problems, starts = zip(*map(_on_floor, sessions, first), strict=True)
-        if params.weight_pelvis > 0:
-            problems = list(problems)
-            for i, (session, f) in enumerate(zip(sessions, first, strict=True)):
-                qpos, scale = f.end.state.qpos, np.asarray(scale_multipliers(f.end.state.s))
-                try:
-                    problems[i] = with_augmented_pelvis(session, problems[i], qpos, scale)
-                except PblError as error:
-                    failed[i] = error
-            told = [np.asarray(p.c_pelvis) for p in problems]
-        found = solve(sessions, problems, starts, last=True)
-    body = sessions[0].body
-    spread = by_joint(body.joint_names, params.sd_factor, 1.0), floors_of(body, params.sd_floor)
-    for i, (session, f) in enumerate(zip(sessions, found, strict=True)):
-        if i in failed:
-            yield failed[i]
-            continue
-        # The cost of the second one has a term more.
-        trace = np.concatenate([traces[i], f.trace + np.array([len(traces[i]), 0.0])])
-        # The seconds of all sessions add to those of the batch, without what the caller does meanwhile.
-        spent = time.perf_counter() - begin, (compile_seconds() - compiled) / len(sessions)
-        yield _solution(session, spread, f, trace, told[i], *spent)
-        begin = time.perf_counter()
+    given = zip(sessions, starts, strict=True)
+    first = list(itertools.islice(given, 2))
+    if not first:
+        return
+    body, w = first[0][0].body, Weights.of(first[0][0].body, params, size_unseen=pixels_alone(first[0][0].problem))
+    fit = fit_many if len(first) > 1 else _one_by_one
+    begun, done = dict[Task, tuple[int, _Steps]](), dict[int, Solution | PblError]()
+    waiting, numbers, due = deque[Task](), itertools.count(), 0
 
-
-def _facing(
-    sessions: Sequence[Session],
-    starts: Sequence[State],
-    params: GaussNewtonParams,
-    solve: Callable[[Sequence[Session], Sequence[Problem], Sequence[State]], Iterator[Found]],
-) -> Iterator[Found]:
-    """The first solution of each session or, from the first suspicious one on, the better of two."""
-    waiting: list[Found] = []
-    for session, f in zip(sessions, solve(sessions, [s.problem for s in sessions], starts), strict=True):
-        if waiting or suspicious(session, f.end.state.qpos):
-            waiting.append(f)
+    def go_on(i: int, steps: _Steps, found: Found | None) -> None:
+        try:
+            task = steps.send(found) if found else next(steps)
+        except StopIteration as end:
+            done[i] = end.value
+        except PblError as error:
+            done[i] = error
         else:
-            yield f
-    rest = sessions[len(sessions) - len(waiting) :]
-    again = [i for i, f in enumerate(waiting) if suspicious(rest[i], f.end.state.qpos)]
-    if again:
-        part = [rest[i] for i in again]
-        turned = [_with_detector(start_of(s, flip=True), params) for s in part]
-        for i, other in zip(again, solve(part, [s.problem for s in part], turned), strict=True):
-            waiting[i] = min(waiting[i], other, key=lambda f: float(f.end.cost))
-    yield from waiting
+            begun[task] = i, steps
+            waiting.append(task)
+
+    def ready(n: int) -> list[Task]:
+        while len(waiting) < n and (pair := first.pop(0) if first else next(given, None)) is not None:
+            go_on(next(numbers), _steps(*pair, params), None)
+        return [waiting.popleft() for _ in range(min(n, len(waiting)))]
+
+    begin, compiled = time.perf_counter(), compile_seconds()
+    with one_blas_thread():
+        for task, found in fit(body, ready, w, limits_of(params)):
+            go_on(*begun.pop(task), found)
+            while due in done:
+                solution, now, compiled_now = done.pop(due), time.perf_counter(), compile_seconds()
+                if isinstance(solution, Solution):
+                    # Those of all sessions add to those of the call, without what the caller does meanwhile.
+                    spent = {"seconds": now - begin, "compile_seconds": compiled_now - compiled}
+                    solution = dataclasses.replace(solution, **spent)
+                yield solution
+                due, begin, compiled = due + 1, time.perf_counter(), compiled_now
+
+
+#: The problems of a session one after the other: each is sent its end, and the last end gives the solution.
+_Steps = Generator[Task, Found, Solution]
+
+
+def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
+    """Solve the problems of a session: each is yielded, and its end is sent back.
+
+    Raises `PblError` where the augmenter is needed and not available.
+    """
+    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
+    p = session.problem
+    found = yield Task(p, _with_detector(start, params), last=not twice)
+    if suspicious(session, found.end.state.qpos):
+        turned = yield Task(p, _with_detector(start_of(session, flip=True), params), last=not twice)
+        found = min(found, turned, key=lambda f: float(f.end.cost))
+    trace, told = found.trace, None
+    if twice:
+        p, start = _on_floor(session, found)
+        if params.weight_pelvis > 0:
+            p = with_augmented_pelvis(session, p, np.asarray(start.qpos), np.asarray(scale_multipliers(start.s)))
+            told = np.asarray(p.c_pelvis)
+        found = yield Task(p, start, last=True)
+        # The cost of the second one has a term more.
+        trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
+    return _solution(session, params, found, trace, told)
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -157,23 +167,13 @@ def _step_by_step(body: Body, p: Problem, w: Weights, begin: Progress, limits: L
     return at
 
 
-def _solve(
-    sessions: Sequence[Session],
-    problems: Sequence[Problem],
-    starts: Sequence[State],
-    params: GaussNewtonParams,
-    several: bool,
-    last: bool,
-) -> Iterator[Found]:
-    body = sessions[0].body
-    w = Weights.of(body, params, size_unseen=pixels_alone(sessions[0].problem))
-    limits = limits_of(params)
-    with one_blas_thread():
-        if several:
-            yield from fit_many(body, list(zip(problems, starts, strict=True)), w, limits, last)
-            return
-        p, start = jax.device_put((problems[0], starts[0]))
-        yield fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), last)
+def _one_by_one(
+    body: Body, ready: Callable[[int], Sequence[Task]], w: Weights, limits: Limits
+) -> Iterator[tuple[Task, Found]]:
+    """What `fit_many` does, without its lanes."""
+    while tasks := ready(1):
+        p, start = jax.device_put((tasks[0].problem, tasks[0].start))
+        yield tasks[0], fetch(p, _step_by_step(body, p, w, begin_one(body, p, w, start), limits), tasks[0].last)
 
 
 def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
@@ -200,15 +200,11 @@ def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> 
 
 
 def _solution(
-    session: Session,
-    spread: tuple[np.ndarray, np.ndarray],
-    found: Found,
-    trace: np.ndarray,
-    pelvis_told: np.ndarray | None,
-    seconds: float,
-    compiled: float,
+    session: Session, params: GaussNewtonParams, found: Found, trace: np.ndarray, pelvis_told: np.ndarray | None
 ) -> Solution:
-    state, (factor, floor) = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), spread
+    """The solution, without the time it took."""
+    state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
+    factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)
@@ -220,8 +216,8 @@ def _solution(
         site_offset_m=state.site_offset_m[: len(session.markers)],
         clock_s=state.clock_s[: len(session.arrays)],
         loss_trace=trace,
-        compile_seconds=compiled,
-        seconds=seconds,
+        compile_seconds=0.0,
+        seconds=0.0,
         iterations=len(trace),
         result=Result(int(found.end.result)),
         outcome=found.outcome,

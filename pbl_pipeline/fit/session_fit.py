@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import itertools
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -19,7 +19,6 @@ from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
 from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.prefetch import prefetched
 from pbl_pipeline.video import Camera
 
 from .checks import check_fit
@@ -35,14 +34,16 @@ from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
 
-#: Sessions given to the solver at once on a GPU: enough to keep its lanes filled, few enough that the next ones are
-#: packed meanwhile. The first ones are fewer, so that the device begins early.
-BATCH, FIRST = 128, 32
-#: Batches that are solved at a time on a GPU: while the host works on one, the device iterates the other.
+#: Sessions of the same sizes that a solver begins with: it takes more as they are packed. At most twice as many wait.
+FIRST = 16
+#: Solvers at a time on a GPU: while the host works for one, the device iterates for the other.
 SOLVERS = 2
 #: Threads that pack sessions and make their results. More of them hold the interpreter when the solvers need it: 256
 #: sessions on an H100 take 4.1 s with two, 4.4 with four, 5.8 with eight.
 PACKERS = 2
+
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,45 +100,19 @@ def fit_sessions(
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
-    A session that cannot be fitted has its `PblError` in its place. `batch`: most sessions at once
-    (default: `BATCH` on a GPU, 1 on a CPU, which gains nothing by it); `implicit-adam` takes one at a time.
+    A session that cannot be fitted has its `PblError` in its place. `batch`: most sessions in one call of the solver
+    (default: all on a GPU; 1 on a CPU, which gains nothing by more); `implicit-adam` takes one at a time.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
-    method = METHODS.find(paramset)
-    solvers, most = (1, 1) if jax.default_backend() == "cpu" else (SOLVERS, BATCH)
-    batch, taking = batch or most, threading.Lock()
-    out: list[SessionFit | PblError | None] = [None] * len(sessions)
-    results: list[Future[None]] = []
-
-    def finish(packed: _Packed, solution: Solution | PblError) -> None:
-        try:
-            if isinstance(solution, PblError):
-                raise solution
-            out[packed.index] = _session_fit(packed, solution, method.paramset, sessions[packed.index])
-        except PblError as error:
-            out[packed.index] = error
-
-    def solve(parts: Iterator[list[_Packed]]) -> None:
-        while True:
-            with taking:
-                part = next(parts, None)
-            if part is None:
-                return
-            solutions = method.function([p.session for p in part], method.params, [p.start for p in part])
-            for each in zip(part, solutions, strict=True):
-                results.append(threads.submit(finish, *each))
-
-    # While batches are solved, the results of earlier ones are made and the next one is packed.
-    with (
-        ThreadPoolExecutor(PACKERS) as threads,
-        contextlib.closing(prefetched(_batches(sessions, method.params, batch, out, threads), 1)) as parts,
-        ThreadPoolExecutor(solvers) as pool,
-    ):
-        list(pool.map(solve, [parts] * solvers))  # raises what was raised there
-        for result in results:
-            result.result()
-    return [r for r in out if r is not None]
+    on_cpu = jax.default_backend() == "cpu"
+    work = _Work(sessions, METHODS.find(paramset), batch or (1 if on_cpu else max(len(sessions), 1)))
+    load_body()  # before the threads, each of which would load its own body and compile for it
+    jobs = [work.solve] * (1 if on_cpu else SOLVERS) + [work.pack_and_finish] * PACKERS
+    with ThreadPoolExecutor(len(jobs)) as threads:
+        for ended in [threads.submit(work.guarded, job) for job in jobs]:
+            ended.result()  # raises what was raised there
+    return [r for r in work.out if r is not None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,41 +124,145 @@ class _Packed:
     start: State
     seconds: float
 
+    @property
+    def kind(self) -> Hashable:
+        """The same for sessions that a solver can take together: of the same sizes and terms."""
+        problem = self.session.problem
+        shapes = tuple(a.shape for a in jax.tree.leaves(problem))
+        return shapes, pixels_alone(problem), type(self.session.trials[0])
 
-def _batches(
-    sessions: Sequence[SessionInput],
-    params: Params,
-    batch: int,
-    out: list[SessionFit | PblError | None],
-    threads: ThreadPoolExecutor,
-) -> Iterator[list[_Packed]]:
-    """Up to `batch` sessions of the same sizes and terms at a time; errors of the others go to `out`."""
-    waiting: dict[tuple, list[_Packed]] = {}
-    load_body()  # before the threads, each of which would load its own body and compile for it
 
-    def pack(i: int) -> _Packed | PblError:
-        begin, given = time.perf_counter(), sessions[i]
+class _Work:
+    """The sessions of a call on their way through its threads: those that pack also make the results of what the
+    others have solved."""
+
+    def __init__(self, sessions: Sequence[SessionInput], method: Method[Params], most: int) -> None:
+        self.sessions, self.method, self.most = sessions, method, most
+        self.first = min(most, FIRST)
+        self.out: list[SessionFit | PblError | None] = [None] * len(sessions)
+        #: Guards what follows.
+        self.changed = threading.Condition()
+        self.to_pack = deque(range(len(sessions)))
+        self.packing = 0
+        self.packed = dict[Hashable, deque[_Packed]]()
+        self.solved = deque[tuple[_Packed, Solution | PblError]]()
+        self.failed = False
+
+    def guarded(self, job: Callable[[], None]) -> None:
+        """The whole of a thread; its error ends the others."""
+        try:
+            job()
+        except BaseException:
+            with self.changed:
+                self.failed = True
+                self.changed.notify_all()
+            raise
+
+    @property
+    def _over(self) -> bool:
+        return self.failed or all(r is not None for r in self.out)
+
+    @property
+    def _full(self) -> bool:
+        return sum(map(len, self.packed.values())) + self.packing >= 2 * self.first
+
+    def pack_and_finish(self) -> None:
+        """Make results where a solution waits, else pack the next session."""
+        while True:
+            with self.changed:
+                self.changed.wait_for(lambda: self._over or self.solved or (self.to_pack and not self._full))
+                if self._over:
+                    return
+                given = self.solved.popleft() if self.solved else None
+                self.packing += given is None
+                i = given[0].index if given else self.to_pack.popleft()
+            done = self._pack(i) if given is None else self._finish(*given)
+            with self.changed:
+                self.packing -= given is None
+                if isinstance(done, _Packed):
+                    self.packed.setdefault(done.kind, deque()).append(done)
+                else:
+                    self.out[i] = done
+                self.changed.notify_all()
+
+    def solve(self) -> None:
+        """Give the solver sessions of one kind after the other."""
+        while (first := self._first_of_most()) is not None:
+            self._solve_kind(first)
+
+    def _first_of_most(self) -> _Packed | None:
+        """One of the kind of which most are packed, once these are enough or no more can come; None at the end."""
+
+        def enough() -> bool:
+            least = 1 if self._full or not (self.to_pack or self.packing) else self.first
+            return max(map(len, self.packed.values()), default=0) >= least
+
+        with self.changed:
+            self.changed.wait_for(lambda: self._over or enough())
+            return None if self._over else self._take(max(self.packed, key=lambda kind: len(self.packed[kind])))
+
+    def _take(self, kind: Hashable) -> _Packed | None:
+        """One that is packed now."""
+        with self.changed:
+            waiting = self.packed.get(kind)
+            if not waiting:
+                return None
+            out = waiting.popleft()
+            if not waiting:
+                del self.packed[kind]
+            self.changed.notify_all()
+            return out
+
+    def _solve_kind(self, first: _Packed) -> None:
+        """Give the solver a session, and others of its kind as long as it asks and they are packed."""
+        kind, taken, unsolved, starts = first.kind, 0, deque[_Packed](), deque[State]()
+
+        def take() -> Session | None:
+            nonlocal taken
+            packed = None if taken == self.most else self._take(kind) if taken else first
+            if packed is None:
+                return None
+            taken += 1
+            unsolved.append(packed)
+            starts.append(packed.start)
+            return packed.session
+
+        given = _Ready(take), self.method.params, _Ready(lambda: starts.popleft() if starts else None)
+        for solution in self.method.function(*given):
+            with self.changed:
+                self.solved.append((unsolved.popleft(), solution))
+                self.changed.notify_all()
+        if unsolved or not taken:
+            raise ValueError(f"{self.method.key} returned less than a solution or an error for each session")
+
+    def _pack(self, i: int) -> _Packed | PblError:
+        begin, given = time.perf_counter(), self.sessions[i]
         try:
             check_height(given.height_m)
-            session = make_session(given.trials, given.names, params, _motions(given), given.markers)
+            session = make_session(given.trials, given.names, self.method.params, _motions(given), given.markers)
         except PblError as error:
             return error
         return _Packed(i, session, start_of(session), time.perf_counter() - begin)
 
-    given, full = iter(range(len(sessions))), min(batch, FIRST)
-    while some := list(itertools.islice(given, full)):
-        for i, packed in zip(some, threads.map(pack, some), strict=True):
-            if isinstance(packed, PblError):
-                out[i] = packed
-                continue
-            problem = packed.session.problem
-            shapes = tuple(a.shape for a in jax.tree.leaves(problem))
-            key = (shapes, pixels_alone(problem), type(packed.session.trials[0]))
-            waiting.setdefault(key, []).append(packed)
-            if len(waiting[key]) == full:
-                yield waiting.pop(key)
-        full = min(batch, 2 * full)
-    yield from waiting.values()
+    def _finish(self, packed: _Packed, solution: Solution | PblError) -> SessionFit | PblError:
+        if isinstance(solution, PblError):
+            return solution
+        try:
+            return _session_fit(packed, solution, self.method.paramset, self.sessions[packed.index])
+        except PblError as error:
+            return error
+
+
+class _Ready(Iterator[T]):
+    """What is ready: ends where nothing is, and may have more when it is asked again."""
+
+    def __init__(self, take: Callable[[], T | None]) -> None:
+        self._take = take
+
+    def __next__(self) -> T:
+        if (item := self._take()) is None:
+            raise StopIteration
+        return item
 
 
 def _motions(given: SessionInput) -> list[str]:

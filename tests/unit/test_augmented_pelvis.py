@@ -1,7 +1,9 @@
 """The pelvis of a person who sits or squats, as the marker augmenter has it."""
 
 import dataclasses
+from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from pbl_pipeline.fit import METHODS, augmented_pelvis, per_frame
 from pbl_pipeline.fit.augmented_pelvis import folds, inclination_of, pelvis_of, with_augmented_pelvis
 from pbl_pipeline.fit.checks import _pelvis_told
 from pbl_pipeline.fit.joint_terms import inclination
+from pbl_pipeline.fit.lanes import Task
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import AnatomicalMarkers, MarkerAugmenter
 from pbl_pipeline.synthetic import SynthSpec, synthesise
@@ -102,9 +105,13 @@ def test_without_the_network_those_who_do_not_sit_are_fitted_all_the_same(monkey
     given = [session_of(task) for task in ("squat", "walk")]
     sessions = [session for session, _ in given]
     starts = [dataclasses.replace(per_frame.start_of(session), qpos=qpos) for session, qpos in given]
-    found = [SimpleNamespace(end=SimpleNamespace(state=start), trace=np.zeros((0, 2))) for start in starts]
-    for name in ("_facing", "_solve"):
-        monkeypatch.setattr(per_frame, name, lambda *_, **__: iter(found))
+
+    def fit(body, ready, *_) -> Iterator[tuple[Task, Any]]:
+        while tasks := ready(2):
+            for task in tasks:
+                yield task, SimpleNamespace(end=SimpleNamespace(state=task.start), trace=np.zeros((0, 2)))
+
+    monkeypatch.setattr(per_frame, "fit_many", fit)
     monkeypatch.setattr(per_frame, "_on_floor", lambda session, f: (session.problem, f.end.state))
     monkeypatch.setattr(per_frame, "_solution", lambda *_: "a solution")
     gone = PblError("ASSET_MISSING", found="no network", expected="a file", next_step="fetch it")

@@ -6,6 +6,7 @@ that one program serves each kind of session.
 
 import dataclasses
 import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -300,7 +301,7 @@ def test_more_sessions_than_lanes_are_each_as_alone(walkers, one_by_one, monkeyp
     """Two lanes for five sessions: who ended makes room, and the last one moves to a program of one."""
     monkeypatch.setattr(lanes, "LANES", 2)
     monkeypatch.setattr(lanes, "FEW", 1)
-    monkeypatch.setattr(lanes, "HELD", 2)  # four on the device at a time
+    monkeypatch.setattr(lanes, "MOVED", 2)
     together = fit_sessions([*walkers, *walkers[:2]], PARAMSET, batch=5)
     for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
         assert isinstance(fit, SessionFit)
@@ -332,20 +333,23 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
     asked: list[list[str]] = []
 
     def refuse(sessions, params, starts) -> list[PblError]:
-        asked.append([s.names[0] for s in sessions])
-        return [UNSOLVED] * len(sessions)
+        asked.append([session.names[0] for session, _ in zip(sessions, starts, strict=True)])
+        return [UNSOLVED] * len(asked[-1])
 
     monkeypatch.setattr(Method, "function", property(lambda _: refuse))
     assert fit_sessions([pixels, *walkers], PARAMSET, batch=8) == [UNSOLVED] * 4
-    assert asked == [["pixels"], [w.names[0] for w in walkers]]
+    assert sorted(asked) == sorted([["pixels"], [w.names[0] for w in walkers]])
 
 
-def test_results_are_made_while_others_are_solved_and_the_first_batch_is_small(walkers, monkeypatch):
-    made, sizes = threading.Event(), list[int]()
+def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, monkeypatch):
+    made, asked = threading.Event(), list[int]()
 
     def solve(sessions, params, starts) -> Iterator[None]:
-        sizes.append(len(sessions))
-        for _ in sessions:
+        asked.append(0)
+        for _ in range(8):
+            while next(zip(sessions, starts, strict=True), None) is None:
+                time.sleep(0.01)  # not packed yet
+            asked[-1] += 1
             yield None
             assert made.wait(60)
 
@@ -356,8 +360,14 @@ def test_results_are_made_while_others_are_solved_and_the_first_batch_is_small(w
     monkeypatch.setattr(Method, "function", property(lambda _: solve))
     monkeypatch.setattr(session_fit, "_session_fit", result)
     monkeypatch.setattr(session_fit, "FIRST", 1)
-    assert fit_sessions([walkers[0]] * 8, PARAMSET, batch=4) == [UNSOLVED] * 8
-    assert sizes == [1, 2, 4, 1]
+    assert fit_sessions([walkers[0]] * 8, PARAMSET, batch=8) == [UNSOLVED] * 8
+    assert asked == [8]
+
+
+def test_a_solver_that_forgets_a_session_is_an_error(walkers, monkeypatch):
+    monkeypatch.setattr(Method, "function", property(lambda _: lambda sessions, *_: list(sessions)[1:]))
+    with pytest.raises(ValueError, match="a solution or an error for each"):
+        fit_sessions(walkers, PARAMSET, batch=3)
 
 
 # --- robustness ---
