@@ -51,7 +51,9 @@ def detector_blocks(
     u, each = detector.by_depth, detector.trials
     frames, markers = b.shape
     eye, n = jnp.eye(markers, dtype=b.dtype), G.shape[-1] - detector.by_lean.shape[-1]
-    by_depth = jnp.einsum("fi,fmia->fam", u, cross)
+    by_depth = jnp.swapaxes(
+        jnp.sum(u[:, None, :, None] * cross, axis=2), 1, 2
+    )  # no product, so nothing is stored for it
     Wu = jnp.einsum("fmij,fj->fmi", W, u)
     own = jnp.einsum("fmi,fi->fm", Wu, u)
     mixed = b[:, :, None] * own[:, None]

@@ -72,9 +72,10 @@ def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
     return before_first(lambda state: linearise(body, p, w, state), start)
 
 
-def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits) -> Progress:
-    """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before."""
-    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits)
+def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits, steps: Any = None) -> Progress:
+    """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before; with
+    `steps`, at most so many now."""
+    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits, steps)
 
 
 def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
@@ -206,14 +207,9 @@ def _placed(rows: Any, at: Any, given: Any) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="body", donate_argnames="at")
-def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, iterations: Any) -> Progress:
+def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, steps: Any) -> Progress:
     """Some iterations more of each lane that has not ended."""
-
-    def more(p: Problem, at: Progress) -> Progress:
-        most = jnp.minimum(limits.iterations, at.iteration + iterations)
-        return fit_problem(body, p, w, at, dataclasses.replace(limits, iterations=most))
-
-    return jax.vmap(more)(p, at)
+    return jax.vmap(lambda p, at: fit_problem(body, p, w, at, limits, steps))(p, at)
 
 
 @jax.jit

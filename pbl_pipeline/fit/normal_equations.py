@@ -231,12 +231,10 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     frames, markers = x.shape[:2]
     flat = lambda a: a.reshape(frames, markers * 3, -1)  # noqa: E731
     W_all = jnp.sum(W, axis=1)
-    # The detector's errors move the 3D residuals alone.
-    wide = lambda a: jnp.pad(a, [(0, 0)] * 3 + [(0, detector.by_lean.shape[-1])])  # noqa: E731
-    of_2d = wide(times(M, A))
+    # Pull on each marker where the unknowns move; the detector's errors move the 3D residuals alone.
     A = jnp.concatenate([A, detector.by_lean], axis=-1)
-    cross = times(W_all, A)
-    G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(cross + of_2d))
+    pulled_by = jnp.concatenate([times(M + W_all, A[..., :n]), times(W_all, A[..., n:])], axis=-1)
+    G = jnp.einsum("fkq,fkr->fqr", flat(A), flat(pulled_by))
     G = G.at[:, n:, :n].set(jnp.swapaxes(G[:, :n, n:], -1, -2))
     U_t = jnp.swapaxes(U, -1, -2)
     own = jnp.sum(times(U_t, times(M + W_all, U)), axis=0)
@@ -244,17 +242,17 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     # A centred residual moves with its marker less the mean over the markers, which all of them move.
     for b, Wv in zip(jnp.moveaxis(centred, 1, 0), jnp.moveaxis(W, 1, 0), strict=True):
         moves = jnp.einsum("fm,fmiq->fiq", b, A)
-        pull = jnp.sum(times(Wv, A), axis=1)
+        pull = jnp.einsum("fmij,fmjq->fiq", Wv, A)
         whole = jnp.sum(Wv, axis=1)
         both = jnp.einsum("fiq,fir->fqr", pull, moves)
         G += jnp.einsum("fiq,fij,fjr->fqr", moves, whole, moves) - both - jnp.swapaxes(both, -1, -2)
         loose = pull - whole @ moves
-        cross = cross - times(Wv, moves[:, None]) - b[..., None, None] * loose[:, None]
+        pulled_by -= times(Wv, moves[:, None]) + b[..., None, None] * loose[:, None]
         X = jnp.swapaxes(times(Wv, U), 1, 2).reshape(frames, 3, 3 * markers)
         Y = jnp.swapaxes(b[..., None, None] * U, 1, 2).reshape(frames, 3, 3 * markers)
         one = jnp.einsum("fik,fil->kl", X - 0.5 * whole @ Y, Y)
         C_oo -= one + one.T
-    by_offset = times(U_t, cross + of_2d).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
+    by_offset = times(U_t, pulled_by).reshape(frames, 3 * markers, A.shape[-1]).swapaxes(1, 2)
     C_so = jnp.sum(by_offset[:, q:n], axis=0)
     C = jnp.block([[jnp.sum(G[:, q:n, q:n], axis=0), C_so], [C_so.T, C_oo]])
     B = jnp.concatenate([G[:, :q, q:n], by_offset[:, :q]], axis=-1)
@@ -262,7 +260,8 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     pulled_o = jnp.einsum("fmik,fmi->mk", U, f + f_3d)
     h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), pulled_o.reshape(-1)])
     if detector.trials.shape[1]:
-        B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, cross, G, f_3d, q)
+        in_3d = pulled_by - jnp.pad(times(M, A[..., :n]), [(0, 0)] * 3 + [(0, A.shape[-1] - n)])
+        B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, in_3d, G, f_3d, q)
         B, h = jnp.concatenate([B, B_d], axis=-1), jnp.concatenate([h, h_d])
         C = jnp.block([[C, C_d], [C_d.T, C_dd]])
     return [rows.cost for _, rows in linear], (G[:, :q, :q], -pulled[:, :q], B), (C, -h)

@@ -108,20 +108,26 @@ def minimise(
     begin: Progress,
     counts: Float[Array, " F"],
     limits: Limits,
+    steps: Any = None,
 ) -> Progress:
     """Minimise a cost, from `before_first` or from where a call with fewer iterations ended: both ways take the
     same steps.
 
     `evaluate`: cost and its quadratic model at a state; `move`: the state after a step (F, Q) of the frames' unknowns
-    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence.
+    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence; `steps`: at most so
+    many steps now, for many problems side by side (`vmap`), because a loop that ends for each at another step copies
+    the state of all in each.
     Each pass of the loop evaluates one state: a second copy of that program, for the start or for the cost alone, would
     double the time it takes to compile.
     """
 
+    def goes_on(p: Progress) -> Array:
+        return (p.result == Result.BOUND) & (p.iteration < jnp.minimum(limits.iterations, MOST_ITERATIONS))
+
     def step(p: Progress) -> Progress:
-        now, first = evaluate(p.candidate), p.iteration < 0
+        now, first, on = evaluate(p.candidate), p.iteration < 0, goes_on(p)
         # Single precision: a change below the rounding of the sum does not refuse a step.
-        accepted = now.cost <= p.cost * (1 + 1e-6)
+        accepted = on & (now.cost <= p.cost * (1 + 1e-6))
         better = accepted & ~first
         keep = lambda new, old: jnp.where(accepted, new, old)  # noqa: E731
         state, latest, cost = jax.tree.map(keep, (p.candidate, now, now.cost), (p.state, p.latest, p.cost))
@@ -139,10 +145,10 @@ def minimise(
         secant = p.length / jnp.maximum(1 - _slope(latest, *p.direction) / p.slope, 1e-3)
         near = better & (jnp.maximum(p.step, longest) < NEAR)
         length = jnp.where(near, jnp.clip(secant, SHORTEST, LONGEST), 1.0)
-        return Progress(
+        after = Progress(
             state=state,
             cost=cost,
-            latest=latest,
+            latest=None,
             candidate=move(state, length * dx, length * dy),
             direction=(dx, dy),
             length=length,
@@ -155,8 +161,12 @@ def minimise(
             trace=p.trace.at[jnp.where(first, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
         )
 
-    most = jnp.minimum(limits.iterations, MOST_ITERATIONS)
-    return jax.lax.while_loop(lambda p: (p.result == Result.BOUND) & (p.iteration < most), step, begin)
+        after = jax.tree.map(lambda new, old: jnp.where(on, new, old), after, dataclasses.replace(p, latest=None))
+        return dataclasses.replace(after, latest=latest)
+
+    if steps is not None:
+        return jax.lax.fori_loop(0, steps, lambda _, p: step(p), begin)
+    return jax.lax.while_loop(goes_on, step, begin)
 
 
 def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:
