@@ -8,6 +8,7 @@ import importlib.util
 import io
 import os
 import sys
+import threading
 import warnings
 from typing import Any
 
@@ -83,20 +84,26 @@ def _default(option: str, value: float) -> None:
         jax.config.update(option, value)
 
 
+_importing = threading.Lock()
+
+
 def import_mjx() -> Any:
     """Return the module of MuJoCo's kinematics in JAX, imported where it is needed: by one solver.
 
     Without NVIDIA's optional warp it prints two lines on stdout, which would end up in the output of a command. Only
     those lines are dropped; everything else that is printed meanwhile is passed on.
     """
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stdout(printed):
-            return importlib.import_module("mujoco.mjx")
-    finally:
-        for line in printed.getvalue().splitlines(keepends=True):
-            if not _is_absent_warp(line):
-                sys.stdout.write(line)
+    with _importing:  # of two threads that redirect the output, the last one to end would restore the other's
+        if "mujoco.mjx" in sys.modules:
+            return sys.modules["mujoco.mjx"]
+        printed = io.StringIO()
+        try:
+            with contextlib.redirect_stdout(printed):
+                return importlib.import_module("mujoco.mjx")
+        finally:
+            for line in printed.getvalue().splitlines(keepends=True):
+                if not _is_absent_warp(line):
+                    sys.stdout.write(line)
 
 
 def _is_absent_warp(line: str) -> bool:

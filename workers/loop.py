@@ -271,7 +271,9 @@ class Worker:
             self.found.add(found)
             if found.queued or found.freed:
                 return True
-            return None if held else False
+            # What another worker has queued since our last step, and not taken yet, is ours as well.
+            ours = {} if self.limit is not None else self._conditions()
+            return None if held or any(queue.most_urgent(t, where) is not None for t, where in ours.items()) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
         tables_version.refuse_newer()  # after a migration meanwhile this worker ends, and its successor does not start

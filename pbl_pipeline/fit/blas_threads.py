@@ -6,8 +6,11 @@ is slower by a factor of ten and more where cores are shared (measured: 110 ms b
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from contextlib import AbstractContextManager
+import threading
+from collections.abc import Iterator
+from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
@@ -19,6 +22,20 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
-    """One thread per call of BLAS and LAPACK inside the block."""
-    return _controller().limit(limits=1, user_api="blas")
+_lock = threading.Lock()
+_inside: list[Any] = []  # one limit for each that is inside a block; the first one knows what was there before
+
+
+@contextlib.contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """One thread per call of BLAS and LAPACK inside the block, of which several threads may be in one at a time."""
+    with _lock:
+        limit = _controller().limit(limits=1, user_api="blas") if not _inside else _inside[0]
+        _inside.append(limit)
+    try:
+        yield
+    finally:
+        with _lock:
+            _inside.pop()
+            if not _inside:
+                limit.restore_original_limits()

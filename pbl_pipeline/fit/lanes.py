@@ -109,16 +109,17 @@ def _kept(end: Progress) -> Progress:
 def fit_many(
     body: Body, ready: Callable[[int], Sequence[Task]], w: Weights, limits: Limits
 ) -> Iterator[tuple[Task, Found]]:
-    """Fit problems of the same sizes: each with its end as soon as that is known, while the device fits the others.
+    """Fit problems of the same sizes: yields each with its end, while the device fits the others.
 
     `ready(n)` returns up to n that are ready now, and is asked again while lanes are free; when none is ready and all
     have ended, this ends. The result does not depend on which problems are fitted together beyond rounding.
     """
-    new = ready(LANES)
+    new = ready(1)
     if not new:
         return
     frames = new[0].problem.weight.shape[0]
     most, few = (min(n, max(1, MOST_FRAMES // frames)) for n in (LANES, FEW))
+    new = [*new, *ready(most - 1)]
     holds = list[Task | None]([None] * (most if len(new) > few else few))
     lanes, ended = (_begin(body, w, _stacked(new[:MOVED]), np.zeros(len(holds), int)) for _ in range(2))
     room, slots = len(holds), list[Task]()  # of `ended`, and what they hold
@@ -142,12 +143,12 @@ def fit_many(
             new = [*new, *ready(most - len(busy) - len(new))]
         n = most if len(busy) + len(new) > few else few
         if n != len(holds) and (busy or new):
-            lanes = _some(lanes, np.asarray([*busy, *[0] * n][:n]))
+            lanes = _some(lanes, _filled_up(busy, n, 0))
             holds = [*(holds[k] for k in busy), *[None] * (n - len(busy))]
         while new:
             now, new = new[:MOVED], new[MOVED:]
             free = [k for k, task in enumerate(holds) if task is None][: len(now)]
-            lanes = _filled(body, w, lanes, _stacked(now), np.asarray([*free, *[n] * (MOVED - len(now))]))
+            lanes = _filled(body, w, lanes, _stacked(now), _filled_up(free, MOVED, n))
             for k, task in zip(free, now, strict=True):
                 holds[k] = task
         if not any(holds):
@@ -162,10 +163,11 @@ def fit_many(
         result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
         ends = (result != Result.BOUND) | (iteration >= bound)
         over = [(k, task) for k, task in enumerate(holds) if task is not None and ends[k]]
-        last, others = ([(k, task) for k, task in over if task.last is of] for of in (True, False))
+        last = [(k, task) for k, task in over if task.last]
+        others = [(k, task) for k, task in over if not task.last]
         if others:
-            at = [k for k, _ in others]
-            to_fetch.append(([task for _, task in others], _reached(lanes[1], np.asarray([*at, *[0] * n][:n]))))
+            reached = _reached(lanes[1], _filled_up([k for k, _ in others], n, 0))
+            to_fetch.append(([task for _, task in others], reached))
         for part in (last[i : i + room] for i in range(0, len(last), room)):
             if len(slots) + len(part) > room:
                 take_ended()
@@ -175,6 +177,10 @@ def fit_many(
             ended = _moved(ended, lanes, slot)
         for k, _ in over:
             holds[k] = None
+
+
+def _filled_up(numbers: Sequence[int], n: int, by: int) -> np.ndarray:
+    return np.asarray([*numbers, *[by] * (n - len(numbers))])
 
 
 def _stacked(tasks: Sequence[Task]) -> tuple[Problem, State]:
@@ -215,7 +221,7 @@ def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, ste
 @jax.jit
 def _finished(p: Problem, end: Progress) -> tuple[Any, ...]:
     """The fields of `Found` of last ends: copies, because the arrays of `end` are given away."""
-    return jax.tree.map(jnp.copy, _kept(end)), None, *jax.vmap(finish)(p, end.latest, end.state.R_nc)
+    return jax.tree.map(jnp.copy, (_kept(end), None, *jax.vmap(finish)(p, end.latest, end.state.R_nc)))
 
 
 @jax.jit

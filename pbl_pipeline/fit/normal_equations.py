@@ -260,6 +260,7 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     pulled_o = jnp.einsum("fmik,fmi->mk", U, f + f_3d)
     h = jnp.concatenate([jnp.sum(pulled[:, q:], axis=0), pulled_o.reshape(-1)])
     if detector.trials.shape[1]:
+        # Taken off again, so that the two are never stored beside each other.
         in_3d = pulled_by - jnp.pad(times(M, A[..., :n]), [(0, 0)] * 3 + [(0, A.shape[-1] - n)])
         B_d, C_d, C_dd, h_d = detector_blocks(detector, centred[:, 0], W_all, U_t, in_3d, G, f_3d, q)
         B, h = jnp.concatenate([B, B_d], axis=-1), jnp.concatenate([h, h_d])

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import operator
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -46,8 +47,9 @@ BACKWARDS_FRACTION = 0.2
 def solve_per_frame(
     sessions: Iterable[Session], params: GaussNewtonParams, starts: Iterable[State]
 ) -> Iterator[Solution | PblError]:
-    """Fit sessions that are packed to the same sizes from `start_of` each: one as it is, several at once on the device,
-    which fits the others while the first solutions are taken and is given more where the iterables then have more.
+    """Fit sessions that are packed to the same sizes from `start_of` each: where there may be several
+    (`operator.length_hint`), side by side on the device, which fits the others while the first solutions are taken, and
+    is given more where the iterables have more after they ended.
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
@@ -56,12 +58,12 @@ def solve_per_frame(
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
-    given = zip(sessions, starts, strict=True)
-    first = list(itertools.islice(given, 2))
-    if not first:
+    several, given = operator.length_hint(sessions) > 1, zip(sessions, starts, strict=True)
+    first = next(given, None)
+    if first is None:
         return
-    body, w = first[0][0].body, Weights.of(first[0][0].body, params, size_unseen=pixels_alone(first[0][0].problem))
-    fit = fit_many if len(first) > 1 else _one_by_one
+    body, w = first[0].body, Weights.of(first[0].body, params, size_unseen=pixels_alone(first[0].problem))
+    fit = fit_many if several else _one_by_one
     begun, done = dict[Task, tuple[int, _Steps]](), dict[int, Solution | PblError]()
     waiting, numbers, due = deque[Task](), itertools.count(), 0
 
@@ -77,22 +79,32 @@ def solve_per_frame(
             waiting.append(task)
 
     def ready(n: int) -> list[Task]:
-        while len(waiting) < n and (pair := first.pop(0) if first else next(given, None)) is not None:
+        nonlocal first
+        while len(waiting) < n:
+            # A zip may be asked again after it ended: it ends anew each time that `sessions` does.
+            pair, first = first or next(given, None), None
+            if pair is None:
+                break
             go_on(next(numbers), _steps(*pair, params), None)
         return [waiting.popleft() for _ in range(min(n, len(waiting)))]
+
+    def ended() -> Iterator[Solution | PblError]:
+        nonlocal due, begin, compiled
+        while due in done:
+            solution, now, compiled_now = done.pop(due), time.perf_counter(), compile_seconds()
+            if isinstance(solution, Solution):
+                # Since the last one, without what the caller did meanwhile.
+                spent = {"seconds": now - begin, "compile_seconds": compiled_now - compiled}
+                solution = dataclasses.replace(solution, **spent)
+            yield solution
+            due, begin, compiled = due + 1, time.perf_counter(), compiled_now
 
     begin, compiled = time.perf_counter(), compile_seconds()
     with one_blas_thread():
         for task, found in fit(body, ready, w, limits_of(params)):
             go_on(*begun.pop(task), found)
-            while due in done:
-                solution, now, compiled_now = done.pop(due), time.perf_counter(), compile_seconds()
-                if isinstance(solution, Solution):
-                    # Those of all sessions add to those of the call, without what the caller does meanwhile.
-                    spent = {"seconds": now - begin, "compile_seconds": compiled_now - compiled}
-                    solution = dataclasses.replace(solution, **spent)
-                yield solution
-                due, begin, compiled = due + 1, time.perf_counter(), compiled_now
+            yield from ended()
+    yield from ended()
 
 
 #: The problems of a session one after the other: each is sent its end, and the last end gives the solution.

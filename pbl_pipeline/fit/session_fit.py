@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -34,7 +35,8 @@ from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
 
-#: Sessions of the same sizes that a solver begins with: it takes more as they are packed. At most twice as many wait.
+#: Sessions of the same sizes that are enough for a solver to begin: it takes more as they are packed, of which at most
+#: twice as many wait.
 FIRST = 16
 #: Solvers at a time on a GPU: while the host works for one, the device iterates for the other.
 SOLVERS = 2
@@ -106,10 +108,10 @@ def fit_sessions(
     Raises `PblError` SOLVER_UNKNOWN.
     """
     on_cpu = jax.default_backend() == "cpu"
-    work = _Work(sessions, METHODS.find(paramset), batch or (1 if on_cpu else max(len(sessions), 1)))
+    work = _Work(sessions, METHODS.find(paramset), max(batch or (1 if on_cpu else len(sessions)), 1))
     load_body()  # before the threads, each of which would load its own body and compile for it
     jobs = [work.solve] * (1 if on_cpu else SOLVERS) + [work.pack_and_finish] * PACKERS
-    with ThreadPoolExecutor(len(jobs)) as threads:
+    with ThreadPoolExecutor(len(jobs)) as threads, work.ends_with_error():
         for ended in [threads.submit(work.guarded, job) for job in jobs]:
             ended.result()  # raises what was raised there
     return [r for r in work.out if r is not None]
@@ -117,19 +119,14 @@ def fit_sessions(
 
 @dataclasses.dataclass(frozen=True)
 class _Packed:
-    """A session ready for a solver, with its start; `seconds`: time that packing took."""
+    """A session ready for a solver, with its start; `seconds`: time that packing took; `kind`: the same for sessions of
+    the same sizes and terms, which a solver can take together."""
 
     index: int
     session: Session
     start: State
     seconds: float
-
-    @property
-    def kind(self) -> Hashable:
-        """The same for sessions that a solver can take together: of the same sizes and terms."""
-        problem = self.session.problem
-        shapes = tuple(a.shape for a in jax.tree.leaves(problem))
-        return shapes, pixels_alone(problem), type(self.session.trials[0])
+    kind: Hashable
 
 
 class _Work:
@@ -138,33 +135,40 @@ class _Work:
 
     def __init__(self, sessions: Sequence[SessionInput], method: Method[Params], most: int) -> None:
         self.sessions, self.method, self.most = sessions, method, most
-        self.first = min(most, FIRST)
+        self.enough = min(most, FIRST)
         self.out: list[SessionFit | PblError | None] = [None] * len(sessions)
         #: Guards what follows.
         self.changed = threading.Condition()
         self.to_pack = deque(range(len(sessions)))
         self.packing = 0
         self.packed = dict[Hashable, deque[_Packed]]()
+        self.taken_by = Counter[Hashable]()  # solvers that take sessions of a kind
         self.solved = deque[tuple[_Packed, Solution | PblError]]()
+        self.left = len(sessions)  # without a result
         self.failed = False
 
-    def guarded(self, job: Callable[[], None]) -> None:
-        """The whole of a thread; its error ends the others."""
+    @contextlib.contextmanager
+    def ends_with_error(self) -> Iterator[None]:
+        """An error inside ends all threads."""
         try:
-            job()
+            yield
         except BaseException:
             with self.changed:
                 self.failed = True
                 self.changed.notify_all()
             raise
 
+    def guarded(self, job: Callable[[], None]) -> None:
+        with self.ends_with_error():
+            job()
+
     @property
     def _over(self) -> bool:
-        return self.failed or all(r is not None for r in self.out)
+        return self.failed or not self.left
 
     @property
     def _full(self) -> bool:
-        return sum(map(len, self.packed.values())) + self.packing >= 2 * self.first
+        return sum(map(len, self.packed.values())) + self.packing >= 2 * self.enough
 
     def pack_and_finish(self) -> None:
         """Make results where a solution waits, else pack the next session."""
@@ -183,29 +187,35 @@ class _Work:
                     self.packed.setdefault(done.kind, deque()).append(done)
                 else:
                     self.out[i] = done
+                    self.left -= 1
                 self.changed.notify_all()
 
     def solve(self) -> None:
         """Give the solver sessions of one kind after the other."""
-        while (first := self._first_of_most()) is not None:
-            self._solve_kind(first)
+        while (begin := self._begin_kind()) is not None:
+            self._solve_kind(begin)
 
-    def _first_of_most(self) -> _Packed | None:
-        """One of the kind of which most are packed, once these are enough or no more can come; None at the end."""
+    def _begin_kind(self) -> _Packed | None:
+        """One of the kind of which most are packed, once these are enough; or all there will be, of a kind that no
+        other solver is taking. None at the end."""
 
-        def enough() -> bool:
-            least = 1 if self._full or not (self.to_pack or self.packing) else self.first
-            return max(map(len, self.packed.values()), default=0) >= least
+        def kinds() -> list[Hashable]:
+            last = self._full or not (self.to_pack or self.packing)
+            return [k for k, p in self.packed.items() if len(p) >= self.enough or (last and not self.taken_by[k])]
 
         with self.changed:
-            self.changed.wait_for(lambda: self._over or enough())
-            return None if self._over else self._take(max(self.packed, key=lambda kind: len(self.packed[kind])))
+            self.changed.wait_for(lambda: self._over or kinds())
+            if self._over:
+                return None
+            kind = max(kinds(), key=lambda k: len(self.packed[k]))
+            self.taken_by[kind] += 1
+            return self._take(kind)
 
     def _take(self, kind: Hashable) -> _Packed | None:
         """One that is packed now."""
         with self.changed:
             waiting = self.packed.get(kind)
-            if not waiting:
+            if not waiting or self.failed:
                 return None
             out = waiting.popleft()
             if not waiting:
@@ -213,27 +223,39 @@ class _Work:
             self.changed.notify_all()
             return out
 
-    def _solve_kind(self, first: _Packed) -> None:
+    def _solve_kind(self, begin: _Packed) -> None:
         """Give the solver a session, and others of its kind as long as it asks and they are packed."""
-        kind, taken, unsolved, starts = first.kind, 0, deque[_Packed](), deque[State]()
+        kind, taken, unsolved, starts = begin.kind, 0, deque[_Packed](), deque[State]()
 
         def take() -> Session | None:
             nonlocal taken
-            packed = None if taken == self.most else self._take(kind) if taken else first
-            if packed is None:
+            packed = begin
+            if taken == self.most:
+                return None
+            if taken and (packed := self._take(kind)) is None:
                 return None
             taken += 1
             unsolved.append(packed)
             starts.append(packed.start)
             return packed.session
 
-        given = _Ready(take), self.method.params, _Ready(lambda: starts.popleft() if starts else None)
-        for solution in self.method.function(*given):
+        sessions = _Ready(take, min(self.most, len(self.sessions)))
+        try:
+            for solution in self.method.function(sessions, self.method.params, _Ready(lambda: _next(starts))):
+                with self.changed:
+                    if not unsolved:
+                        raise self._miscounted()
+                    self.solved.append((unsolved.popleft(), solution))
+                    self.changed.notify_all()
+        finally:
             with self.changed:
-                self.solved.append((unsolved.popleft(), solution))
+                self.taken_by[kind] -= 1
                 self.changed.notify_all()
-        if unsolved or not taken:
-            raise ValueError(f"{self.method.key} returned less than a solution or an error for each session")
+        if (unsolved or not taken) and not self.failed:
+            raise self._miscounted()
+
+    def _miscounted(self) -> ValueError:
+        return ValueError(f"{self.method.key} did not return a solution or an error for each session that it took")
 
     def _pack(self, i: int) -> _Packed | PblError:
         begin, given = time.perf_counter(), self.sessions[i]
@@ -242,7 +264,9 @@ class _Work:
             session = make_session(given.trials, given.names, self.method.params, _motions(given), given.markers)
         except PblError as error:
             return error
-        return _Packed(i, session, start_of(session), time.perf_counter() - begin)
+        shapes = tuple(a.shape for a in jax.tree.leaves(session.problem))
+        kind = shapes, pixels_alone(session.problem), type(session.trials[0])
+        return _Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
 
     def _finish(self, packed: _Packed, solution: Solution | PblError) -> SessionFit | PblError:
         if isinstance(solution, PblError):
@@ -253,16 +277,23 @@ class _Work:
             return error
 
 
-class _Ready(Iterator[T]):
-    """What is ready: ends where nothing is, and may have more when it is asked again."""
+def _next(waiting: deque[T]) -> T | None:
+    return waiting.popleft() if waiting else None
 
-    def __init__(self, take: Callable[[], T | None]) -> None:
-        self._take = take
+
+class _Ready(Iterator[T]):
+    """What is ready: ends where nothing is, and may have more when it is asked again, up to `most`."""
+
+    def __init__(self, take: Callable[[], T | None], most: int = 0) -> None:
+        self._take, self._most = take, most
 
     def __next__(self) -> T:
         if (item := self._take()) is None:
             raise StopIteration
         return item
+
+    def __length_hint__(self) -> int:
+        return self._most
 
 
 def _motions(given: SessionInput) -> list[str]:

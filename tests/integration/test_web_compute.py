@@ -148,6 +148,26 @@ def test_a_job_that_ends_just_after_it_was_looked_for_is_followed(
     assert len(qc.SessionQc & job.key) == 1
 
 
+def test_a_job_that_another_has_queued_and_not_taken_is_done(
+    visits: None, browser: Any, monkeypatch: pytest.MonkeyPatch
+):
+    mark(browser, 2)
+    job = fit.SessionFit.jobs.pending.fetch1("KEY")
+    fit.SessionFit.jobs.update1({**job, "status": "ignore"})
+    real, looks = refresh.refresh_scope, []
+
+    def look(scope: Any) -> Any:
+        found = real(scope)
+        looks.append(scope)
+        if len(looks) == 2:  # the first is before the worker
+            fit.SessionFit.jobs.update1({**job, "status": "pending"})
+        return found
+
+    monkeypatch.setattr(refresh, "refresh_scope", look)
+    populate(visit=1)
+    assert len(fit.SessionFit & job) == 1
+
+
 def test_a_failure_is_shown_with_its_next_step_and_tried_again(visits: None, browser: Any, tmp_path: Path):
     gone = small_video(tmp_path, "gone")
     number = register(gone, session_label="2026-01-10")[0]

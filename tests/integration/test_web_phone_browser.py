@@ -321,6 +321,30 @@ def test_a_recording_whose_facts_are_read_while_they_are_written_stays(camera: A
         assert page.evaluate(FACTS_READ_WHILE_WRITTEN) == 0
 
 
+#: In the page, on a full phone: facts that do not fit are refused, and the recording is listed with those before.
+FACTS_THAT_DO_NOT_FIT = """
+async () => {
+  const { all, keep, newFile, remove } = await import("/static/capture_takes.js");
+  const facts = {name: "take-full", visit: -1, made: 1, about: {}, log: null, complete: false};
+  const file = await newFile(facts.name);
+  await file.write(0, new Uint8Array(9));
+  await file.close();
+  await keep(facts);
+  const refused = await keep({...facts, visit: 7, log: "x".repeat(1e7)}).then(() => "", (error) => error.name);
+  const kept = (await all()).filter((take) => take.name === facts.name).map((take) => take.visit);
+  await remove(facts.name);
+  return [refused, ...kept];
+}
+"""
+
+
+def test_on_a_full_phone_a_recording_keeps_the_facts_it_had(camera: Any, visit: int):
+    with filming(camera, visit) as page:
+        origin, cdp = page.evaluate("location.origin"), page.context.new_cdp_session(page)
+        cdp.send("Storage.overrideQuotaForOrigin", {"origin": origin, "quotaSize": 1_000_000})
+        assert page.evaluate(FACTS_THAT_DO_NOT_FIT) == ["QuotaExceededError", -1]
+
+
 def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     with filming(camera, visit, orientation=False) as page:
         page.get_by_text("does not report its orientation").wait_for()

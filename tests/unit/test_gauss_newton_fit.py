@@ -5,6 +5,7 @@ that one program serves each kind of session.
 """
 
 import dataclasses
+import operator
 import threading
 import time
 from collections.abc import Iterator
@@ -299,7 +300,7 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
 
 def test_more_sessions_than_lanes_are_each_as_alone(walkers, one_by_one, monkeypatch):
     """Two lanes for five sessions: who ended makes room, and the last one moves to a program of one."""
-    monkeypatch.setattr(lanes, "LANES", 2)
+    monkeypatch.setattr(lanes, "MOST_FRAMES", 2 * 128)
     monkeypatch.setattr(lanes, "FEW", 1)
     monkeypatch.setattr(lanes, "MOVED", 2)
     together = fit_sessions([*walkers, *walkers[:2]], PARAMSET, batch=5)
@@ -364,8 +365,30 @@ def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, m
     assert asked == [8]
 
 
+def test_two_solvers_share_the_sessions_of_a_gpu(walkers, monkeypatch):
+    """No session is lost or taken twice."""
+    taken = list[int]()
+
+    def solve(sessions, params, starts) -> Iterator[PblError]:
+        assert operator.length_hint(sessions) == 30  # enough to solve them side by side
+        for session, _ in zip(sessions, starts, strict=True):
+            taken.append(int(session.names[0]))
+            time.sleep(0.005)
+            yield UNSOLVED
+
+    monkeypatch.setattr(session_fit.jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(Method, "function", property(lambda _: solve))
+    monkeypatch.setattr(session_fit, "FIRST", 4)
+    given = [dataclasses.replace(walkers[0], names=[str(i)]) for i in range(30)]
+    assert fit_sessions(given, PARAMSET) == [UNSOLVED] * 30
+    assert sorted(taken) == list(range(30))
+
+
 def test_a_solver_that_forgets_a_session_is_an_error(walkers, monkeypatch):
     monkeypatch.setattr(Method, "function", property(lambda _: lambda sessions, *_: list(sessions)[1:]))
+    with pytest.raises(ValueError, match="a solution or an error for each"):
+        fit_sessions(walkers, PARAMSET, batch=3)
+    monkeypatch.setattr(Method, "function", property(lambda _: lambda sessions, *_: [*list(sessions), UNSOLVED]))
     with pytest.raises(ValueError, match="a solution or an error for each"):
         fit_sessions(walkers, PARAMSET, batch=3)
 

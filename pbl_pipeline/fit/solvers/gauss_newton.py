@@ -114,9 +114,9 @@ def minimise(
     same steps.
 
     `evaluate`: cost and its quadratic model at a state; `move`: the state after a step (F, Q) of the frames' unknowns
-    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence; `steps`: at most so
-    many steps now, for many problems side by side (`vmap`), because a loop that ends for each at another step copies
-    the state of all in each.
+    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence. `steps`: for many
+    problems side by side (`vmap`): so many passes, in which one that has ended stays as it is. A loop that ends for
+    each at another pass would copy all of `latest` once more in each.
     Each pass of the loop evaluates one state: a second copy of that program, for the start or for the cost alone, would
     double the time it takes to compile.
     """
@@ -160,7 +160,7 @@ def minimise(
             result=result.astype(jnp.int32),
             trace=p.trace.at[jnp.where(first, MOST_ITERATIONS, p.iteration)].set(cost, mode="drop"),
         )
-
+        # `latest`, which is large, was chosen above.
         after = jax.tree.map(lambda new, old: jnp.where(on, new, old), after, dataclasses.replace(p, latest=None))
         return dataclasses.replace(after, latest=latest)
 

@@ -27,12 +27,17 @@ onmessage = async ({ data: { id, what, name, at, bytes } }) => {
       files.get(name).close();
       files.delete(name);
     } else {  // put: a small file at once
-      const file = await opened(name);
+      const file = await opened(name), before = new Uint8Array(file.getSize());
       try {
-        write(file, bytes, 0);  // before it is cut: on a full phone what it held stays
+        file.read(before, { at: 0 });
+        write(file, bytes, 0);
         file.truncate(bytes.byteLength);
-        file.flush();
+      } catch (error) {  // a full phone: what it held stays
+        file.write(before, { at: 0 });
+        file.truncate(before.byteLength);
+        throw error;
       } finally {
+        file.flush();
         file.close();
       }
     }
