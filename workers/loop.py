@@ -271,7 +271,7 @@ class Worker:
             self.found.add(found)
             if found.queued or found.freed:
                 return True
-            # What another worker has queued since our last step, and not taken yet, is ours as well.
+            # Another worker may have queued a job since our last step and not taken it yet.
             ours = {} if self.limit is not None else self._conditions()
             return None if held or any(queue.most_urgent(t, where) is not None for t, where in ours.items()) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):

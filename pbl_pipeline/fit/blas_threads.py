@@ -23,7 +23,7 @@ def _controller() -> ThreadpoolController:
 
 
 _lock = threading.Lock()
-_inside: list[Any] = []  # one limit for each that is inside a block; the first one knows what was there before
+_inside: list[Any] = []  # the limit, once for each block that is entered; it knows the number of threads before
 
 
 @contextlib.contextmanager

@@ -51,7 +51,7 @@ def detector_blocks(
     u, each = detector.by_depth, detector.trials
     frames, markers = b.shape
     eye, n = jnp.eye(markers, dtype=b.dtype), G.shape[-1] - detector.by_lean.shape[-1]
-    # A sum in place of a product, for which `cross` would have to be stored.
+    # A sum instead of a product, for which `cross` would have to be stored.
     by_depth = jnp.swapaxes(jnp.sum(u[:, None, :, None] * cross, axis=2), 1, 2)
     Wu = jnp.einsum("fmij,fj->fmi", W, u)
     own = jnp.einsum("fmi,fi->fm", Wu, u)
