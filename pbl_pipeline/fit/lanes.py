@@ -15,16 +15,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pbl_pipeline.body import Body
 
 from .normal_equations import Linearised, linearise, moved
 from .problem import Problem, State
 from .solution import Outcome, outcome
-from .solvers.gauss_newton import MOST_ITERATIONS, Limits, Progress, before_first, minimise
+from .solvers.gauss_newton import Limits, Progress, before_first, goes_on, minimise
 from .solvers.linear import marginal_variance
-from .solvers.result import Result
 from .weights import Weights
 
 #: Lanes of a program: enough to fill a GPU, where an iteration takes longer with each lane from 16 on; and of the one
@@ -121,7 +120,8 @@ def fit_many(
     most, few = (min(n, max(1, MOST_FRAMES // frames)) for n in (LANES, FEW))
     new = [*new, *ready(most - 1)]
     holds = list[Task | None]([None] * (most if len(new) > few else few))
-    lanes, ended = (_begin(body, w, _stacked(new[:MOVED]), np.zeros(len(holds), int)) for _ in range(2))
+    empty = functools.partial(_begin, body, w, _stacked(new[:1]), np.zeros(len(holds), int))
+    lanes, ended = empty(), empty()
     room, slots = len(holds), list[Task]()  # of `ended`, and what they hold
     to_fetch = list[tuple[list[Task], tuple[Any, ...]]]()
 
@@ -136,7 +136,6 @@ def fit_many(
                 yield task, Found(*jax.tree.map(lambda a, k=k: a[k], here))
         to_fetch.clear()
 
-    bound = min(int(limits.iterations), MOST_ITERATIONS)
     while True:
         busy = [k for k, task in enumerate(holds) if task is not None]
         if len(busy) + len(new) < most:
@@ -158,11 +157,11 @@ def fit_many(
                 return
             yield from fetched()
             continue
-        lanes = lanes[0], _round(body, lanes[0], w, lanes[1], limits, ROUND)
+        at, on = _round(body, lanes[0], w, lanes[1], limits, ROUND)
+        lanes = lanes[0], at
         yield from fetched()  # while the device iterates
-        result, iteration = jax.device_get((lanes[1].result, lanes[1].iteration))
-        ends = (result != Result.BOUND) | (iteration >= bound)
-        over = [(k, task) for k, task in enumerate(holds) if task is not None and ends[k]]
+        going = jax.device_get(on)
+        over = [(k, task) for k, task in enumerate(holds) if task is not None and not going[k]]
         last = [(k, task) for k, task in over if task.last]
         others = [(k, task) for k, task in over if not task.last]
         if others:
@@ -213,9 +212,12 @@ def _placed(rows: Any, at: Any, given: Any) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="body", donate_argnames="at")
-def _round(body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, steps: Any) -> Progress:
-    """Some iterations more of each lane that has not ended."""
-    return jax.vmap(lambda p, at: fit_problem(body, p, w, at, limits, steps))(p, at)
+def _round(
+    body: Body, p: Problem, w: Weights, at: Progress, limits: Limits, steps: Any
+) -> tuple[Progress, Bool[Array, " lanes"]]:
+    """Some iterations more of each lane that has not ended, and which have not ended then."""
+    at = jax.vmap(lambda p, at: fit_problem(body, p, w, at, limits, steps))(p, at)
+    return at, goes_on(at, limits)
 
 
 @jax.jit

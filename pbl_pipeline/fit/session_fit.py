@@ -240,8 +240,9 @@ class _Work:
             return packed.session
 
         sessions = _Ready(take, min(self.most, len(self.sessions)))
+        beside = _Ready(lambda: starts.popleft() if starts else None)
         try:
-            for solution in self.method.function(sessions, self.method.params, _Ready(lambda: _next(starts))):
+            for solution in self.method.function(sessions, self.method.params, beside):
                 with self.changed:
                     if not unsolved:
                         raise self._miscounted()
@@ -275,10 +276,6 @@ class _Work:
             return _session_fit(packed, solution, self.method.paramset, self.sessions[packed.index])
         except PblError as error:
             return error
-
-
-def _next(waiting: deque[T]) -> T | None:
-    return waiting.popleft() if waiting else None
 
 
 class _Ready(Iterator[T]):

@@ -294,15 +294,20 @@ def test_a_take_whose_page_was_killed_is_still_there(camera: Any, visit: int):
     assert film_of(visit).n_frames > 30
 
 
-#: In the page: a recording is listed whenever that is asked for, also while its facts are written.
-FACTS_READ_WHILE_WRITTEN = """
+#: Begins a function for the page, with a recording of nine bytes and its facts.
+WITH_A_RECORDING = """
 async () => {
   const { all, keep, newFile, remove } = await import("/static/capture_takes.js");
-  const facts = {name: "take-read", visit: -1, made: 1, about: {}, log: null, complete: false};
+  const facts = {name: "take-test", visit: -1, made: 1, about: {}, log: null, complete: false};
   const file = await newFile(facts.name);
   await file.write(0, new Uint8Array(9));
   await file.close();
   await keep(facts);
+"""
+#: In the page: a recording is listed whenever that is asked for, also while its facts are written.
+FACTS_READ_WHILE_WRITTEN = (
+    WITH_A_RECORDING
+    + """
   let missing = 0;
   for (let n = 0; n < 300; n++) {
     const written = keep({...facts, log: "x".repeat(1e5 * (n % 3))});
@@ -314,6 +319,7 @@ async () => {
   return missing;
 }
 """
+)
 
 
 def test_a_recording_whose_facts_are_read_while_they_are_written_stays(camera: Any, visit: int):
@@ -322,20 +328,16 @@ def test_a_recording_whose_facts_are_read_while_they_are_written_stays(camera: A
 
 
 #: In the page, on a full phone: facts that do not fit are refused, and the recording is listed with those before.
-FACTS_THAT_DO_NOT_FIT = """
-async () => {
-  const { all, keep, newFile, remove } = await import("/static/capture_takes.js");
-  const facts = {name: "take-full", visit: -1, made: 1, about: {}, log: null, complete: false};
-  const file = await newFile(facts.name);
-  await file.write(0, new Uint8Array(9));
-  await file.close();
-  await keep(facts);
+FACTS_THAT_DO_NOT_FIT = (
+    WITH_A_RECORDING
+    + """
   const refused = await keep({...facts, visit: 7, log: "x".repeat(1e7)}).then(() => "", (error) => error.name);
   const kept = (await all()).filter((take) => take.name === facts.name).map((take) => take.visit);
   await remove(facts.name);
   return [refused, ...kept];
 }
 """
+)
 
 
 def test_on_a_full_phone_a_recording_keeps_the_facts_it_had(camera: Any, visit: int):

@@ -121,11 +121,8 @@ def minimise(
     double the time it takes to compile.
     """
 
-    def goes_on(p: Progress) -> Array:
-        return (p.result == Result.BOUND) & (p.iteration < jnp.minimum(limits.iterations, MOST_ITERATIONS))
-
     def step(p: Progress) -> Progress:
-        now, first, on = evaluate(p.candidate), p.iteration < 0, goes_on(p)
+        now, first, on = evaluate(p.candidate), p.iteration < 0, goes_on(p, limits)
         # Single precision: a change below the rounding of the sum does not refuse a step.
         accepted = on & (now.cost <= p.cost * (1 + 1e-6))
         better = accepted & ~first
@@ -166,7 +163,12 @@ def minimise(
 
     if steps is not None:
         return jax.lax.fori_loop(0, steps, lambda _, p: step(p), begin)
-    return jax.lax.while_loop(goes_on, step, begin)
+    return jax.lax.while_loop(lambda p: goes_on(p, limits), step, begin)
+
+
+def goes_on(p: Progress, limits: Limits) -> Array:
+    """False where the iteration has ended."""
+    return (p.result == Result.BOUND) & (p.iteration < jnp.minimum(limits.iterations, MOST_ITERATIONS))
 
 
 def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:
