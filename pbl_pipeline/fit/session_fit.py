@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import dataclasses
 import threading
@@ -141,7 +142,7 @@ class _Work:
         self.changed = threading.Condition()
         self.to_pack = deque(range(len(sessions)))
         self.packing = 0
-        self.packed = dict[Hashable, deque[_Packed]]()
+        self.packed = dict[Hashable, list[_Packed]]()
         self.taken_by = Counter[Hashable]()  # solvers that take sessions of a kind
         self.solved = deque[tuple[_Packed, Solution | PblError]]()
         self.left = len(sessions)  # without a result
@@ -184,7 +185,8 @@ class _Work:
             with self.changed:
                 self.packing -= given is None
                 if isinstance(done, _Packed):
-                    self.packed.setdefault(done.kind, deque()).append(done)
+                    # In their order, not that in which the threads are done with them.
+                    bisect.insort(self.packed.setdefault(done.kind, []), done, key=lambda packed: packed.index)
                 else:
                     self.out[i] = done
                     self.left -= 1
@@ -217,7 +219,7 @@ class _Work:
             waiting = self.packed.get(kind)
             if not waiting or self.failed:
                 return None
-            out = waiting.popleft()
+            out = waiting.pop(0)
             if not waiting:
                 del self.packed[kind]
             self.changed.notify_all()
