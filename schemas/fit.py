@@ -20,7 +20,7 @@ from . import keypoints, lab, session, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, check_columns, check_row, check_values, number, one
+from .rows import InputChanged, MadeOnce, check_columns, check_row, check_values, number, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -249,10 +249,8 @@ class SessionFit(dj.Computed):
         return super().populate(*restrictions, **options)
 
     def make_fetch(self, key: dict) -> tuple:
-        with_points = FitSet.proj("fit_set_kind") * FitSet.Video * keypoints.Keypoints.proj("keypoints_file")
-        rows = (with_points * video.Video & key).to_dicts(order_by="video_id")
-        recorded = FitSet.Video.proj() * video.MarkerRecording * video.Video & key
-        of_markers = [] if rows else recorded.to_dicts(order_by="video_id")
+        rows = (_recordings_with_points(FitSet) & key).to_dicts(order_by="video_id")
+        of_markers = [] if rows else (_marker_recordings(FitSet) & key).to_dicts(order_by="video_id")
         if not rows and not of_markers:
             raise InputChanged("no video of this set has keypoints any more")
         of_rig = bool(rows) and rows[0]["fit_set_kind"] == RIG
@@ -267,8 +265,7 @@ class SessionFit(dj.Computed):
                 raise InputChanged("a camera of this set has no keypoints any more")
             refs = [files[v["video_id"]] for v in own] or [files[r["video_id"]]]
             trials.append((r["video_id"], name, r["camera_motion"], refs, _rig(own)))
-        people = session.Session.proj("subject") * lab.Subject.proj("subject_height")
-        height_m = number(one(people & (FitSet & key).proj("session_id"), "subject_height"))
+        height_m = number(one(_people(FitSet) & key, "subject_height"))
         table = None
         if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
             table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
@@ -296,7 +293,7 @@ class SessionFit(dj.Computed):
     ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
         """Several sets in one call of the library: for each what `make_compute` returns, None if it would raise.
 
-        A worker with a GPU fits a batch so, and hands each result to the table's own make.
+        A worker with a GPU fits a batch so, beside another one, and hands each result to the table's own make.
         """
         from pbl_pipeline.fit import fit_sessions
 
@@ -311,7 +308,7 @@ class SessionFit(dj.Computed):
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
-            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][-1]))
+            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][-1]), threads=1)
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):
@@ -384,6 +381,22 @@ class SessionFit(dj.Computed):
                     }
                 )
         self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+
+
+@MadeOnce
+def _recordings_with_points(sets: Any) -> Any:
+    own = sets.proj("fit_set_kind") * sets.Video
+    return own * keypoints.Keypoints.proj("keypoints_file") * video.Video
+
+
+@MadeOnce
+def _marker_recordings(sets: Any) -> Any:
+    return sets.Video.proj() * video.MarkerRecording * video.Video
+
+
+@MadeOnce
+def _people(sets: Any) -> Any:
+    return sets.proj("session_id") * session.Session.proj("subject") * lab.Subject.proj("subject_height")
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:

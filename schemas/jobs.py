@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 import pymysql
@@ -12,6 +12,7 @@ from pbl_pipeline.errors import PblError
 from .chain import computed_tables
 from .datajoint_setup import AccessError
 from .job_errors import error_code
+from .rows import MadeOnce
 
 #: Additional columns of DataJoint's job table, 0 for each new job, with their meaning.
 COUNTS = {
@@ -22,31 +23,25 @@ COUNTS = {
 #: The server's number of "duplicate column name": another process was quicker.
 _THERE_ALREADY = 1060
 
-_jobs: dict[Any, Any] = {}
-_sources: dict[Any, Any] = {}
 
-
+@MadeOnce
 def keys_of(table: Any) -> Any:
-    """Query of the keys that can be computed for a table (class), made once for a connection: DataJoint reads the
-    columns of the tables above for it."""
-    return _kept(_sources, table, lambda: table().key_source)
+    """Query of the keys that can be computed for a table (class)."""
+    return table().key_source
 
 
+@MadeOnce
 def jobs_of(table: Any) -> Any:
-    """The job table of a computed table (class), made once: DataJoint reads every foreign key of the server for it.
+    """The job table of a computed table (class), for which DataJoint reads every foreign key of the server.
 
     It is declared where it is missing, and gets the columns of `COUNTS`; an account that may not declare relies on
     `schemas.operations.declare.declare_all`. Both end a transaction that is open.
     """
-
-    def declared() -> Any:
+    jobs = table.jobs
+    if missing := [name for name in COUNTS if name not in jobs.heading.names]:
+        _add(jobs, missing)
         jobs = table.jobs
-        if missing := [name for name in COUNTS if name not in jobs.heading.names]:
-            _add(jobs, missing)
-            jobs = table.jobs
-        return jobs
-
-    return _kept(_jobs, table, declared)
+    return jobs
 
 
 def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
@@ -59,13 +54,6 @@ def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
         for row in (jobs.errors & {"video_id": video_id}).to_dicts():
             if codes is None or error_code(row["error_message"]) in codes:
                 (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()
-
-
-def _kept(made: dict[Any, Any], table: Any, make: Callable[[], Any]) -> Any:
-    """Return the cached object of a table, made again if the tables have another connection since."""
-    if table not in made or made[table].connection is not table().connection:
-        made[table] = make()
-    return made[table]
 
 
 def _add(jobs: Any, names: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,20 @@ class InputChanged(PblError):
             next_step="`pbl retry` once the row is there again (`pbl db restore`, `pbl ingest`, or another method)",
             key=key,
         )
+
+
+class MadeOnce:
+    """Decorator of a function that makes a query of a table (class): called once, and again where the tables have
+    another connection since. DataJoint takes milliseconds to put a query of several tables together."""
+
+    def __init__(self, make: Callable[[Any], Any]) -> None:
+        self._make, self.made = make, dict[Any, Any]()
+        functools.update_wrapper(self, make)
+
+    def __call__(self, table: Any) -> Any:
+        if table not in self.made or self.made[table].connection is not table().connection:
+            self.made[table] = self._make(table)
+        return self.made[table]
 
 
 def one(query: Any, *columns: str) -> Any:

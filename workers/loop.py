@@ -32,7 +32,7 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
     Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the
     next batch waiting. A job that the batch could not compute is computed alone.
     """
-    table, n = first[0].table, _threads()
+    table, n = first[0].table, _at_once(worker)
     with ThreadPoolExecutor(max_workers=n, thread_name_prefix="fits") as device:
         waiting = deque([(first, _start(device, first))])
         while waiting:
@@ -58,12 +58,12 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
             worker.follow(ended)
 
 
-def _threads() -> int:
+def _at_once(worker: Worker) -> int:
     """Return how many batches are computed at a time: two on a GPU, so that one is packed and unpacked on the host
-    while the other is solved; a CPU does both itself."""
+    while the other is solved; a CPU does both itself, and processes that share a GPU fill it together."""
     import jax
 
-    return 1 if jax.default_backend() == "cpu" else 2
+    return 1 if worker.shares_gpu or jax.default_backend() == "cpu" else 2
 
 
 def _start(device: ThreadPoolExecutor, jobs: list[Claim]) -> Future[list[Computed | None]]:
@@ -107,7 +107,8 @@ class Worker:
     limit: most jobs of each table. found: what its looks at the tables, and its jobs, made computable. only: takes no
     job but of these recordings; called before each look, as sets come and go. takes: condition on its jobs (`takes`).
     phone: looks often, and for nothing but jobs that are queued. long_waits: called where no job is more urgent than
-    that of a long recording, which another process takes. siblings: other processes of this machine also work.
+    that of a long recording, which another process takes. siblings: other processes of this machine also work;
+    shares_gpu: and fit on the same GPU.
     """
 
     tables: Sequence[Any]
@@ -121,6 +122,7 @@ class Worker:
     phone: bool = False
     long_waits: Callable[[], None] | None = None
     siblings: bool = False
+    shares_gpu: bool = False
     done: int = 0
     failed: int = 0
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)

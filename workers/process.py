@@ -155,6 +155,7 @@ def work(options: Options, pipe: Connection) -> None:
             tables, beats, stop, report, options.batch, takes=takes, phone=options.phone or options.long
         )
         worker.siblings = options.processes > 1 and not options.long
+        worker.shares_gpu = worker.siblings and options.resource == "gpu"
         if options.short:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)

@@ -8,6 +8,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import deepdiff
 import pymysql
@@ -135,22 +136,33 @@ class _Attempt:
             return ALREADY
         if not _is_wanted(self.job):
             return VANISHED
-        fetched = table.make_fetch(dict(key))
-        if self.computed is None or not self.computed.of(fetched):
-            self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
+        before = computed = self.computed
+        if computed is None:
+            fetched = table.make_fetch(dict(key))
+            self.computed = computed = Computed(fetched, table.make_compute(dict(key), *fetched))
+        try:
+            self._insert(table, key, computed)
+        except InputChanged:
+            if before is None:
+                raise
+            self.computed = None
+            return self.make()
+        return DONE
+
+    def _insert(self, table: Any, key: dict[str, Any], computed: Computed) -> None:
+        """Insert what was computed. Raises InputChanged if its inputs are not the same any longer."""
         with table.connection.transaction:
             queued_s = queue.lock_reservation(self.job)
-            if not self.computed.of(table.make_fetch(dict(key))):
+            if not computed.of(table.make_fetch(dict(key))):
                 raise InputChanged("other rows than before the computation", self.job)
             remove_left_over(table, key, queued_s)
             try:
                 with inserting(table):
-                    table.make_insert(dict(key), *self.computed.result)
+                    table.make_insert(dict(key), *computed.result)
             except BaseException as error:
                 if not is_gone(error):  # then another worker may have the job; the next insert removes them
                     remove_left_over(table, key, queued_s)
                 raise
-        return DONE
 
 
 def _is_wanted(job: Claim) -> bool:

@@ -39,11 +39,9 @@ from .vertical import upright
 #: Sessions of the same sizes that are enough for a solver to begin: it takes more as they are packed, of which at most
 #: twice as many wait.
 FIRST = 16
-#: Solvers at a time on a GPU: while the host works for one, the device iterates for the other.
-SOLVERS = 2
-#: Threads that pack sessions and make their results. More of them hold the interpreter when the solvers need it: 256
-#: sessions on an H100 take 4.1 s with two, 4.4 with four, 5.8 with eight.
-PACKERS = 2
+#: Solvers at a time on a GPU: while the host works for one, the device iterates for the other; and threads that pack
+#: sessions and make their results. More of them hold the interpreter when the solvers need it.
+THREADS = 2
 
 
 T = TypeVar("T")
@@ -100,20 +98,22 @@ def fit_sessions(
     sessions: Sequence[SessionInput],
     paramset: Method[Params] | Paramset | Params | str | None = None,
     batch: int | None = None,
+    threads: int = THREADS,
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
     A session that cannot be fitted has its `PblError` in its place. `batch`: most sessions in one call of the solver
-    (default: all on a GPU; 1 on a CPU, which gains nothing by more); `implicit-adam` takes one at a time.
+    (default: all on a GPU; 1 on a CPU, which gains nothing by more); `implicit-adam` takes one at a time. `threads`:
+    that solve on a GPU, and as many that pack; fewer where other calls fit on it at the same time.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
     on_cpu = jax.default_backend() == "cpu"
     work = _Work(sessions, METHODS.find(paramset), max(batch or (1 if on_cpu else len(sessions)), 1))
     load_body()  # before the threads, each of which would load its own body and compile for it
-    jobs = [work.solve] * (1 if on_cpu else SOLVERS) + [work.pack_and_finish] * PACKERS
-    with ThreadPoolExecutor(len(jobs)) as threads, work.ends_with_error():
-        for ended in [threads.submit(work.guarded, job) for job in jobs]:
+    jobs = [work.solve] * (1 if on_cpu else threads) + [work.pack_and_finish] * threads
+    with ThreadPoolExecutor(len(jobs)) as pool, work.ends_with_error():
+        for ended in [pool.submit(work.guarded, job) for job in jobs]:
             ended.result()  # raises what was raised there
     return [r for r in work.out if r is not None]
 

@@ -26,10 +26,10 @@ def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> C
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
     gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
     assert gpu_worker.queue_fits(0) == N
-    monkeypatch.setattr(loop, "_threads", lambda: 2)
+    monkeypatch.setattr(loop, "_at_once", lambda worker: 2)
 
     def worker(solve: Callable[[int], None]) -> Worker:
-        def fit_sessions(given, paramset=None, batch=None):
+        def fit_sessions(given, paramset=None, **_):
             solve(len(given))
             return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in given]
 

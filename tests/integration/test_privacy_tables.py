@@ -39,10 +39,10 @@ def find_heads(video: Path, params: object, info: VideoInfo) -> Heads:
 def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     schemas.activate()
     monkeypatch.setattr(pbl_pipeline.deidentify.video_copy, "find_heads", find_heads)
-    jobs._sources.pop(privacy.Deidentified, None)
+    jobs.keys_of.made.pop(privacy.Deidentified, None)
     yield monkeypatch
     remove_all()
-    jobs._sources.pop(privacy.Deidentified, None)  # made once for a process, whose setting does not change
+    jobs.keys_of.made.pop(privacy.Deidentified, None)  # made once for a process, whose setting does not change
 
 
 def films(folder: Path, *names: str) -> list[Path]:
@@ -106,7 +106,7 @@ def test_a_worker_without_the_setting_says_so(tables, tmp_path: Path):
     tables.setenv("PBL_DEIDENTIFY", "blur")
     register(*films(tmp_path, "walk"))
     populate(["VideoInfo"])
-    jobs._sources.pop(privacy.Deidentified, None)
+    jobs.keys_of.made.pop(privacy.Deidentified, None)
     source = privacy.Deidentified().key_source
     tables.setattr(privacy.Deidentified, "key_source", property(lambda _: source))
     tables.setenv("PBL_DEIDENTIFY", "")

@@ -198,7 +198,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     assert fit.SessionFit.Trial().to_arrays("video_id").tolist() == [1]
     # A worker with a GPU hands a batch over.
     batch: list = []
-    rig.setattr(pbl_pipeline.fit, "fit_sessions", lambda given, paramset: batch.extend(given) or [REFUSED])
+    rig.setattr(pbl_pipeline.fit, "fit_sessions", lambda given, *_, **__: batch.extend(given) or [REFUSED])
     (key,) = fit.FitSelection().keys()
     assert fit.SessionFit().make_computes([key], [fit.SessionFit().make_fetch(key)]) == [None]
     assert [t.cameras for t in batch[0].trials] == [CAMERAS]

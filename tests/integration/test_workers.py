@@ -72,7 +72,7 @@ def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: N
 def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch):
     batches = []
 
-    def fit_sessions(sessions, paramset=None, batch=None):
+    def fit_sessions(sessions, paramset=None, **_):
         batches.append(len(sessions))
         return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in sessions]
 
