@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import bisect
-import contextlib
 import dataclasses
-import threading
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -25,10 +19,11 @@ from pbl_pipeline.video import Camera
 
 from .checks import check_fit
 from .known_height import in_metres
+from .many_sessions import Packed, Work
 from .methods import METHODS
 from .params import Params
 from .per_frame import start_of
-from .problem import State, pixels_alone
+from .problem import pixels_alone
 from .results import SessionFit, TrialFit
 from .rotations import quat_wxyz
 from .session import Session, Trial, make_session
@@ -36,15 +31,9 @@ from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
 
-#: Sessions of the same sizes that are enough for a solver to begin: it takes more as they are packed, of which at most
-#: twice as many wait.
-FIRST = 16
 #: Solvers at a time on a GPU: while the host works for one, the device iterates for the other; and threads that pack
 #: sessions and make their results. More of them hold the interpreter when the solvers need it.
 THREADS = 2
-
-
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,191 +97,22 @@ def fit_sessions(
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
-    on_cpu = jax.default_backend() == "cpu"
-    work = _Work(sessions, METHODS.find(paramset), max(batch or (1 if on_cpu else len(sessions)), 1))
-    load_body()  # before the threads, each of which would load its own body and compile for it
-    jobs = [work.solve] * (1 if on_cpu else threads) + [work.pack_and_finish] * threads
-    with ThreadPoolExecutor(len(jobs)) as pool, work.ends_with_error():
-        for ended in [pool.submit(work.guarded, job) for job in jobs]:
-            ended.result()  # raises what was raised there
-    return [r for r in work.out if r is not None]
+    on_cpu, method = jax.default_backend() == "cpu", METHODS.find(paramset)
 
-
-@dataclasses.dataclass(frozen=True)
-class _Packed:
-    """A session ready for a solver, with its start; `seconds`: time that packing took; `kind`: the same for sessions of
-    the same sizes and terms, which a solver can take together."""
-
-    index: int
-    session: Session
-    start: State
-    seconds: float
-    kind: Hashable
-
-
-class _Work:
-    """The sessions of a call on their way through its threads: those that pack also make the results of what the
-    others have solved."""
-
-    def __init__(self, sessions: Sequence[SessionInput], method: Method[Params], most: int) -> None:
-        self.sessions, self.method, self.most = sessions, method, most
-        self.enough = min(most, FIRST)
-        self.out: list[SessionFit | PblError | None] = [None] * len(sessions)
-        #: Guards what follows.
-        self.changed = threading.Condition()
-        self.to_pack = deque(range(len(sessions)))
-        self.packing = 0
-        self.packed = dict[Hashable, list[_Packed]]()
-        self.taken_by = Counter[Hashable]()  # solvers that take sessions of a kind
-        self.solved = deque[tuple[_Packed, Solution | PblError]]()
-        self.left = len(sessions)  # without a result
-        self.failed = False
-
-    @contextlib.contextmanager
-    def ends_with_error(self) -> Iterator[None]:
-        """An error inside ends all threads."""
-        try:
-            yield
-        except BaseException:
-            with self.changed:
-                self.failed = True
-                self.changed.notify_all()
-            raise
-
-    def guarded(self, job: Callable[[], None]) -> None:
-        with self.ends_with_error():
-            job()
-
-    @property
-    def _over(self) -> bool:
-        return self.failed or not self.left
-
-    @property
-    def _full(self) -> bool:
-        return sum(map(len, self.packed.values())) + self.packing >= 2 * self.enough
-
-    def pack_and_finish(self) -> None:
-        """Make results where a solution waits, else pack the next session."""
-        while True:
-            with self.changed:
-                self.changed.wait_for(lambda: self._over or self.solved or (self.to_pack and not self._full))
-                if self._over:
-                    return
-                given = self.solved.popleft() if self.solved else None
-                self.packing += given is None
-                i = given[0].index if given else self.to_pack.popleft()
-            done = self._pack(i) if given is None else self._finish(*given)
-            with self.changed:
-                self.packing -= given is None
-                if isinstance(done, _Packed):
-                    # In their order, not that in which the threads are done with them.
-                    bisect.insort(self.packed.setdefault(done.kind, []), done, key=lambda packed: packed.index)
-                else:
-                    self.out[i] = done
-                    self.left -= 1
-                self.changed.notify_all()
-
-    def solve(self) -> None:
-        """Give the solver sessions of one kind after the other."""
-        while (begin := self._begin_kind()) is not None:
-            self._solve_kind(begin)
-
-    def _begin_kind(self) -> _Packed | None:
-        """One of the kind of which most are packed, once these are enough; or all there will be, of a kind that no
-        other solver is taking. None at the end."""
-
-        def kinds() -> list[Hashable]:
-            last = self._full or not (self.to_pack or self.packing)
-            return [k for k, p in self.packed.items() if len(p) >= self.enough or (last and not self.taken_by[k])]
-
-        with self.changed:
-            self.changed.wait_for(lambda: self._over or kinds())
-            if self._over:
-                return None
-            kind = max(kinds(), key=lambda k: len(self.packed[k]))
-            self.taken_by[kind] += 1
-            return self._take(kind)
-
-    def _take(self, kind: Hashable) -> _Packed | None:
-        """One that is packed now."""
-        with self.changed:
-            waiting = self.packed.get(kind)
-            if not waiting or self.failed:
-                return None
-            out = waiting.pop(0)
-            if not waiting:
-                del self.packed[kind]
-            self.changed.notify_all()
-            return out
-
-    def _solve_kind(self, begin: _Packed) -> None:
-        """Give the solver a session, and others of its kind as long as it asks and they are packed."""
-        kind, taken, unsolved, starts = begin.kind, 0, deque[_Packed](), deque[State]()
-
-        def take() -> Session | None:
-            nonlocal taken
-            packed = begin
-            if taken == self.most:
-                return None
-            if taken and (packed := self._take(kind)) is None:
-                return None
-            taken += 1
-            unsolved.append(packed)
-            starts.append(packed.start)
-            return packed.session
-
-        sessions = _Ready(take, min(self.most, len(self.sessions)))
-        beside = _Ready(lambda: starts.popleft() if starts else None)
-        try:
-            for solution in self.method.function(sessions, self.method.params, beside):
-                with self.changed:
-                    if not unsolved:
-                        raise self._miscounted()
-                    self.solved.append((unsolved.popleft(), solution))
-                    self.changed.notify_all()
-        finally:
-            with self.changed:
-                self.taken_by[kind] -= 1
-                self.changed.notify_all()
-        if (unsolved or not taken) and not self.failed:
-            raise self._miscounted()
-
-    def _miscounted(self) -> ValueError:
-        return ValueError(f"{self.method.key} did not return a solution or an error for each session that it took")
-
-    def _pack(self, i: int) -> _Packed | PblError:
-        begin, given = time.perf_counter(), self.sessions[i]
-        try:
-            check_height(given.height_m)
-            session = make_session(given.trials, given.names, self.method.params, _motions(given), given.markers)
-        except PblError as error:
-            return error
+    def pack(i: int) -> Packed:
+        begin, given = time.perf_counter(), sessions[i]
+        check_height(given.height_m)
+        session = make_session(given.trials, given.names, method.params, _motions(given), given.markers)
         shapes = tuple(a.shape for a in jax.tree.leaves(session.problem))
         kind = shapes, pixels_alone(session.problem), type(session.trials[0])
-        return _Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
+        return Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
 
-    def _finish(self, packed: _Packed, solution: Solution | PblError) -> SessionFit | PblError:
-        if isinstance(solution, PblError):
-            return solution
-        try:
-            return _session_fit(packed, solution, self.method.paramset, self.sessions[packed.index])
-        except PblError as error:
-            return error
+    def finish(packed: Packed, solution: Solution) -> SessionFit:
+        return _session_fit(packed, solution, method.paramset, sessions[packed.index])
 
-
-class _Ready(Iterator[T]):
-    """What is ready: ends where nothing is, and may have more when it is asked again, up to `most`."""
-
-    def __init__(self, take: Callable[[], T | None], most: int = 0) -> None:
-        self._take, self._most = take, most
-
-    def __next__(self) -> T:
-        if (item := self._take()) is None:
-            raise StopIteration
-        return item
-
-    def __length_hint__(self) -> int:
-        return self._most
+    load_body()  # before the threads, each of which would load its own body and compile for it
+    most = max(batch or (1 if on_cpu else len(sessions)), 1)
+    return Work(len(sessions), pack, method, finish, most).run(1 if on_cpu else threads, threads)
 
 
 def _motions(given: SessionInput) -> list[str]:
@@ -313,7 +133,7 @@ def check_trial(
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 
 
-def _session_fit(packed: _Packed, solution: Solution, paramset: Paramset, given: SessionInput) -> SessionFit:
+def _session_fit(packed: Packed, solution: Solution, paramset: Paramset, given: SessionInput) -> SessionFit:
     begin, session, motions = time.perf_counter(), packed.session, _motions(given)
     used = np.asarray(session.problem.weight) > 0
     finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))

@@ -25,6 +25,7 @@ from pbl_pipeline.fit import (
     fit_session,
     fit_sessions,
     lanes,
+    many_sessions,
     per_frame,
     problem,
     session_fit,
@@ -360,7 +361,7 @@ def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, m
 
     monkeypatch.setattr(Method, "function", property(lambda _: solve))
     monkeypatch.setattr(session_fit, "_session_fit", result)
-    monkeypatch.setattr(session_fit, "FIRST", 1)
+    monkeypatch.setattr(many_sessions, "FIRST", 1)
     assert fit_sessions([walkers[0]] * 8, PARAMSET, batch=8) == [UNSOLVED] * 8
     assert asked == [8]
 
@@ -378,7 +379,7 @@ def test_two_solvers_share_the_sessions_of_a_gpu(walkers, monkeypatch):
 
     monkeypatch.setattr(session_fit.jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(Method, "function", property(lambda _: solve))
-    monkeypatch.setattr(session_fit, "FIRST", 4)
+    monkeypatch.setattr(many_sessions, "FIRST", 4)
     given = [dataclasses.replace(walkers[0], names=[str(i)]) for i in range(30)]
     assert fit_sessions(given, PARAMSET) == [UNSOLVED] * 30
     assert sorted(taken) == list(range(30))
