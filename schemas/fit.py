@@ -289,11 +289,12 @@ class SessionFit(dj.Computed):
         return result, [t[0] for t in trials], method["sha"]
 
     def make_computes(
-        self, keys: Sequence[dict], fetched: Sequence[tuple]
+        self, keys: Sequence[dict], fetched: Sequence[tuple], threads: int | None = None
     ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
         """Several sets in one call of the library: for each what `make_compute` returns, None if it would raise.
 
-        A worker with a GPU fits a batch so, beside another one, and hands each result to the table's own make.
+        A worker with a GPU fits a batch so, and hands each result to the table's own make. threads: as for
+        `fit_sessions`.
         """
         from pbl_pipeline.fit import fit_sessions
 
@@ -308,7 +309,7 @@ class SessionFit(dj.Computed):
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
-            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][-1]), threads=1)
+            results = fit_sessions(sessions, methods.stored(**fetched[rows[0]][-1]), threads=threads)
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):

@@ -32,12 +32,12 @@ def run_fits(first: list[Claim], worker: Worker, where: str | None = None) -> No
     Threads compute and touch no database; this one reserves, fetches and inserts, so that the device always has the
     next batch waiting. A job that the batch could not compute is computed alone.
     """
-    table, n = first[0].table, _at_once(worker)
+    table, n, threads = first[0].table, _at_once(worker), 1 if worker.shares_gpu else None
     with ThreadPoolExecutor(max_workers=n, thread_name_prefix="fits") as device:
-        waiting = deque([(first, _start(device, first))])
+        waiting = deque([(first, _start(device, first, threads))])
         while waiting:
             while len(waiting) <= n and not worker.stop.is_set() and (more := queue.claim(table, worker.batch, where)):
-                waiting.append((more, _start(device, more)))
+                waiting.append((more, _start(device, more, threads)))
             batch, result = waiting.popleft()
             worker.heartbeat.doing(f"{table.__name__}: batch of {len(batch)}")
             for job in batch:
@@ -66,10 +66,10 @@ def _at_once(worker: Worker) -> int:
     return 1 if worker.shares_gpu or jax.default_backend() == "cpu" else 2
 
 
-def _start(device: ThreadPoolExecutor, jobs: list[Claim]) -> Future[list[Computed | None]]:
+def _start(device: ThreadPoolExecutor, jobs: list[Claim], threads: int | None) -> Future[list[Computed | None]]:
     """Fetch the inputs here, compute there."""
     fetched = run_job.fetch_batch(jobs)
-    return device.submit(run_job.compute_batch, jobs, fetched)
+    return device.submit(run_job.compute_batch, jobs, fetched, threads)
 
 
 log = logging.getLogger("pbl.worker")

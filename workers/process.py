@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
-import math
 import os
 import signal
 import subprocess
@@ -82,6 +81,11 @@ class Options:
         """Number of processes, with the one for phones, which is the last."""
         return self.processes + self.phones
 
+    @property
+    def shares_gpu(self) -> bool:
+        """Of one process: True if others fit on its GPU."""
+        return bool(self.gpus) and self.processes > 1 and registry.GROUPS[self.resource] == (registry.FIT,)
+
     def of_process(self, number: int) -> Options:
         """The options of one of the processes: its GPU, and how many processes share that; the last of several is for
         short recordings, so that long ones never hold them all; beside a lone one the number after the one for phones
@@ -96,7 +100,7 @@ class Options:
         n = len(self.gpus)
         # A fit takes gigabytes of a GPU, and one process fits more sessions than many can detect.
         resource = "cpu" if self.resource == "all" and n <= number < self.processes else self.resource
-        gpus, sharing = (self.gpus[number % n],), 2 if self.lone else math.ceil(self.processes / n)
+        gpus, sharing = (self.gpus[number % n],), 2 if self.lone else len(range(number % n, self.processes, n))
         return dataclasses.replace(one, resource=resource, gpus=gpus, processes=sharing)
 
 
@@ -155,7 +159,7 @@ def work(options: Options, pipe: Connection) -> None:
             tables, beats, stop, report, options.batch, takes=takes, phone=options.phone or options.long
         )
         worker.siblings = options.processes > 1 and not options.long
-        worker.shares_gpu = worker.siblings and options.resource == "gpu"
+        worker.shares_gpu = options.shares_gpu
         if options.short:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)

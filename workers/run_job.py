@@ -146,8 +146,9 @@ class _Attempt:
             if before is None:
                 raise
             self.computed = None
-            return self.make()
-        return DONE
+        else:
+            return DONE
+        return self.make()
 
     def _insert(self, table: Any, key: dict[str, Any], computed: Computed) -> None:
         """Insert what was computed. Raises InputChanged if its inputs are not the same any longer."""
@@ -264,7 +265,9 @@ def fetch_batch(jobs: Sequence[Claim]) -> list[tuple | None]:
     return out
 
 
-def compute_batch(jobs: Sequence[Claim], fetched: Sequence[tuple | None]) -> list[Computed | None]:
+def compute_batch(
+    jobs: Sequence[Claim], fetched: Sequence[tuple | None], threads: int | None = None
+) -> list[Computed | None]:
     """Compute several jobs together (`make_computes` of their table); touches no database.
 
     The result is None for a job without inputs or of a batch that fails: it is then run alone and reports its own
@@ -273,7 +276,8 @@ def compute_batch(jobs: Sequence[Claim], fetched: Sequence[tuple | None]) -> lis
     out: list[Computed | None] = [None] * len(jobs)
     good = [i for i, f in enumerate(fetched) if f is not None]
     try:
-        results = jobs[0].table().make_computes([dict(jobs[i].key) for i in good], [fetched[i] for i in good])
+        keys = [dict(jobs[i].key) for i in good]
+        results = jobs[0].table().make_computes(keys, [fetched[i] for i in good], threads)
     except Exception:  # noqa: BLE001
         return out
     for i, result in zip(good, results, strict=True):

@@ -87,13 +87,13 @@ def fit_sessions(
     sessions: Sequence[SessionInput],
     paramset: Method[Params] | Paramset | Params | str | None = None,
     batch: int | None = None,
-    threads: int = THREADS,
+    threads: int | None = None,
 ) -> list[SessionFit | PblError]:
     """Fit many sessions; those packed to the same sizes go through the device together, with the same results.
 
     A session that cannot be fitted has its `PblError` in its place. `batch`: most sessions in one call of the solver
     (default: all on a GPU; 1 on a CPU, which gains nothing by more); `implicit-adam` takes one at a time. `threads`:
-    that solve on a GPU, and as many that pack; fewer where other calls fit on it at the same time.
+    that solve on a GPU, and as many that pack (default: `THREADS`); fewer where other processes fit on it as well.
 
     Raises `PblError` SOLVER_UNKNOWN.
     """
@@ -111,7 +111,7 @@ def fit_sessions(
         return _session_fit(packed, solution, method.paramset, sessions[packed.index])
 
     load_body()  # before the threads, each of which would load its own body and compile for it
-    most = max(batch or (1 if on_cpu else len(sessions)), 1)
+    most, threads = max(batch or (1 if on_cpu else len(sessions)), 1), threads or THREADS
     return Work(len(sessions), pack, method, finish, most).run(1 if on_cpu else threads, threads)
 
 

@@ -54,7 +54,7 @@ def fit(method: str, first: int, step: int) -> None:
     """Fit every session of this process from a first one on. Raises the `PblError` of one that cannot be fitted."""
     from pbl_pipeline.fit import fit_sessions
 
-    for found in fit_sessions(_sessions[first::step], method, **{"threads": 1} if step > 1 else {}):
+    for found in fit_sessions(_sessions[first::step], method, threads=1 if step > 1 else None):
         if isinstance(found, PblError):
             raise found
 

@@ -41,8 +41,8 @@ JITTER_PX, JITTER_M = 1.0, 0.005
 FIRST = 1
 #: Seconds between two readings of the device's own counter.
 SAMPLE_S = 0.5
-#: Batches that a process has at most: computed, waiting, and being written.
-IN_HAND = 4
+#: Batches that a process has at most: computed, waiting or being written.
+IN_HAND = 3
 
 #: When (`time.monotonic`), and percent of the time in which a kernel ran.
 Reading = tuple[float, float]
@@ -256,9 +256,11 @@ def main(sessions: int, warm_up: int, batches: str, processes: str, seconds: str
         put_sessions(home, plans(warm_up + sessions + after, [float(s) for s in seconds.split(",")], alike))
         del os.environ["JAX_PLATFORMS"]
         for options in runs:
-            queue_fits(warm_up)
+            queued = queue_fits(warm_up)
             started = time.monotonic()
             ends, readings = run(options)
+            if len(ends) != queued:  # a process died with some in hand
+                raise SystemExit(f"{queued - len(ends)} of {queued} sessions were not fitted at the first attempt")
             begin, end = ends[warm_up - 1], ends[warm_up + sessions - 1]
             busy = [percent for time_s, percent in readings if begin <= time_s <= end]
             device = (fit.SessionFit & "fit_seconds >= 0").to_arrays("compute_device")[0]

@@ -1,6 +1,7 @@
 """Batches of fits on two threads: each session once, two batches at a time, and what becomes of them at the end."""
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,11 +27,11 @@ def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> C
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
     gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
     assert gpu_worker.queue_fits(0) == N
-    monkeypatch.setattr(loop, "_at_once", lambda worker: 2)
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
 
-    def worker(solve: Callable[[int], None]) -> Worker:
-        def fit_sessions(given, paramset=None, **_):
-            solve(len(given))
+    def worker(solve: Callable[..., None]) -> Worker:
+        def fit_sessions(given, paramset, **options):
+            solve(len(given), **options)
             return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in given]
 
         monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
@@ -46,8 +47,8 @@ def jobs() -> dict[str, int]:
 def test_two_batches_are_computed_at_a_time_and_each_session_once(sessions):
     together, sizes = threading.Barrier(2, timeout=120), []
 
-    def solve(n: int) -> None:
-        sizes.append(n)
+    def solve(n: int, threads: int | None) -> None:
+        sizes.append(n if threads is None else -1)
         together.wait()  # breaks, and with it the batch, where no other one is being computed
 
     worker = sessions(solve)
@@ -62,9 +63,25 @@ def test_two_batches_are_computed_at_a_time_and_each_session_once(sessions):
     assert jobs() == {}
 
 
+def test_one_that_shares_its_gpu_computes_one_batch_at_a_time(sessions):
+    busy, seen = threading.Lock(), []
+
+    def solve(n: int, threads: int | None) -> None:
+        alone = busy.acquire(blocking=False)
+        time.sleep(0.05)  # the main thread has the next batch ready
+        seen.append((n, threads, alone))
+        busy.release()
+
+    worker = sessions(solve)
+    worker.shares_gpu = True
+    loop.run_fits(queue.claim(fit.SessionFit, 2), worker)
+    assert seen == [(2, 1, True), (2, 1, True), (2, 1, True), (1, 1, True)]
+    assert (worker.done, worker.failed) == (N, 0)
+
+
 def test_told_to_stop_it_ends_what_it_has_and_takes_no_more(sessions):
     computed = []
-    worker = sessions(computed.append)
+    worker = sessions(lambda n, **_: computed.append(n))
 
     def stop(job, outcome) -> None:
         if outcome is not None:
@@ -78,7 +95,7 @@ def test_told_to_stop_it_ends_what_it_has_and_takes_no_more(sessions):
 
 
 def test_told_to_end_at_once_it_puts_all_back(sessions):
-    worker = sessions(lambda n: None)
+    worker = sessions(lambda n, **_: None)
 
     def end(*_: object) -> None:
         raise SystemExit(0)
@@ -92,7 +109,7 @@ def test_told_to_end_at_once_it_puts_all_back(sessions):
 
 
 def test_a_database_that_is_away_between_two_batches_leaves_no_job_behind(sessions, monkeypatch):
-    worker, claim, asked = sessions(lambda n: None), queue.claim, []
+    worker, claim, asked = sessions(lambda n, **_: None), queue.claim, []
 
     def away_once(table, n=1, only=None):
         asked.append(n)

@@ -233,7 +233,7 @@ def _unbind(patch: pytest.MonkeyPatch) -> None:
     """The classes as a new process has them: what they know of another server's tables must not count here."""
     from schemas.chain import tables
 
-    patch.setattr(jobs, "_jobs", {})
+    patch.setattr(jobs.jobs_of, "made", {})
     patch.setattr(schemas._activate, "_methods_done", set())
     for module in stages.modules():
         patch.setattr(module.schema, "database", None)

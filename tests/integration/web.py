@@ -3,6 +3,7 @@
 import contextlib
 import re
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -113,5 +114,9 @@ def shown(
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
         opened.goto(f"/enter?key={app.state.sessions.new_link(name, *role.split(','))}")
         with one_query_at_a_time():
-            yield opened
+            try:
+                yield opened
+            except BaseException:  # pytest shows what a failed test has printed
+                sys.stdout.write("\n".join([opened.url, *errors, opened.inner_text("body")]))
+                raise
         assert not [e for e in errors if not (refused and "a status of 4" in e)]

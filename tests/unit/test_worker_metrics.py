@@ -20,7 +20,7 @@ from schemas.reading import status
 from schemas.store import check_store
 from tests.command import program
 from tests.ended_process import Ended
-from workers import process, recover, selftest
+from workers import process, recover, registry, selftest
 from workers.metrics import Metrics
 from workers.process import VISIBLE, Options, given_gpus
 from workers.queue import Claim
@@ -261,7 +261,7 @@ def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tm
 def test_processes_are_dealt_to_the_gpus_evenly():
     options = Options(processes=5, gpus=("a", "b"))
     assert [options.of_process(i).gpus for i in range(5)] == [("a",), ("b",), ("a",), ("b",), ("a",)]
-    assert {options.of_process(i).processes for i in range(5)} == {3}  # that share a device, at most
+    assert [options.of_process(i).processes for i in range(5)] == [3, 2, 3, 2, 3]  # that share a device
     alone = Options(processes=2, gpus=("a", "b")).of_process(1)
     assert (alone.gpus, alone.processes) == (("b",), 1)
     assert Options(processes=2).of_process(0) == Options(processes=2)
@@ -272,6 +272,17 @@ def test_processes_are_dealt_to_the_gpus_evenly():
     assert (here.gpus, beside.gpus, here.processes, beside.processes) == (("a",), ("a",), 2, 2)
     phone = Options(processes=2, gpus=("a", "b"), batch=128, max_jobs=9, phones=True).of_process(2)
     assert phone == Options(phones=True, phone=True)  # no GPU, all cores, one session at a time, for as long as others
+
+
+def test_processes_that_fit_on_one_gpu_know_it():
+    def share(resource: str, processes: int, *gpus: str) -> list[bool]:
+        options = Options(resource, processes, gpus=gpus)
+        return [options.of_process(i).shares_gpu for i in range(processes)]
+
+    assert share("gpu", 3, "a", "b") == [True, False, True]
+    assert share(registry.FIT, 2, "a") == [True, True]
+    assert share("all", 2, "a") == [False, False]  # the other one detects
+    assert share("gpu", 2) == [False, False]
 
 
 def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
