@@ -299,31 +299,23 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
         assert check.value is None or check.value == pytest.approx(other.value, rel=1e-2)
 
 
-def test_more_sessions_than_lanes_are_each_as_alone(walkers, one_by_one, monkeypatch):
-    """Two lanes for five sessions: who ended makes room, and the last one moves to a program of one."""
-    monkeypatch.setattr(lanes, "MOST_FRAMES", 2 * 128)
-    monkeypatch.setattr(lanes, "FEW", 1)
-    monkeypatch.setattr(lanes, "MOVED", 2)
-    together = fit_sessions([*walkers, *walkers[:2]], PARAMSET, batch=5)
-    for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
-        assert isinstance(fit, SessionFit)
-        assert_same(alone, fit)
-
-
 def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monkeypatch):
-    """Three people at once among whom one session is bad, packed with more frames, markers and trials than needed."""
+    """Five people and one whose points nobody saw, packed with more frames, markers and trials than needed, in three
+    lanes: who ended makes room, the last ones move to a program of two, the last of all has an empty lane beside it."""
     trial = walkers[0].trials[0]
     assert isinstance(trial, Keypoints)
     bad = SessionInput([dataclasses.replace(trial, confidence=np.zeros_like(trial.confidence))], ["bad"])
-    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192 if n <= 192 else 512)
+    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192)
     monkeypatch.setattr(problem, "pad_markers", lambda n: 128)
     monkeypatch.setattr(problem, "pad_trials", lambda n, coarse=False: 4)
-    monkeypatch.setattr(lanes, "FEW", 4)  # one lane is empty
-    together = fit_sessions([walkers[0], bad, *walkers[1:]], PARAMSET, batch=3)
+    monkeypatch.setattr(lanes, "MOST_FRAMES", 3 * 192)
+    monkeypatch.setattr(lanes, "FEW", 2)
+    monkeypatch.setattr(lanes, "MOVED", 2)
+    together = fit_sessions([walkers[0], bad, *walkers[1:], *walkers[:2]], PARAMSET, batch=5)
     error = together.pop(1)
     assert isinstance(error, PblError)
     assert error.code == "FIT_INPUT"
-    for alone, fit in zip(one_by_one, together, strict=True):
+    for alone, fit in zip([*one_by_one, *one_by_one[:2]], together, strict=True):
         assert isinstance(fit, SessionFit)
         assert_same(alone, fit)
 
