@@ -300,7 +300,7 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
 
 
 def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monkeypatch):
-    """Five people and one whose points nobody saw, packed with more frames, markers and trials than needed, in three
+    """Five people and one whose points no one saw, packed with more frames, markers and trials than needed, in three
     lanes: who ended makes room, the last ones move to a program of two, the last of all has an empty lane beside it."""
     trial = walkers[0].trials[0]
     assert isinstance(trial, Keypoints)
