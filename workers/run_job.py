@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import threading
@@ -136,19 +137,14 @@ class _Attempt:
             return ALREADY
         if not _is_wanted(self.job):
             return VANISHED
-        before = computed = self.computed
-        if computed is None:
-            fetched = table.make_fetch(dict(key))
-            self.computed = computed = Computed(fetched, table.make_compute(dict(key), *fetched))
-        try:
-            self._insert(table, key, computed)
-        except InputChanged:
-            if before is None:
-                raise
-            self.computed = None
-        else:
-            return DONE
-        return self.make()
+        if self.computed is not None:
+            with contextlib.suppress(InputChanged):  # then it is computed again
+                self._insert(table, key, self.computed)
+                return DONE
+        fetched = table.make_fetch(dict(key))
+        self.computed = Computed(fetched, table.make_compute(dict(key), *fetched))
+        self._insert(table, key, self.computed)
+        return DONE
 
     def _insert(self, table: Any, key: dict[str, Any], computed: Computed) -> None:
         """Insert what was computed. Raises InputChanged if its inputs are not the same any longer."""

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pbl_pipeline.cli.bench import Numbers
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import cores
 
@@ -63,19 +64,18 @@ def fit(method: str, first: int, step: int) -> None:
 @click.option("--method", default="gauss-newton", show_default=True, help="Fit method.")
 @click.option("--points", default="bml_movi_87", show_default=True, help="Marker set.")
 @click.option("--sessions", default=256, show_default=True)
-@click.option("--processes", default="1,2", show_default=True, help="That share the device; a,b,c.")
-@click.option("--repeat", default=3, show_default=True, help="Warm runs; the best counts.")
-def main(method: str, points: str, sessions: int, processes: str, repeat: int) -> None:
+@click.option("--processes", type=Numbers(), default="1,2", show_default=True, help="That share the device.")
+@click.option("--repeat", type=click.IntRange(1), default=3, show_default=True, help="Warm runs; the best counts.")
+def main(method: str, points: str, sessions: int, processes: tuple[int, ...], repeat: int) -> None:
     """Time the fit of many sessions."""
-    numbers = [int(n) for n in processes.split(",")]
     os.environ |= {"JAX_PLATFORMS": "cpu", "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     with ProcessPoolExecutor(cores(), SPAWN) as makers:
         walks = list(makers.map(walk, [points] * sessions, range(sessions)))
     del os.environ["JAX_PLATFORMS"]
     with contextlib.ExitStack() as ended:
-        pools = [ended.enter_context(ProcessPoolExecutor(1, SPAWN)) for _ in range(max(numbers))]
+        pools = [ended.enter_context(ProcessPoolExecutor(1, SPAWN)) for _ in range(max(processes))]
         *_, device = [held.result() for held in [pool.submit(hold, walks) for pool in pools]]
-        for n in numbers:
+        for n in processes:
             seconds = []
             for _ in range(1 + repeat):
                 begin = time.perf_counter()

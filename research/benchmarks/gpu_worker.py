@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
+from pbl_pipeline.cli.bench import Numbers
 from tests.database import installation
 
 if TYPE_CHECKING:
@@ -232,11 +233,11 @@ def device_readings() -> Iterator[list[Reading]]:
     show_default=True,
     help="Sessions before them, so that programs are compiled.",
 )
-@click.option("--batch", "batches", default="128", show_default=True, help="Sessions reserved together; a,b,c.")
+@click.option("--batch", type=Numbers(), default="128", show_default=True, help="Sessions reserved together.")
 @click.option("--processes", default="auto", show_default=True, help="Working processes, of all devices; a,b,c.")
 @click.option("--seconds", default="5,7.5,10", show_default=True, help="That a trial may last; a,b,c.")
 @click.option("--alike", is_flag=True, help="All sessions of one size: a single program.")
-def main(sessions: int, warm_up: int, batches: str, processes: str, seconds: str, alike: bool) -> None:
+def main(sessions: int, warm_up: int, batch: tuple[int, ...], processes: str, seconds: str, alike: bool) -> None:
     """Measure a worker that fits."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # this process only makes the sessions: the device is the worker's
     import schemas
@@ -244,8 +245,8 @@ def main(sessions: int, warm_up: int, batches: str, processes: str, seconds: str
     from workers.cli.worker import options_of
 
     runs = [
-        options_of("gpu", n if n == "auto" else int(n), int(batch), once=True, selftest=False)
-        for batch in batches.split(",")
+        options_of("gpu", n if n == "auto" else int(n), size, once=True, selftest=False)
+        for size in batch
         for n in processes.split(",")
     ]
     # So that no process runs out of work before the last of the measured ones is in its table.
