@@ -75,7 +75,8 @@ def build(folder: Path) -> Path:
     stage(folder)
     shutil.rmtree(folder / "site", ignore_errors=True)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    ours = [str(ROOT / folder) for folder in ("", "schemas", "workers")]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([*ours, os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, encoding="utf-8")
     if done.returncode:
         raise BuildError(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr))

@@ -16,15 +16,15 @@ MODULES: dict[str, tuple[str, ...]] = {
     "pbl_pipeline.methods": (),
     "pbl_pipeline.paramset": (),
     "pbl_pipeline.pipeline": (),
-    "schemas": (),
-    "schemas.connection": ("connect", "schema_name"),
-    "schemas.intake": (),
-    "schemas.method_rows": ("insert_methods", "method_columns"),
-    "schemas.origin": (),
-    "schemas.reading": (),
-    "schemas.rows": ("InputChanged", "one"),
-    "schemas.reading.status": ("pipeline_status",),
-    "schemas.reading.frames": (),
+    "pbl_schemas": (),
+    "pbl_schemas.connection": ("connect", "schema_name"),
+    "pbl_schemas.intake": (),
+    "pbl_schemas.method_rows": ("insert_methods", "method_columns"),
+    "pbl_schemas.origin": (),
+    "pbl_schemas.reading": (),
+    "pbl_schemas.rows": ("InputChanged", "one"),
+    "pbl_schemas.reading.status": ("pipeline_status",),
+    "pbl_schemas.reading.frames": (),
 }
 
 
@@ -37,7 +37,7 @@ def public(root: Path) -> dict[str, list[str]]:
         if names and name != "pbl_pipeline.cli":  # the commands have pages of their own
             found[name] = names
     for name, names in MODULES.items():
-        path = root.joinpath(*name.split("."))
+        path = _path(root, name)
         file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
         found[name] = list(names) or _offered(file)
     return dict(sorted(found.items()))
@@ -52,7 +52,7 @@ def pages(root: Path) -> dict[str, str]:
     for name, names in modules.items():
         below = {n: m for m in modules if m.startswith(f"{name}.") for n in modules[m] if n in names}
         # A function with the name of its module: asked for the name, mkdocstrings would show the module.
-        hidden = [n for n in names if root.joinpath(*name.split("."), f"{n}.py").is_file()]
+        hidden = [n for n in names if (_path(root, name) / f"{n}.py").is_file()]
         parts = [f"# {name}"]
         if below:
             parts.append(f"Also here: {', '.join(f'[`{n}`]({m}.md#{m}.{n})' for n, m in below.items())}.")
@@ -62,6 +62,12 @@ def pages(root: Path) -> dict[str, str]:
         parts += [f"::: {name}.{n}.{n}\n    {options}" for n in hidden]
         found[f"{FOLDER}/{name}.md"] = "\n\n".join(parts) + "\n"
     return found
+
+
+def _path(root: Path, name: str) -> Path:
+    """Where a module or package of the project lies, without ending."""
+    inside = {"pbl_schemas": "schemas", "pbl_workers": "workers"}.get(name.partition(".")[0], "")
+    return root.joinpath(inside, *name.split("."))
 
 
 def _offered(file: Path) -> list[str]:

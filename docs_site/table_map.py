@@ -6,9 +6,9 @@ import re
 import sys
 from typing import Any
 
-from schemas.chain import references, renamed, tables
-from schemas.datajoint_setup import dj
-from schemas.stages import STAGES, modules
+from pbl_schemas.chain import references, renamed, tables
+from pbl_schemas.datajoint_setup import dj
+from pbl_schemas.stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
@@ -35,7 +35,7 @@ instead of 8, and `lab.Subject * gdi.SessionGdi` has each person with the visits
 ([datajoint_delete.md](datajoint_delete.md)). Restrict by the keys instead, and let results of the whole visit go along:
 
 ```python
-from schemas import gdi, session
+from pbl_schemas import gdi, session
 
 chosen = gdi.GDI & (session.Session & {"subject": "P001"})
 (gdi.GDI & chosen.keys()).delete(part_integrity="cascade", prompt=False)  # without prompt=False it asks first

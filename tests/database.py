@@ -14,8 +14,8 @@ from unittest import mock
 
 import pytest
 
-from schemas.datajoint_setup import datajoint
-from schemas.operations import embedded
+from pbl_schemas.datajoint_setup import datajoint
+from pbl_schemas.operations import embedded
 from tests import mysql
 
 #: For tests of what the embedded server alone has.

@@ -23,7 +23,7 @@ from pathlib import Path
 import pymysql
 
 from pbl_pipeline import settings
-from schemas.operations.embedded.folder import free_port
+from pbl_schemas.operations.embedded.folder import free_port
 
 #: Set to `mysql`: `tests.database.installation` starts this server in place of the embedded one.
 CHOICE = "PBL_TEST_DATABASE"

@@ -7,11 +7,11 @@ from contextlib import closing
 from pathlib import Path
 
 from pbl_pipeline import settings
-from schemas import connection
-from schemas.intake import Registered, VisitRecord, ingest
-from schemas.intake.records import session_ids
-from schemas.operations import backup_files, catalog
-from schemas.transactions import in_transaction
+from pbl_schemas import connection
+from pbl_schemas.intake import Registered, VisitRecord, ingest
+from pbl_schemas.intake.records import session_ids
+from pbl_schemas.operations import backup_files, catalog
+from pbl_schemas.transactions import in_transaction
 
 
 def outcomes(results: Iterable[Registered]) -> list[str]:
@@ -91,8 +91,8 @@ def _of_tests(table: str) -> bool:
 
 
 def remove_all() -> None:
-    """Leave the tables as `schemas.activate` makes them: every row and every job goes but the methods (`#`), and so do
-    the lists of what was removed of whom (`forget.manifest_path`), by which a person is forgotten again.
+    """Leave the tables as `pbl_schemas.activate` makes them: every row and every job goes but the methods (`#`), and so
+    do the lists of what was removed of whom (`forget.manifest_path`), by which a person is forgotten again.
 
     In one transaction of plain statements: what depends on what was deleted is not looked up, which takes DataJoint
     seconds. That results go with their person is a test of its own (test_validation.py).

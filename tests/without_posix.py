@@ -33,7 +33,7 @@ _NAMES = """
     uname wait3 wait4
 """
 ABSENT_NAMES = frozenset(_NAMES.split())
-OURS = ("pbl_pipeline", "schemas", "workers")
+OURS = ("pbl_pipeline", "pbl_schemas", "pbl_workers")
 
 
 class WithoutPosix(types.ModuleType):

@@ -1,7 +1,8 @@
 """A visit with all its results, and its folder of files.
 
-`pipeline.run_visit` makes a `Visit` from videos, `load_visit` reads it from its folder, and `schemas.load_visit` from
-the tables. Report, overlay, exports and web pages take a `Visit` and compute nothing themselves.
+`pipeline.run_visit` makes a `Visit` from videos, `load_visit` reads it from its folder, and
+`pbl_schemas.load_visit` from the tables. Report, overlay, exports and web pages take a `Visit` and compute
+nothing themselves.
 """
 
 from .files import (

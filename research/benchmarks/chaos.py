@@ -30,10 +30,10 @@ from typing import Any
 import click
 import pytest
 
+from pbl_workers.process import Options
 from research.benchmarks import worker_standins, workers
 from tests import database, mysql
 from tests.integration import chain
-from workers.process import Options
 
 #: Variables of the processes: which machine they pass for, and the folder in which those inside an insert have a file.
 HOST, INSERTS = "PBL_BENCH_HOST", "PBL_BENCH_INSERTS"
@@ -47,24 +47,24 @@ STATUS_S, DRAIN_S = 120.0, 900.0
 
 def main_of_boss(number: int) -> None:
     """A supervisor of one process, on a separate machine."""
-    from workers.supervisor import Supervisor
+    from pbl_workers.supervisor import Supervisor
 
     os.environ[HOST] = f"machine-{number}"
     _pass_for_a_machine()
-    import schemas
+    import pbl_schemas
 
-    schemas.activate(methods=False)  # without a database it ends, and is started again
+    pbl_schemas.activate(methods=False)  # without a database it ends, and is started again
     raise SystemExit(Supervisor(Options(resource="cpu", selftest=False, grace_s=5.0), target=work).run())
 
 
 def work(options: Options, pipe: Connection) -> None:
     """A working process whose inserts can be seen from outside and take some time."""
-    import schemas
-    from schemas import computed_tables
+    import pbl_schemas
+    from pbl_schemas import computed_tables
 
     _pass_for_a_machine()
-    activate = schemas.activate
-    schemas.activate = lambda: activate(methods=False)  # they are there
+    activate = pbl_schemas.activate
+    pbl_schemas.activate = lambda: activate(methods=False)  # they are there
     draw, inserts = random.Random(os.getpid()), Path(os.environ[INSERTS])
 
     def seen(real: Any) -> Any:
@@ -86,7 +86,7 @@ def work(options: Options, pipe: Connection) -> None:
 
 
 def _pass_for_a_machine() -> None:
-    from workers import recover
+    from pbl_workers import recover
 
     name = os.environ[HOST]
     platform.node = lambda: name
@@ -107,7 +107,7 @@ class Site:
     @property
     def server(self) -> int:
         """Process number of the database."""
-        from schemas.operations import embedded
+        from pbl_schemas.operations import embedded
 
         if self.mysql is not None:
             return self.mysql.pid
@@ -115,7 +115,7 @@ class Site:
 
     def start_server(self) -> None:
         """Start the database where it does not run, as systemd would."""
-        from schemas.operations import embedded
+        from pbl_schemas.operations import embedded
 
         if self.mysql is not None:
             self.mysql.start()
@@ -247,7 +247,7 @@ def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
         finally:
             site.end_bosses()
             database.remove_home(home / "nothing")
-            from schemas.operations import embedded
+            from pbl_schemas.operations import embedded
 
             if site.mysql is not None:
                 site.mysql.stop()
@@ -274,7 +274,7 @@ def _disks(home: Path, minutes: float) -> Iterator[bool]:
 
 
 def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
-    from schemas.operations.declare import declare_all
+    from pbl_schemas.operations.declare import declare_all
 
     site.start_server()
     declare_all()
@@ -310,14 +310,14 @@ def _register(first: int) -> int:
 
 
 def _waiting() -> int:
-    from schemas import video
+    from pbl_schemas import video
 
     return len(video.VideoInfo.jobs.pending)
 
 
 def _cron() -> None:
-    from schemas import connection
-    from workers import refresh
+    from pbl_schemas import connection
+    from pbl_workers import refresh
 
     connection.connect()
     refresh.refresh(True)
@@ -325,8 +325,8 @@ def _cron() -> None:
 
 def _status(site: Site, supervisors: int, until: float) -> list[str]:
     """Wait until what `pbl status` says is so: no dead worker, no job in dead hands, the rows that are there."""
-    from schemas import computed_tables
-    from schemas.reading import status
+    from pbl_schemas import computed_tables
+    from pbl_schemas.reading import status
 
     wrong, last, began = ["it was not asked"], list[str](), time.monotonic()
     while wrong and time.monotonic() < until:
@@ -354,9 +354,9 @@ def _status(site: Site, supervisors: int, until: float) -> list[str]:
 
 def _drain(site: Site, supervisors: int, until: float) -> list[str]:
     """Let everything be done, with what `pbl cron` does every night."""
-    from schemas.reading.status import queue_counts
-    from schemas.video import Video
-    from workers import requeue
+    from pbl_schemas.reading.status import queue_counts
+    from pbl_schemas.video import Video
+    from pbl_workers import requeue
 
     busy = {}
     while time.monotonic() < until:
@@ -375,8 +375,8 @@ def _drain(site: Site, supervisors: int, until: float) -> list[str]:
 
 def _left(registered: int) -> list[str]:
     """Return the faults: missing results, jobs and files that were left behind."""
-    from schemas import computed_tables, connection, fit
-    from schemas.operations.orphans import orphans
+    from pbl_schemas import computed_tables, connection, fit
+    from pbl_schemas.operations.orphans import orphans
 
     connection.connect()
     wrong = []

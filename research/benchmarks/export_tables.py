@@ -55,10 +55,10 @@ def main(visits: tuple[int, ...], formats: tuple[str, ...]) -> None:
 
 def _first(home: Path, patch: pytest.MonkeyPatch) -> None:
     """The visit whose rows are copied."""
-    import schemas
-    from workers.populate import populate
+    import pbl_schemas
+    from pbl_workers.populate import populate
 
-    schemas.activate()
+    pbl_schemas.activate()
     chain.install(patch)
     chain.change_fits(patch, chain.with_all_markers)
     register(chain.small_video(home, "walk"), subject="S0", session_label="1")
@@ -67,8 +67,8 @@ def _first(home: Path, patch: pytest.MonkeyPatch) -> None:
 
 def copies(first: int, last: int) -> None:
     """Copies of the visit's rows for the visits `range(first, last)`, in every table that knows a person or visit."""
-    from schemas import fit, session
-    from schemas.chain import tables
+    from pbl_schemas import fit, session
+    from pbl_schemas.chain import tables
 
     query = session.Session.connection.query
     numbers = f"`{session.Session.database}`.`numbers`"

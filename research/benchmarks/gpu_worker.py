@@ -32,7 +32,7 @@ from pbl_pipeline.cli.bench import Numbers
 from tests.database import installation
 
 if TYPE_CHECKING:
-    from workers.process import Options
+    from pbl_workers.process import Options
 
 #: Trials that a session may have, and cameras.
 TRIALS, CAMERAS = (1, 2, 3), ("static", "handheld")
@@ -95,8 +95,8 @@ class Walks:
 
 def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
     """Register the sessions' videos and put the rows of all tables before SessionFit, as detection would leave them."""
+    from pbl_schemas.intake import Methods, VisitRecord
     from research.benchmarks.many_recordings import archived, register_many
-    from schemas.intake import Methods, VisitRecord
 
     recordings, trials = [], []
     walks = Walks()
@@ -115,8 +115,8 @@ def put_sessions(home: Path, sessions: Sequence[Plan]) -> None:
 
 
 def _insert_rows(folder: Path, trials: Sequence[Any]) -> None:
-    from schemas import fit, keypoints, tracking, video
-    from schemas.origin import Origin
+    from pbl_schemas import fit, keypoints, tracking, video
+    from pbl_schemas.origin import Origin
 
     def origin(prefix: str) -> dict[str, Any]:
         return Origin.now(0.0).row(prefix)
@@ -165,9 +165,9 @@ def _insert_rows(folder: Path, trials: Sequence[Any]) -> None:
 
 def queue_fits(warm_up: int) -> int:
     """Plan and queue the fits, the first `warm_up` sessions before all others; returns how many."""
-    from schemas import fit
-    from schemas.plan import plan_fit_sets
-    from workers import queue
+    from pbl_schemas import fit
+    from pbl_schemas.plan import plan_fit_sets
+    from pbl_workers import queue
 
     plan_fit_sets()
     sets = fit.FitSelection * fit.FitSet.proj("session_id")
@@ -183,9 +183,9 @@ def run(options: Options) -> tuple[list[float], list[Reading]]:
 
     Raises SystemExit where a session was not fitted.
     """
-    from workers.metrics import KeptReports
-    from workers.run_job import DONE
-    from workers.supervisor import Supervisor
+    from pbl_workers.metrics import KeptReports
+    from pbl_workers.run_job import DONE
+    from pbl_workers.supervisor import Supervisor
 
     metrics = KeptReports()
     with device_readings() as readings:
@@ -240,9 +240,9 @@ def device_readings() -> Iterator[list[Reading]]:
 def main(sessions: int, warm_up: int, batch: tuple[int, ...], processes: str, seconds: str, alike: bool) -> None:
     """Measure a worker that fits."""
     os.environ["JAX_PLATFORMS"] = "cpu"  # this process only makes the sessions: the device is the worker's
-    import schemas
-    from schemas import fit
-    from workers.cli.worker import options_of
+    import pbl_schemas
+    from pbl_schemas import fit
+    from pbl_workers.cli.worker import options_of
 
     runs = [
         options_of("gpu", n if n == "auto" else int(n), size, once=True, selftest=False)
@@ -252,7 +252,7 @@ def main(sessions: int, warm_up: int, batch: tuple[int, ...], processes: str, se
     # So that no process runs out of work before the last of the measured ones is in its table.
     after = max(IN_HAND * o.batch * o.processes for o in runs)
     with installation() as home:
-        schemas.activate()
+        pbl_schemas.activate()
         logging.getLogger("datajoint").setLevel(logging.ERROR)
         put_sessions(home, plans(warm_up + sessions + after, [float(s) for s in seconds.split(",")], alike))
         del os.environ["JAX_PLATFORMS"]

@@ -121,16 +121,16 @@ def fuzzed_log(draw: random.Random) -> bytes:
 @click.option("--seed", default=0, show_default=True)
 def main(inputs: int, seed: int) -> None:
     """Make the inputs, put them through, count."""
-    import schemas
-    from schemas import tracking, video
-    from schemas.intake import Sensors, VisitRecord, ingest
-    from schemas.job_errors import error_code
-    from schemas.jobs import jobs_of
-    from workers.process import Options
-    from workers.supervisor import Supervisor
+    import pbl_schemas
+    from pbl_schemas import tracking, video
+    from pbl_schemas.intake import Sensors, VisitRecord, ingest
+    from pbl_schemas.job_errors import error_code
+    from pbl_schemas.jobs import jobs_of
+    from pbl_workers.process import Options
+    from pbl_workers.supervisor import Supervisor
 
     with installation() as home:
-        schemas.activate()
+        pbl_schemas.activate()
         good = chain.small_video(home, "good", n=40).read_bytes()
         draw = random.Random(seed)
         refused: collections.Counter = collections.Counter()

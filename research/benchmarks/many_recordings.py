@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
-from schemas.intake.records import File, Methods, VisitRecord
-from schemas.intake.registration import check_owner, registered, resolve, write
-from schemas.intake.videos import OneCamera
-from schemas.transactions import in_transaction
+from pbl_schemas.intake.records import File, Methods, VisitRecord
+from pbl_schemas.intake.registration import check_owner, registered, resolve, write
+from pbl_schemas.intake.videos import OneCamera
+from pbl_schemas.transactions import in_transaction
 
 #: Recordings in one transaction.
 CHUNK = 5000

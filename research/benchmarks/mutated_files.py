@@ -176,7 +176,7 @@ def reference(path: Path) -> None:
 
 def use_reference(path: Path) -> None:
     from pbl_pipeline.validation import QPOS, compare
-    from schemas.intake.references import read_reference
+    from pbl_schemas.intake.references import read_reference
 
     found = read_reference(path)
     if found.convention == QPOS:
@@ -423,7 +423,7 @@ def use_sheets(path: Path) -> None:
     from unittest import mock
 
     from pbl_pipeline.errors import PblError
-    from schemas.intake import sheets
+    from pbl_schemas.intake import sheets
 
     def here(function: Any, *args: Any, **_: object) -> object:
         return function(*args)
@@ -481,14 +481,14 @@ def use_study(path: Path) -> None:
 
 
 def manifest(path: Path) -> None:
-    from schemas.operations import backup
+    from pbl_schemas.operations import backup
 
     content = {"format": backup.FORMAT, "created": "2026-01-01", "server": "x", "prefix": "pbl", "rows": {"a": 1}}
     path.write_text(json.dumps(content | {"store": True, "n_files": 0, "n_bytes": 0, "sha256": {}}))
 
 
 def use_manifest(path: Path) -> None:
-    from schemas.operations import backup
+    from pbl_schemas.operations import backup
 
     folder = path.parent / "backup"
     folder.mkdir(exist_ok=True)
@@ -503,7 +503,7 @@ def listing(path: Path) -> None:
 def use_listing(path: Path) -> None:
     """The files of a backup by their checksums; none of them is there."""
     from pbl_pipeline.errors import PblError
-    from schemas.operations import backup
+    from pbl_schemas.operations import backup
 
     folder = path.parent / "listed"
     folder.mkdir(exist_ok=True)
@@ -526,7 +526,7 @@ def forgotten(path: Path) -> None:
 
 def use_forgotten(path: Path) -> None:
     from pbl_pipeline import settings
-    from schemas.operations import forget
+    from pbl_schemas.operations import forget
 
     with settings_at(path.parent):
         place = settings.home_dir() / "forgotten" / "P001.json"
@@ -547,8 +547,8 @@ def server(path: Path) -> None:
 
 
 def use_server(path: Path) -> None:
-    from schemas.operations import embedded
-    from schemas.operations.embedded.folder import Credentials
+    from pbl_schemas.operations import embedded
+    from pbl_schemas.operations.embedded.folder import Credentials
 
     folder = embedded.Folder(path.parent / "db")
     folder.data.mkdir(parents=True, exist_ok=True)
@@ -559,13 +559,13 @@ def use_server(path: Path) -> None:
 
 
 def accounts(path: Path) -> None:
-    from workers.web.accounts import Accounts
+    from pbl_workers.web.accounts import Accounts
 
     Accounts(path).add("a.first", ["reader"], "correct horse battery")
 
 
 def use_accounts(path: Path) -> None:
-    from workers.web.accounts import Accounts
+    from pbl_workers.web.accounts import Accounts
 
     path.chmod(0o600)
     found = Accounts(path)
@@ -626,7 +626,7 @@ def use_kinetics(path: Path) -> None:
 
 def tracking(path: Path) -> None:
     from pbl_pipeline.tracking import PersonTrack, Tracking
-    from schemas.tracking import save_tracking
+    from pbl_schemas.tracking import save_tracking
 
     box = np.tile([10.0, 10.0, 90.0, 200.0], (N, 1))
     people = tuple(PersonTrack(i, box, box, np.ones(N), np.ones(N, bool)) for i in range(2))
@@ -638,8 +638,8 @@ def use_tracking(path: Path) -> None:
     from types import SimpleNamespace
     from unittest import mock
 
-    from schemas import stored_files
-    from schemas.tracking import load_tracking
+    from pbl_schemas import stored_files
+    from pbl_schemas.tracking import load_tracking
 
     local = SimpleNamespace(protocol="file")
     with (
@@ -769,8 +769,8 @@ def use_form(path: Path) -> None:
     from starlette.requests import Request
 
     from pbl_pipeline.errors import PblError
-    from workers.web.access import Refused
-    from workers.web.multipart import parts
+    from pbl_workers.web.access import Refused
+    from pbl_workers.web.multipart import parts
 
     data = path.read_bytes()
     pieces = [data[i : i + 700] for i in range(0, len(data), 700)] or [b""]

@@ -54,16 +54,16 @@ def film(takes: int) -> None:
     """Print index, clocks and lost frames of so many takes."""
     from playwright.sync_api import sync_playwright
 
-    import schemas
+    import pbl_schemas
     from pbl_pipeline import assets
-    from schemas import computed_tables, gdi
-    from schemas.capture import PhoneRecording
-    from schemas.jobs import jobs_of
+    from pbl_schemas import computed_tables, gdi
+    from pbl_schemas.capture import PhoneRecording
+    from pbl_schemas.jobs import jobs_of
     from tests.end_to_end.test_phone import clocks_s, take, trial_of
     from tests.rows import remove_all
 
     with installation() as home, sync_playwright() as playwright:
-        schemas.activate()
+        pbl_schemas.activate()
         for i in range(takes):
             folder = home / f"take-{i}"
             folder.mkdir()
@@ -96,16 +96,16 @@ def main(videos: int, processes: int, phones: int, takes: int) -> None:
     if takes:
         film(takes)
         return
-    import schemas
-    from schemas import gdi, keypoints, video
-    from schemas.intake import VisitRecord, register
-    from schemas.intake.videos import OneCamera
-    from schemas.reading.usable import PENDING, usable
-    from workers import queue, refresh
-    from workers.registry import FIRST
+    import pbl_schemas
+    from pbl_schemas import gdi, keypoints, video
+    from pbl_schemas.intake import VisitRecord, register
+    from pbl_schemas.intake.videos import OneCamera
+    from pbl_schemas.reading.usable import PENDING, usable
+    from pbl_workers import queue, refresh
+    from pbl_workers.registry import FIRST
 
     with installation() as home, contextlib.ExitStack() as end:
-        schemas.activate()
+        pbl_schemas.activate()
         clip = demo_clip(home / "clip.mp4")
         register(OneCamera(copy_of(clip, i), VisitRecord(f"B{i:05d}", "1")) for i in range(videos))
         refresh.refresh()

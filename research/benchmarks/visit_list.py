@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from research.benchmarks import workers as queue
+from research.benchmarks import pbl_workers as queue
 
 #: Visits of a person.
 VISITS_EACH = 5
@@ -33,7 +33,7 @@ def recordings(n_visits: int) -> Iterator[Any]:
 
 def spread(n_visits: int) -> None:
     """Give the copied visits days, roles, a cohort, indices and outcomes that differ."""
-    from schemas import gdi, lab, qc, session, study, tracking
+    from pbl_schemas import gdi, lab, qc, session, study, tracking
 
     query = session.Session.connection.query
     sessions, members = session.Session.full_table_name, study.CohortMember.full_table_name
@@ -57,7 +57,7 @@ def spread(n_visits: int) -> None:
 
 def filters() -> dict[str, Any]:
     """Return the measured filters by name."""
-    from schemas.reading.visit_list import OUTCOMES, STATES, Filter
+    from pbl_schemas.reading.visit_list import OUTCOMES, STATES, Filter
 
     day = datetime.date
     found = {"everything": Filter(), "a person's code": Filter(search="s000123"), "a label": Filter(search="2024-0")}
@@ -88,8 +88,8 @@ def median_ms(function: Any, n: int) -> float:
 @click.option("--repeats", default=50, show_default=True)
 def main(visits: int, repeats: int) -> None:
     """Make the visits, ask for pages, print the figures."""
+    from pbl_schemas.reading.visit_list import Filter, visit_page
     from research.benchmarks.many_recordings import register_many
-    from schemas.reading.visit_list import Filter, visit_page
 
     with queue.installation():
         register_many(list(recordings(visits))[: queue.EACH])

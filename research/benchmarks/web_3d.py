@@ -30,9 +30,9 @@ from starlette.staticfiles import StaticFiles
 
 from pbl_pipeline.body import load_body
 from pbl_pipeline.visit import Recording
+from pbl_workers import web
+from pbl_workers.web.movement import Movement
 from tests.walking_fit import walking_fit
-from workers import web
-from workers.web.movement import Movement
 
 PAGE = '<!doctype html><link rel="stylesheet" href="/static/page.css"><canvas></canvas>'
 DRAW = """

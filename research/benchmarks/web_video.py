@@ -20,11 +20,11 @@ import click
 import numpy as np
 import pytest
 
+from pbl_workers.populate import populate
 from tests import database
 from tests.integration import chain, web
 from tests.rows import register
 from tests.videos import constant_rate, write_video
-from workers.populate import populate
 
 SIZE, FPS = (1080, 1920), 30
 #: Written into each page before its own scripts: notes when what happened, in ms since the click that led here.
@@ -80,10 +80,10 @@ def main(seconds: float, repeats: int) -> None:
     """Make the recording, open it, print median and worst."""
     from playwright.sync_api import sync_playwright
 
-    import schemas
+    import pbl_schemas
 
     with database.installation() as home, pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
+        pbl_schemas.activate()
         chain.install(patch)
         path = write_video(Path(home) / "walk.mp4", pictures(seconds), constant_rate(round(seconds * FPS)), crf=27)
         click.echo(f"video: {seconds:g} s, {SIZE[1]} x {SIZE[0]} px, {path.stat().st_size / 2**20:.0f} MiB")

@@ -23,8 +23,8 @@ _OPENS = ("SET TRANSACTION", "START TRANSACTION")
 
 def record(tables: Sequence[Any]) -> list[list[Statement]]:
     """Do the queued jobs of these tables in this process; the statements of each step that found any."""
-    from workers.heartbeat import Silent
-    from workers.loop import Worker
+    from pbl_workers.heartbeat import Silent
+    from pbl_workers.loop import Worker
 
     worker = Worker(tables, Silent())
     steps: list[list[Statement]] = []
@@ -70,7 +70,7 @@ def replay(steps: Sequence[Sequence[Statement]], connections: int) -> tuple[floa
 
 
 def _send(steps: Sequence[Sequence[Statement]], ready: Any, answers: Any) -> None:
-    from schemas.connection import plain_connection
+    from pbl_schemas.connection import plain_connection
 
     repeated = 0
     with contextlib.closing(plain_connection()) as server, server.cursor() as cursor:

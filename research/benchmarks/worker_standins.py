@@ -18,10 +18,10 @@ import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 import pbl_pipeline.video
-import schemas.video
+import pbl_schemas.video
+from pbl_workers import heartbeat, loop, process, selftest
+from pbl_workers.process import Options
 from tests.integration import chain
-from workers import heartbeat, loop, process, selftest
-from workers.process import Options
 
 #: Variable that names the recording whose probe every video gives.
 RECORDED = "PBL_BENCH_RECORDED"
@@ -53,7 +53,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(pbl_pipeline.video, "probe", given)
     patch.setattr(chain, "probe", lambda _: probe(recorded))
-    patch.setattr(schemas.video, "registered_file", lambda path, sha256, key: Path(path))
+    patch.setattr(pbl_schemas.video, "registered_file", lambda path, sha256, key: Path(path))
     if RATE in os.environ:
         rate = float(os.environ[RATE])
         patch.setattr(loop, "IDLE_S", tuple(s * REAL_RATE / rate for s in loop.IDLE_S))  # pauses are shorter as well
@@ -70,7 +70,7 @@ def _timed(detect: Callable[..., Any], rate: float) -> Callable[..., Any]:
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """`workers.process.work` with recorded results; the self-test, where it is asked for, is the real one."""
+    """`pbl_workers.process.work` with recorded results; the self-test, where it is asked for, is the real one."""
     check, fit_session = selftest.check, pbl_pipeline.fit.fit_session
 
     def real_check(tables: Sequence[Any]) -> None:

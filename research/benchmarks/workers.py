@@ -30,13 +30,13 @@ from typing import Any
 import click
 import pytest
 
+from pbl_workers.queue import Claim
+from pbl_workers.run_job import Outcome
 from research.benchmarks import worker_replay, worker_standins
 from tests import database
 from tests.integration import chain
-from workers.queue import Claim
-from workers.run_job import Outcome
 
-#: What a worker reports of a job (see `workers.loop.Worker`), and when.
+#: What a worker reports of a job (see `pbl_workers.loop.Worker`), and when.
 Report = tuple[float, Claim, Outcome | None]
 #: Videos of a session.
 EACH = 6
@@ -49,10 +49,10 @@ _JOBS_OF_A_SESSION = 9 * EACH + 3
 @contextlib.contextmanager
 def installation() -> Iterator[Path]:
     """Yield the folder of a separate database and store, with the recorded stages also in this process."""
-    import schemas
+    import pbl_schemas
 
     with database.installation() as home, pytest.MonkeyPatch.context() as patch:
-        schemas.activate()
+        pbl_schemas.activate()
         patch.setenv(worker_standins.RECORDED, str(chain.small_video(home, "recorded")))
         worker_standins.install(patch)
         yield home
@@ -60,8 +60,8 @@ def installation() -> Iterator[Path]:
 
 def recordings(first: int, n: int) -> Iterator[Any]:
     """Numbered recordings, `EACH` of a session, one session of a subject."""
+    from pbl_schemas.intake import VisitRecord
     from research.benchmarks.many_recordings import archived
-    from schemas.intake import VisitRecord
 
     for i in range(first, first + n):
         sha256 = hashlib.sha256(str(i).encode()).hexdigest()
@@ -76,9 +76,9 @@ def say(what: str, value: float, unit: str, bar: str = "") -> None:
 def work(processes: int, heard: list[Report] | None = None, **options: Any) -> float:
     """Work until nothing is left; return the seconds from the first report to the last one. `heard` gets all
     reports."""
-    from workers.metrics import KeptReports
-    from workers.process import Options
-    from workers.supervisor import Supervisor
+    from pbl_workers.metrics import KeptReports
+    from pbl_workers.process import Options
+    from pbl_workers.supervisor import Supervisor
 
     once = {"once": True, "selftest": False, "processes": processes, **options}
     metrics = KeptReports()
@@ -98,10 +98,10 @@ def main() -> None:
 @click.option("--videos", default=300_000, show_default=True)
 def scale(videos: int) -> None:
     """Register, look, refresh, work, with as many videos."""
+    from pbl_schemas import computed_tables, video
+    from pbl_schemas.reading.status import pipeline_status
+    from pbl_workers import refresh
     from research.benchmarks.many_recordings import register_many
-    from schemas import computed_tables, video
-    from schemas.reading.status import pipeline_status
-    from workers import refresh
 
     with installation():
         small = 3000
@@ -141,8 +141,8 @@ def scale(videos: int) -> None:
 
 def _cost_per_job(first: int, sessions: int) -> float:
     """Seconds a job of two workers costs beside make_compute, over a whole chain of new sessions."""
+    from pbl_schemas import computed_tables
     from research.benchmarks.many_recordings import register_many
-    from schemas import computed_tables
 
     before = {t.__name__: _computed(t) for t in computed_tables()}
     register_many(recordings(first, sessions * EACH))
@@ -164,7 +164,7 @@ def _computed(table: Any) -> tuple[int, float]:
 
 def copy_results(first_session: int, last_session: int) -> None:
     """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
-    from schemas import fit, gait, gdi, keypoints, qc, tracking, video
+    from pbl_schemas import fit, gait, gdi, keypoints, qc, tracking, video
 
     copied = (
         video.VideoInfo,
@@ -205,8 +205,8 @@ def copy_results(first_session: int, last_session: int) -> None:
 
 def _names_of_sets(first: int, last: int) -> str:
     """A temporary table of the sessions `range(first, last)` and the names that planning would give their sets."""
-    from schemas import fit
-    from schemas.plan import fit_set_hash
+    from pbl_schemas import fit
+    from pbl_schemas.plan import fit_set_hash
 
     methods = (fit.FitSet.Video & {"fit_set": _first_set()}).to_dicts(limit=1)[0]
     name = f"`{fit.FitSet.database}`.`names_of_sets`"
@@ -222,7 +222,7 @@ def _names_of_sets(first: int, last: int) -> str:
 
 
 def _first_set() -> str:
-    from schemas import fit
+    from pbl_schemas import fit
 
     return str((fit.FitSet & {"session_id": 1}).fetch1("fit_set"))
 
@@ -235,10 +235,10 @@ def _first_set() -> str:
 )
 def speed(keys: int, work_ms: float) -> None:
     """Jobs a second of one table (VideoInfo) by 1 to 4 workers, each key exactly once; what the database could do."""
+    from pbl_schemas import tracking, video
+    from pbl_schemas.operations import embedded
+    from pbl_workers import queue
     from research.benchmarks.many_recordings import register_many
-    from schemas import tracking, video
-    from schemas.operations import embedded
-    from workers import queue
 
     def begin() -> None:
         """Let all keys wait, with nothing done."""
@@ -299,9 +299,9 @@ def _processor_s(pid: int) -> float:
 @click.option("--worked", default=20, show_default=True, help="Sessions whose new fits are computed then.")
 def method(sessions: int, worked: int) -> None:
     """A new parameter set of the fit over fitted sessions: what becomes pending, and that no old row changes."""
+    from pbl_schemas import computed_tables, fit
+    from pbl_workers import refresh, requeue
     from research.benchmarks.many_recordings import register_many
-    from schemas import computed_tables, fit
-    from workers import refresh, requeue
 
     with installation():
         register_many(recordings(0, EACH))
@@ -358,10 +358,10 @@ def _contents(table: Any, but: str = "") -> tuple[int, int]:
 @click.option("--jobs", default=500, show_default=True)
 def memory(jobs: int) -> None:
     """Resident memory of one worker, started as in production: after 20 jobs, after all, after as many again."""
+    from pbl_workers.metrics import Metrics
+    from pbl_workers.process import Options
+    from pbl_workers.supervisor import Supervisor
     from research.benchmarks.many_recordings import register_many
-    from workers.metrics import Metrics
-    from workers.process import Options
-    from workers.supervisor import Supervisor
 
     with installation():
         register_many(recordings(0, EACH * math.ceil(2 * jobs / _JOBS_OF_A_SESSION)))
@@ -398,16 +398,16 @@ def memory(jobs: int) -> None:
 @click.option("--faster", default=100.0, show_default=True, help="Detection takes 1/N of the time that it would.")
 def long(videos: int, minutes: float, late: int, processes: int, faster: float) -> None:
     """Waiting time of a recording behind another video: the longest time in which no process took any job."""
+    from pbl_schemas import tracking, video
+    from pbl_schemas.intake import VisitRecord
+    from pbl_workers import queue, refresh
+    from pbl_workers.heartbeat import Silent
+    from pbl_workers.loop import Worker
+    from pbl_workers.metrics import Metrics
+    from pbl_workers.process import Options
+    from pbl_workers.registry import FIRST, tables_of
+    from pbl_workers.supervisor import Supervisor
     from research.benchmarks.many_recordings import archived, register_many
-    from schemas import tracking, video
-    from schemas.intake import VisitRecord
-    from workers import queue, refresh
-    from workers.heartbeat import Silent
-    from workers.loop import Worker
-    from workers.metrics import Metrics
-    from workers.process import Options
-    from workers.registry import FIRST, tables_of
-    from workers.supervisor import Supervisor
 
     frames = round(minutes * 60 * 30)
     begun: list[tuple[float, int]] = []  # when a job was taken, and of which recording
@@ -489,8 +489,8 @@ _MOMENTS = ("computing", "before the insert", "before the commit", "after the co
 
 def killed(options: Any, pipe: Any) -> None:
     """A working process that kills itself, at a random moment of a job; twice a job, which gets three attempts."""
-    from schemas import computed_tables
-    from workers import queue, run_job
+    from pbl_schemas import computed_tables
+    from pbl_workers import queue, run_job
 
     folder, draw = Path(os.environ[_KILLS]), random.Random(os.getpid())
     moments: dict[str, str] = {}
@@ -531,14 +531,14 @@ def killed(options: Any, pipe: Any) -> None:
 @click.option("--each", default=10, show_default=True, help="Kills in each stage.")
 def kills(each: int) -> None:
     """Kill the working process in every stage, at four moments of a job: every row is there once, nothing is left."""
+    from pbl_schemas import chain as tables_chain
+    from pbl_schemas import computed_tables
+    from pbl_schemas.operations.orphans import orphans
+    from pbl_schemas.reading.status import queue_counts
+    from pbl_schemas.video import Video
+    from pbl_workers import refresh, supervisor
+    from pbl_workers.process import Options
     from research.benchmarks.many_recordings import register_many
-    from schemas import chain as tables_chain
-    from schemas import computed_tables
-    from schemas.operations.orphans import orphans
-    from schemas.reading.status import queue_counts
-    from schemas.video import Video
-    from workers import refresh, supervisor
-    from workers.process import Options
 
     with installation() as home, pytest.MonkeyPatch.context() as patch:
         (home / "kills").mkdir()

@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.video import probe
-from schemas import fit, gait, gdi, keypoints, qc, tracking, video
-from schemas.reading import frames
+from pbl_schemas import fit, gait, gdi, keypoints, qc, tracking, video
+from pbl_schemas.reading import frames
 from tests.command import Done, pbl
 from tests.rows import remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -28,7 +28,7 @@ EMPTY = "niemand ist da, früh.mp4"
 
 @pytest.fixture(scope="module")
 def tables(database: Path) -> Iterator[None]:
-    schemas.activate()
+    pbl_schemas.activate()
     remove_all()
     yield
     remove_all()

@@ -23,7 +23,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import probe
-from schemas.operations.embedded import APP_USER, HOST, Folder
+from pbl_schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import without_posix
 from tests.database import new_home, remove_home
 from tests.german import REPORT_NAMES, english_of, english_words

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-import schemas
-from schemas import connection
-from schemas.connection import dj, schema_name
-from schemas.operations import catalog
+import pbl_schemas
+from pbl_schemas import connection
+from pbl_schemas.connection import dj, schema_name
+from pbl_schemas.operations import catalog
 from tests import notebook
 from tests.command import pbl
 from tests.rows import remove_all
@@ -27,7 +27,7 @@ MEASURED, WITHIN = ("02_populate", "03_query", "05_own_table"), 0.1
 @pytest.fixture
 def own_tables(database: Path) -> Iterator[None]:
     """Empty tables, and none of the notebooks' own afterwards."""
-    schemas.activate()
+    pbl_schemas.activate()
     remove_all()
     yield
     dj.Schema(schema_name("mylab")).drop(prompt=False)

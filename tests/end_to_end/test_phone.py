@@ -12,20 +12,20 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.video import PhoneLog, camera_in_device, probe, read_frames, read_phone_log
-from schemas import fit, gdi, session, video
-from schemas.capture import PhoneRecording
-from schemas.intake import Sensors, VisitRecord, ingest
-from schemas.intake.calibrations import add_calibration
-from schemas.reading.objects import load_keypoints, load_trial_fit
+from pbl_schemas import fit, gdi, session, video
+from pbl_schemas.capture import PhoneRecording
+from pbl_schemas.intake import Sensors, VisitRecord, ingest
+from pbl_schemas.intake.calibrations import add_calibration
+from pbl_schemas.reading.objects import load_keypoints, load_trial_fit
+from pbl_workers.populate import populate
 from tests.inputs import LEVEL
 from tests.integration.test_web_phone import new_visit
 from tests.integration.test_web_phone_browser import arrived, filming, turn, with_camera
 from tests.phone_film import device_quat, hand
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
-from workers.populate import populate
 
 pytestmark = [pytest.mark.slow, pytest.mark.machine]
 FPS = 30
@@ -140,7 +140,7 @@ def film(page: Any, n: int) -> np.ndarray:
 def walked(
     database: Path, chromium: Any, demo_files: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Walked]:
-    schemas.activate()
+    pbl_schemas.activate()
     remove_all()
     yield take(chromium, demo_files["demo_video"], tmp_path_factory.mktemp("walked"))
     remove_all()

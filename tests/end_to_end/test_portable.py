@@ -11,10 +11,10 @@ from tests.without_posix import ABSENT_MODULES, ABSENT_NAMES, ROOT, pbl
 PROBE = """
 import tests.without_posix as without
 without.install()
-exec('import os, sys\\nassert not hasattr(os, "geteuid") and os.getpid() > 0', {'__name__': 'schemas.x'})
+exec('import os, sys\\nassert not hasattr(os, "geteuid") and os.getpid() > 0', {'__name__': 'pbl_schemas.x'})
 exec('import os, pwd; os.geteuid()', {'__name__': 'another'})
 try:
-    exec('import pwd', {'__name__': 'schemas.x'})
+    exec('import pwd', {'__name__': 'pbl_schemas.x'})
 except ModuleNotFoundError:
     print('absent')
 """

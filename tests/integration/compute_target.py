@@ -5,7 +5,7 @@ import signal
 import time
 from pathlib import Path
 
-from workers.on_request import compute_visit
+from pbl_workers.on_request import compute_visit
 
 
 def compute(session_id: int, again: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-import schemas
+import pbl_schemas
 from tests.rows import Saved, remove_all
 
 from . import chain
@@ -16,7 +16,7 @@ from . import chain
 @pytest.fixture(scope="module")
 def declared(database: Path) -> None:
     """All tables with their method rows."""
-    schemas.activate()
+    pbl_schemas.activate()
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ from typing import Any
 
 def work(gate: Any, said: Any) -> None:
     """Wait for the others at `gate`, take jobs of VideoInfo one by one until none is left; put them in `said`."""
-    import schemas
-    from schemas import video
-    from workers import queue, run_job
+    import pbl_schemas
+    from pbl_schemas import video
+    from pbl_workers import queue, run_job
 
-    schemas.activate(methods=False)
+    pbl_schemas.activate(methods=False)
     gate.wait(240)
     done: list[int] = []
     while jobs := queue.claim(video.VideoInfo, 1):

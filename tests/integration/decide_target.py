@@ -3,15 +3,15 @@
 from multiprocessing.synchronize import Barrier
 from typing import Any
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
 
 
 def decide(function: str, arguments: tuple[Any, ...], together: Barrier, answers: Any) -> None:
-    """Call a function of `schemas.decisions` when all have come so far; its error's code, or "done", into `answers`."""
+    """Call a function of `pbl_schemas.decisions` when all have come; its error's code or "done" into the queue."""
     import importlib
 
-    schemas.activate(methods=False)
+    pbl_schemas.activate(methods=False)
     module, _, name = function.rpartition(".")
     together.wait(60)
     try:

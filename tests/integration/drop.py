@@ -3,7 +3,7 @@
 import time
 from pathlib import Path
 
-from workers.incoming import Imports, import_uploads
+from pbl_workers.incoming import Imports, import_uploads
 
 from . import chain
 

@@ -4,21 +4,21 @@ import datetime
 from pathlib import Path
 from typing import Any
 
-import schemas
-from schemas import video, worker
-from schemas.reading.status import queue_counts
-from schemas.rows import utc_now
+import pbl_schemas
+from pbl_schemas import video, worker
+from pbl_schemas.reading.status import queue_counts
+from pbl_schemas.rows import utc_now
+from pbl_workers import queue, refresh
+from pbl_workers.heartbeat import Silent
+from pbl_workers.loop import Worker
 from tests.rows import register
-from workers import queue, refresh
-from workers.heartbeat import Silent
-from workers.loop import Worker
 
 from . import chain
 
 
 def work(*tables: Any, **options: Any) -> Worker:
     """One worker in this process until nothing is left that can be taken now; of all tables where none is named."""
-    one = Worker(tables or schemas.computed_tables(), Silent(), **options)
+    one = Worker(tables or pbl_schemas.computed_tables(), Silent(), **options)
     one.run(once=True)
     return one
 
@@ -26,7 +26,7 @@ def work(*tables: Any, **options: Any) -> Worker:
 def queued(folder: Path, table: Any, name: str = "walk") -> int:
     """The number of a new video whose job of this table is queued."""
     (number,) = register(chain.small_video(folder, name), session_label=name)
-    computed = schemas.computed_tables()
+    computed = pbl_schemas.computed_tables()
     if table is not computed[0]:
         work(*computed[: computed.index(table)])
     refresh.refresh()
@@ -47,7 +47,7 @@ def at_once(job: queue.Claim) -> None:
 
 def counts() -> dict[str, int]:
     """How many rows the computed tables have."""
-    return {t.__name__: len(t()) for t in schemas.computed_tables()}
+    return {t.__name__: len(t()) for t in pbl_schemas.computed_tables()}
 
 
 def jobs_left() -> dict[str, dict[str, int]]:

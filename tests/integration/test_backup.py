@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from schemas import connection, gait, lab, load_visit, migrations, video
-from schemas.intake import VisitRecord, ingest
-from schemas.operations import backup, backup_files, embedded
-from schemas.operations.declare import declare_all
-from schemas.reading import frames
+from pbl_schemas import connection, gait, lab, load_visit, migrations, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.operations import backup, backup_files, embedded
+from pbl_schemas.operations.declare import declare_all
+from pbl_schemas.reading import frames
+from pbl_workers import backups
+from pbl_workers.populate import populate
 from tests.command import PBL, pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes
-from workers import backups
-from workers.populate import populate
 
 from . import chain
 
@@ -81,7 +81,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert f"left out: {films[1]}: another file is there" in done.err
     assert films[1].read_text() == "another film"
     # The tables work: what was computed is there, with its arrays, and nothing is computed anew.
-    schemas.activate()
+    pbl_schemas.activate()
     assert lab.Subject.fetch1("subject_height") == HEIGHT
     assert lab.Project.fetch1("project_title") == TITLE
     assert frames.session_summary()["subject"].tolist() == ["P001"]
@@ -106,7 +106,7 @@ def test_a_backup_of_an_older_version_is_restored_and_migrated(database: Path):
         found = backup.restore(Path(__file__).parent / "backup_of_2e66321")
         assert (sum(found.rows.values()), len(found.rows)) == (493, 110)
         migrations.migrate()
-        schemas.activate()
+        pbl_schemas.activate()
         assert lab.Subject.fetch1("subject_height") == HEIGHT
         assert lab.Project.fetch1("project_title") == TITLE.partition(" $(")[0]
         assert len(gait.GaitCycle()) == found.rows["pbl_gait.__gait_cycle"] > 0

@@ -6,12 +6,12 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from schemas import gait, gdi
-from schemas.reading import comparison
+from pbl_schemas import gait, gdi
+from pbl_schemas.reading import comparison
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.populate import populate
 
 OLD, NEW = "zeni-2008-v1", "phase-transformer-v2"
 

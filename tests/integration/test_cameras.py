@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas import fit, keypoints, lab, video
-from schemas.intake import VisitRecord, ingest
-from schemas.stored_files import file_ref, stored_file
+from pbl_schemas import fit, keypoints, lab, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.stored_files import file_ref, stored_file
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
 from tests.quicktime import insert, meta
 from tests.rows import outcomes, register
 from tests.videos import constant_rate, numbered_frames, write_video
-from workers.populate import populate
 
 pytestmark = pytest.mark.usefixtures("tables")
 

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-import schemas
-from schemas.operations import catalog
+import pbl_schemas
+from pbl_schemas.operations import catalog
 
 
 def test_tables_and_columns_of_this_installation(declared: None):
-    schemas.activate()
+    pbl_schemas.activate()
     tables = catalog.tables()
     assert {schema for schema, _ in tables} <= set(catalog.schemas())
     columns = {c.name: c for c in tables["pbl_video", "__video_info"]}

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection
-from schemas.datajoint_setup import dj
-from schemas.operations import client_config
-from schemas.store import further_stores
+from pbl_schemas import connection
+from pbl_schemas.datajoint_setup import dj
+from pbl_schemas.operations import client_config
+from pbl_schemas.store import further_stores
 from tests.command import pbl
 
 #: In a process that knows DataJoint and nothing of this project.
@@ -32,7 +32,7 @@ if repair := sys.argv[1]:
     exec(repair)
 print("aggregated", counted.to_arrays("n").tolist())
 print(own.Tried().fetch1("curve").load().tolist(), dj.config.safemode, dj.config.stores["far"]["secret_key"])
-assert not [n for n in sys.modules if n.split(".")[0] in ("schemas", "pbl_pipeline")]
+assert not [n for n in sys.modules if n.split(".")[0] in ("pbl_schemas", "pbl_pipeline")]
 own.Tried().delete()
 """
 
@@ -48,7 +48,7 @@ def stores(monkeypatch: pytest.MonkeyPatch, database: Path, tmp_path: Path) -> N
 @pytest.fixture
 def tried(stores: None):
     """A table of the lab's own with a row."""
-    schemas.activate()
+    pbl_schemas.activate()
     schema = dj.Schema("pbl_tried", connection=connection.connect())
 
     class Tried(dj.Manual):

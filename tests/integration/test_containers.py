@@ -18,7 +18,7 @@ import boto3
 import pytest
 from moto.server import ThreadedMotoServer
 
-from schemas.operations import embedded
+from pbl_schemas.operations import embedded
 from tests import image, until
 
 from . import chain

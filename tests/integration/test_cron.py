@@ -9,16 +9,16 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-import schemas
-from schemas import connection, lab, session, tracking, video
-from schemas.intake import uploads
-from schemas.operations.orphans import orphans, remove
+import pbl_schemas
+from pbl_schemas import connection, lab, session, tracking, video
+from pbl_schemas.intake import uploads
+from pbl_schemas.operations.orphans import orphans, remove
+from pbl_workers import incoming
+from pbl_workers.heartbeat import Silent
+from pbl_workers.loop import Worker
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import register
-from workers import incoming
-from workers.heartbeat import Silent
-from workers.loop import Worker
-from workers.populate import populate
 
 from . import chain
 from .drop import codes, files, look, twice, upload
@@ -43,7 +43,7 @@ def test_whole_files_are_taken_checked_and_registered(drop: Path, archive: Path)
     assert Path(rows[0]["video_path"]).read_bytes() == content
     assert files(drop) == ["P001/2026-11-20/.walk2.mp4.part", "notes.txt"]
     assert len(files(archive)) == 2
-    one = Worker(schemas.computed_tables(), Silent())
+    one = Worker(pbl_schemas.computed_tables(), Silent())
     one.run(once=True)
     assert (len(video.VideoInfo()), one.failed) == (2, 0)
 

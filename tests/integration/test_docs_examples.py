@@ -16,15 +16,15 @@ import pytest
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.study import write_study
+from pbl_schemas import gait, gdi, study
+from pbl_schemas.reading import frames
+from pbl_workers.populate import populate
 from research.cohort import cohort
-from schemas import gait, gdi, study
-from schemas.reading import frames
 from tests import pages
 from tests.command import pbl
 from tests.exported import marked_fit
 from tests.rows import register
 from tests.unit.test_blazepose import asset
-from workers.populate import populate
 
 from .chain import small_video
 

@@ -24,11 +24,11 @@ from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.qc import EMPTY, PASS
 from pbl_pipeline.study import CURVE_PERCENT, CURVE_POINTS, StudyData, read_study, write_study
 from pbl_pipeline.study_report import all_tables, plan, study_figures, study_results
+from pbl_schemas.intake import LaboratoryMarkers, VisitRecord, register
+from pbl_schemas.studies import slices
+from pbl_schemas.studies.study_sheets import import_sheets
+from pbl_workers.populate import populate
 from research import cohort as made
-from schemas.intake import LaboratoryMarkers, VisitRecord, register
-from schemas.studies import slices
-from schemas.studies.study_sheets import import_sheets
-from workers.populate import populate
 
 from . import chain
 from .test_markers import recording

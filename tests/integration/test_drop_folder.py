@@ -16,12 +16,12 @@ import pytest
 
 from pbl_pipeline import temporary
 from pbl_pipeline.bench.detect import numbered
-from schemas import connection, lab, session, video, worker
-from schemas.intake import VisitRecord, ingest, uploads
-from schemas.operations import archive as layout
-from schemas.operations import backup, forget
+from pbl_schemas import connection, lab, session, video, worker
+from pbl_schemas.intake import VisitRecord, ingest, uploads
+from pbl_schemas.operations import archive as layout
+from pbl_schemas.operations import backup, forget
+from pbl_workers import incoming
 from tests.command import pbl
-from workers import incoming
 
 from . import chain
 from .drop import codes, files, look, twice, upload
@@ -170,8 +170,12 @@ def test_a_lock_that_is_held_is_reported(drop: Path):
 
 def test_a_run_that_hangs_is_ended():
     """Also where nothing answers: whatever it was doing, the next run goes on."""
-    hangs = "import schemas, time; schemas.activate = lambda: time.sleep(600)"
-    run = [sys.executable, "-c", f"{hangs}; from workers.cli import cron; cron.AT_MOST_S = 1; cron.cron(['import'])"]
+    hangs = "import pbl_schemas, time; pbl_schemas.activate = lambda: time.sleep(600)"
+    run = [
+        sys.executable,
+        "-c",
+        f"{hangs}; from pbl_workers.cli import cron; cron.AT_MOST_S = 1; cron.cron(['import'])",
+    ]
     assert subprocess.run(run, timeout=300, check=False).returncode == -signal.SIGALRM
 
 

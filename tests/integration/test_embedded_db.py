@@ -17,11 +17,11 @@ import pytest
 from click.testing import CliRunner
 
 from pbl_pipeline.errors import PblError
-from schemas import connection
-from schemas.cli.db import db
-from schemas.operations import embedded
-from schemas.operations.embedded import binaries, process, server
-from schemas.operations.embedded.folder import UNPRIVILEGED, server_account
+from pbl_schemas import connection
+from pbl_schemas.cli.db import db
+from pbl_schemas.operations import embedded
+from pbl_schemas.operations.embedded import binaries, process, server
+from pbl_schemas.operations.embedded.folder import UNPRIVILEGED, server_account
 from tests.command import PBL, program
 from tests.database import new_home, remove_home
 
@@ -390,7 +390,7 @@ def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPa
 
 # ---------------------------------------------------------------- the connection
 
-CONNECT = "from schemas import connection; c = connection.connect(); print('user', c.get_user()); "
+CONNECT = "from pbl_schemas import connection; c = connection.connect(); print('user', c.get_user()); "
 
 
 def python(home: Path, code: str, **more: str) -> tuple[subprocess.CompletedProcess[str], float]:
@@ -398,7 +398,7 @@ def python(home: Path, code: str, **more: str) -> tuple[subprocess.CompletedProc
     were imported; DataJoint keeps one connection a process."""
     frame = """
 import pathlib, sys, time
-import schemas.connection
+import pbl_schemas.connection
 from pbl_pipeline.errors import PblError as E
 begin = time.monotonic()
 try:
@@ -440,7 +440,7 @@ def test_never_set_up_is_not_running(tmp_path: Path):
 
 def test_a_server_that_keeps_silent_is_given_up(tmp_path: Path):
     assert connection.CONNECT_TIMEOUT_S <= 5.0
-    impatient = f"from schemas import connection; connection.CONNECT_TIMEOUT_S = 1.0; {CONNECT}"
+    impatient = f"from pbl_schemas import connection; connection.CONNECT_TIMEOUT_S = 1.0; {CONNECT}"
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = str(silent.getsockname()[1])
         done, seconds = python(tmp_path, impatient, DJ_HOST="127.0.0.1", DJ_PORT=port, DJ_USER="u", DJ_PASS="p")
@@ -470,9 +470,9 @@ def test_a_datajoint_json_nearby_changes_nothing(database: Path, tmp_path: Path)
 
 TABLES = '''
 import numpy as np
-from schemas import connection
-from schemas.operations import embedded
-from schemas.connection import dj
+from pbl_schemas import connection
+from pbl_schemas.operations import embedded
+from pbl_schemas.connection import dj
 schema = dj.Schema()
 @schema
 class A(dj.Manual):

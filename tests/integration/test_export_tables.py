@@ -9,13 +9,13 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import fit, gait, gdi, session
-from schemas.intake import Methods, Sensors, VisitRecord, ingest
-from schemas.reading import fitted_visit, list_fitted, load_visits
-from schemas.reading import visits as reading_visits
+from pbl_schemas import fit, gait, gdi, session
+from pbl_schemas.intake import Methods, Sensors, VisitRecord, ingest
+from pbl_schemas.reading import fitted_visit, list_fitted, load_visits
+from pbl_schemas.reading import visits as reading_visits
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import register
-from workers.populate import populate
 
 from . import chain
 

@@ -9,12 +9,12 @@ import pymysql
 import pytest
 
 import pbl_pipeline.fit
+from pbl_schemas import fit
+from pbl_schemas.jobs import jobs_of
+from pbl_workers import loop, queue
+from pbl_workers.heartbeat import Silent
+from pbl_workers.loop import Worker
 from research.benchmarks import gpu_worker
-from schemas import fit
-from schemas.jobs import jobs_of
-from workers import loop, queue
-from workers.heartbeat import Silent
-from workers.loop import Worker
 
 from . import chain
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from schemas import connection, keypoints, lab, session, video
-from schemas.intake import VisitRecord, ingest
-from schemas.operations import forget
-from schemas.operations.declare import declare_all
+from pbl_schemas import connection, keypoints, lab, session, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.operations import forget
+from pbl_schemas.operations.declare import declare_all
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
-from workers.populate import populate
 
 from . import chain
 

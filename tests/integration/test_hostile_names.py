@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.pipeline
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
 from pbl_pipeline.video import load_camera, read_phone_log
+from pbl_schemas import fit, video
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.intake.calibrations import camera_row
+from pbl_schemas.intake.references import add_reference
+from pbl_schemas.job_errors import error_next_step
+from pbl_schemas.reading.visits import write_visit
+from pbl_workers.populate import populate
 from research.benchmarks import mutated_files as files
-from schemas import fit, video
-from schemas.chain import ON_REQUEST
-from schemas.intake import VisitRecord, ingest
-from schemas.intake.calibrations import camera_row
-from schemas.intake.references import add_reference
-from schemas.job_errors import error_next_step
-from schemas.reading.visits import write_visit
 from tests.command import pbl
 from tests.html_page import Page
 from tests.rows import outcomes
-from workers.populate import populate
 
 from . import chain
 
@@ -73,7 +73,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
         assert "\x1b" not in said
         assert error_next_step(said) == "rename the file or folder"
         assert len(said.splitlines()) == 5
-    run = populate([t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST])
+    run = populate([t.__name__ for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST])
     assert not {t.table: t.errors for t in run.tables if t.errors}
     assert len(fit.SessionFit.Trial()) == len(paths)
     status = pbl("status")

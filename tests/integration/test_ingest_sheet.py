@@ -7,10 +7,10 @@ from pathlib import Path
 import av
 import pytest
 
-from schemas import lab, session, video
-from schemas.intake import videos
-from schemas.intake.recording_sheet import COLUMNS, ingest_sheet
-from schemas.intake.sheets import read_sheets
+from pbl_schemas import lab, session, video
+from pbl_schemas.intake import videos
+from pbl_schemas.intake.recording_sheet import COLUMNS, ingest_sheet
+from pbl_schemas.intake.sheets import read_sheets
 from tests.command import pbl
 from tests.rows import everything
 

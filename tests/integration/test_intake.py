@@ -7,11 +7,11 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
+from pbl_schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
+from pbl_schemas.intake import LaboratoryMarkers, Methods, SeveralCameras, VisitRecord, ingest, register
+from pbl_schemas.intake.recording_sheet import ingest_sheet
+from pbl_schemas.intake.registration import resolve
 from research.benchmarks.many_recordings import archived, register_many
-from schemas import fit, gait, gdi, keypoints, kinetics, lab, session, tracking, video
-from schemas.intake import LaboratoryMarkers, Methods, SeveralCameras, VisitRecord, ingest, register
-from schemas.intake.recording_sheet import ingest_sheet
-from schemas.intake.registration import resolve
 from tests.command import Done, pbl
 from tests.rows import everything_but_refreshes, outcomes
 

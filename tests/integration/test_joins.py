@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 from datajoint import DataJointError
 
-import schemas
+import pbl_schemas
 from docs_site import table_map
-from schemas import fit, gdi, lab, session, video
-from schemas.chain import ON_REQUEST
-from schemas.datajoint_setup import dj
+from pbl_schemas import fit, gdi, lab, session, video
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.datajoint_setup import dj
+from pbl_workers.populate import populate
 from tests.rows import register
-from workers.populate import populate
 
 from . import chain
 
@@ -34,7 +34,7 @@ def visits(module_tables: Path) -> None:
 
 
 def _computed() -> list[Any]:
-    return [t for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
+    return [t for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
 
 def _of_fit() -> list[Any]:
@@ -58,7 +58,7 @@ def test_what_is_computed_from_a_fit_is_joined_with_its_own_visit(visits: None):
         truth = (fit.FitSet.proj("session_id") * session.Session).to_dicts()
         subject = {r["fit_set"]: (r["session_id"], r["subject"]) for r in truth}
         assert all((r["session_id"], r["subject"]) == subject[r["fit_set"]] for r in rows)
-    kinematic = next(t for t in schemas.computed_tables() if t.__name__ == "KinematicError")
+    kinematic = next(t for t in pbl_schemas.computed_tables() if t.__name__ == "KinematicError")
     assert "session_id" in kinematic.heading.secondary_attributes
 
 
@@ -87,7 +87,7 @@ def test_two_results_with_the_video_between_them_are_of_one_visit(visits: None):
 def test_the_section_of_joins_names_every_computed_table(visits: None):
     rows = [row for row in table_map.joins() if row.startswith("| know their")]
     named = {name: "session_id" in row for row in rows for name in re.findall(r"`([a-z]+\.\w+)`", row.split("|")[2])}
-    tables = {f"{t.__module__.removeprefix('schemas.')}.{t.__name__}": t for t in schemas.computed_tables()}
+    tables = {f"{t.__module__.removeprefix('pbl_schemas.')}.{t.__name__}": t for t in pbl_schemas.computed_tables()}
     assert named == {name: "session_id" in table.heading.names for name, table in tables.items()}
 
 

@@ -11,22 +11,22 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.kinetics import MEASURES, METHODS, REASONS, TOO_UNCERTAIN, Kinetics
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.visit import Visit
-from schemas import capture, gait, gdi, kinetics, load_visit, session
-from schemas.intake import Methods, VisitRecord, ingest
-from schemas.intake.records import set_condition
-from schemas.method_rows import insert_methods
-from schemas.reading import frames
-from schemas.reading.status import pipeline_status
-from schemas.reading.visit_progress import visit_progress
-from schemas.reading.why import why
-from schemas.rows import delete_below, utc_now
-from schemas.studies import visit_forms
-from schemas.studies.study_sheets import import_sheets
+from pbl_schemas import capture, gait, gdi, kinetics, load_visit, session
+from pbl_schemas.intake import Methods, VisitRecord, ingest
+from pbl_schemas.intake.records import set_condition
+from pbl_schemas.method_rows import insert_methods
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.status import pipeline_status
+from pbl_schemas.reading.visit_progress import visit_progress
+from pbl_schemas.reading.why import why
+from pbl_schemas.rows import delete_below, utc_now
+from pbl_schemas.studies import visit_forms
+from pbl_schemas.studies.study_sheets import import_sheets
+from pbl_workers.populate import Run, populate
 from tests import not_none
 from tests.command import pbl
 from tests.integration import chain, web
 from tests.rows import register
-from workers.populate import Run, populate
 
 VISIT = {"subject": "P001", "session_label": "2026-01-10"}
 

@@ -10,13 +10,13 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
-from schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, video
-from schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
-from schemas.intake.move import carry_out, plan_move
-from schemas.method_names import keys_named, with_keys
+from pbl_schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, video
+from pbl_schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
+from pbl_schemas.intake.move import carry_out, plan_move
+from pbl_schemas.method_names import keys_named, with_keys
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import everything, outcomes, register
-from workers.populate import populate
 
 from . import chain, test_rigs
 from .drop import twice, upload
@@ -143,7 +143,7 @@ def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, a
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")
     with monkeypatch.context() as patch:
-        patch.setattr("schemas.intake.move.session_ids", lambda visits: 1 / 0)
+        patch.setattr("pbl_schemas.intake.move.session_ids", lambda visits: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             carry_out(plan)
     assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)

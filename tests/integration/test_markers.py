@@ -12,19 +12,19 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.keypoints import WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
+from pbl_schemas import fit, gait, gdi, load_visit, norms, video
+from pbl_schemas.intake import LaboratoryMarkers, Registered, VisitRecord, ingest, register
+from pbl_schemas.operations.forget import forget
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.why import why
+from pbl_schemas.studies import slices
+from pbl_schemas.studies.study_sheets import import_sheets
+from pbl_workers.populate import populate
 from research.walker.views import observe_markers
-from schemas import fit, gait, gdi, load_visit, norms, video
-from schemas.intake import LaboratoryMarkers, Registered, VisitRecord, ingest, register
-from schemas.operations.forget import forget
-from schemas.reading import frames
-from schemas.reading.why import why
-from schemas.studies import slices
-from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
 from tests.inputs import ROWS, trc_text
 from tests.rows import outcomes
 from tests.walking_fit import CYCLE_S
-from workers.populate import populate
 
 from . import chain
 

@@ -13,20 +13,20 @@ from typing import Any
 import datajoint
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, validation, video
-from schemas.chain import ON_REQUEST
-from schemas.decisions import event_corrections
-from schemas.intake import VisitRecord, ingest
-from schemas.reading import frames
+from pbl_schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, validation, video
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.decisions import event_corrections
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.reading import frames
+from pbl_workers import heartbeat, loop
+from pbl_workers.populate import populate
 from tests import mysql, not_none
 from tests.command import pbl
 from tests.database import keep, new_home, put_back, remove_home, server
 from tests.rows import everything, register
-from workers import heartbeat, loop
-from workers.populate import populate
 
 from . import chain, older_tables
 
@@ -38,7 +38,7 @@ OWN = len(migrations.available()) + 1
 SIZES = '''
 """The size of a video's file, which older versions did not record."""
 
-from schemas import connection
+from pbl_schemas import connection
 
 
 def statements(conn):
@@ -135,7 +135,7 @@ def no_table(folder: Path) -> None:
 
 def new(folder: Path) -> None:
     """Declare the tables."""
-    schemas.activate()
+    pbl_schemas.activate()
 
 
 def without_sizes(folder: Path) -> None:
@@ -158,7 +158,7 @@ def without_session(folder: Path) -> dict[str, list[tuple]]:
 
 def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     """Declare the tables and take the migrations from 0006 back."""
-    schemas.activate()
+    pbl_schemas.activate()
     rows = everything()
     _undo(older_tables.undo_0008, older_tables.undo_0007, older_tables.undo_0006)
     return rows
@@ -186,7 +186,7 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
 
 
 def _visits(folder: Path, *days: str) -> dict[str, list[tuple]]:
-    schemas.activate()
+    pbl_schemas.activate()
     for day in days:
         register(chain.small_video(folder, day), session_label=day)
     _compute()
@@ -231,10 +231,10 @@ def add(
 
 def _unbind(patch: pytest.MonkeyPatch) -> None:
     """The classes as a new process has them: what they know of another server's tables must not count here."""
-    from schemas.chain import tables
+    from pbl_schemas.chain import tables
 
     patch.setattr(jobs.jobs_of, "made", {})
-    patch.setattr(schemas._activate, "_methods_done", set())
+    patch.setattr(pbl_schemas._activate, "_methods_done", set())
     for module in stages.modules():
         patch.setattr(module.schema, "database", None)
         patch.setattr(module.schema, "connection", None)
@@ -262,7 +262,7 @@ def migrate_until(line: int | str | None) -> list[str]:
 
 
 def _chain() -> list[str]:
-    return [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
+    return [t.__name__ for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
 
 def test_an_older_database_keeps_its_rows_and_works(older: None, tmp_path: Path):
@@ -470,7 +470,7 @@ def test_a_database_of_a_newer_version_is_left_alone(
     assert not list(tmp_path.iterdir())
     # Also a worker that runs while the tables are migrated stops at its next look.
     forget()
-    schemas.stages.modules()
+    pbl_schemas.stages.modules()
     with pytest.raises(PblError, match=r"9\.9") as error:
         loop.Worker((), heartbeat.Silent()).run(once=True)
     assert error.value.code == "DB_MIGRATION"
@@ -494,7 +494,7 @@ def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_miss
 
 
 def test_one_process_migrates_at_a_time(database: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("schemas.migrations._run.LOCK_S", 1)
+    monkeypatch.setattr("pbl_schemas.migrations._run.LOCK_S", 1)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 0)", (f"{connection.prefix()}_migrate",))
         assert cursor.fetchone() == (1,)
@@ -518,6 +518,6 @@ def test_an_empty_server_gets_the_tables_as_they_are_defined(put: Put, add: Call
 
 
 def test_a_new_database_needs_nothing(database: Path):
-    schemas.activate()
+    pbl_schemas.activate()
     outcome = migrations.migrate()
     assert [s for _, statements in outcome.steps for s in statements] == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.tracking
-import schemas
+import pbl_schemas
 from pbl_pipeline import methods, models
 from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
@@ -17,16 +17,16 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
-from schemas import fit, gait, gdi, keypoints, tracking
-from schemas.intake import Methods, VisitRecord, ingest
-from schemas.method_rows import insert_methods, resolve_method
-from schemas.rows import plain
-from schemas.stored_files import file_ref, stored_file
+from pbl_schemas import fit, gait, gdi, keypoints, tracking
+from pbl_schemas.intake import Methods, VisitRecord, ingest
+from pbl_schemas.method_rows import insert_methods, resolve_method
+from pbl_schemas.rows import plain
+from pbl_schemas.stored_files import file_ref, stored_file
+from pbl_workers import queue, requeue
+from pbl_workers.populate import populate
 from tests import dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
-from workers import queue, requeue
-from workers.populate import populate
 
 from . import chain
 
@@ -50,7 +50,7 @@ def track_people(video_path, params=None, info=None) -> Tracking:
 @pytest.fixture
 def tables(database: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """Empty tables, a registry of its own, the people where they are."""
-    schemas.activate()
+    pbl_schemas.activate()
     monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
     monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     yield

@@ -17,16 +17,16 @@ from typing import Any
 
 import pytest
 
-from schemas import connection, video
-from schemas.intake import VisitRecord, ingest
-from schemas.jobs import jobs_of
-from schemas.operations.declare import declare_all
+from pbl_schemas import connection, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.operations.declare import declare_all
+from pbl_workers import refresh
+from pbl_workers.populate import populate
 from tests import mysql
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything, register, remove_all
-from workers import refresh
-from workers.populate import populate
 
 from . import chain, contention
 

@@ -11,13 +11,13 @@ import pytest
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GaitMetrics
-from schemas import fit, gait, gdi, lab, load_visit, norms, session
-from schemas.intake import Methods, VisitRecord, ingest
-from schemas.reading import frames
+from pbl_schemas import fit, gait, gdi, lab, load_visit, norms, session
+from pbl_schemas.intake import Methods, VisitRecord, ingest
+from pbl_schemas.reading import frames
+from pbl_workers.populate import populate
 from tests import not_none
 from tests.command import pbl
 from tests.rows import outcomes, remove_all
-from workers.populate import populate
 
 from . import chain
 

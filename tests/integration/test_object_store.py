@@ -8,15 +8,15 @@ import pytest
 from moto.server import ThreadedMotoServer
 
 import pbl_pipeline.video
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, store, tracking, video
-from schemas.intake import VisitRecord, ingest
-from schemas.operations import backup, forget
-from schemas.operations.declare import declare_all
-from schemas.stored_files import file_ref, stored_file
+from pbl_schemas import connection, store, tracking, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.operations import backup, forget
+from pbl_schemas.operations.declare import declare_all
+from pbl_schemas.stored_files import file_ref, stored_file
+from pbl_workers.incoming import import_uploads
 from tests.rows import remove_all
-from workers.incoming import import_uploads
 
 from . import chain
 
@@ -38,7 +38,7 @@ def remote(database: Path, server: str, tmp_path: Path, monkeypatch: pytest.Monk
     """The store `arrays` is a bucket; key and secret come from files, as containers mount them."""
     (tmp_path / "key").write_text("pbl-worker\n")
     (tmp_path / "secret").write_text(SECRET + "\n")
-    schemas.activate()
+    pbl_schemas.activate()
     chain.install(monkeypatch)
     monkeypatch.setenv("PBL_S3_ENDPOINT", server)
     monkeypatch.setenv("PBL_S3_BUCKET", "walks")

@@ -14,18 +14,18 @@ import pymysql
 import pytest
 
 import pbl_pipeline.video
-from schemas import connection, fit, lab, review, session, tracking, video, worker
-from schemas.decisions import review_decisions
-from schemas.job_errors import error_code, of_server
-from schemas.jobs import jobs_of
-from schemas.operations import catalog
-from schemas.operations.orphans import orphans
-from schemas.reading.status import pipeline_status
-from schemas.store import store_error
-from schemas.stored_files import remove_left_over
+from pbl_schemas import connection, fit, lab, review, session, tracking, video, worker
+from pbl_schemas.decisions import review_decisions
+from pbl_schemas.job_errors import error_code, of_server
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.operations import catalog
+from pbl_schemas.operations.orphans import orphans
+from pbl_schemas.reading.status import pipeline_status
+from pbl_schemas.store import store_error
+from pbl_schemas.stored_files import remove_left_over
+from pbl_workers import queue, recover, refresh, run_job
+from pbl_workers.heartbeat import Heartbeat
 from tests.rows import register
-from workers import queue, recover, refresh, run_job
-from workers.heartbeat import Heartbeat
 
 from . import chain
 from .jobs import at_once, first_job, jobs_left, queued, work
@@ -166,7 +166,7 @@ def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, monkeypatch, 
 
 
 def test_a_worker_starts_while_the_database_takes_nothing(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("workers.heartbeat.PERIOD_S", 0.02)
+    monkeypatch.setattr("pbl_workers.heartbeat.PERIOD_S", 0.02)
     failing(monkeypatch, connection, "another", FULL)
     with Heartbeat("cpu") as beats:
         beats.count("VideoInfo", 1, 0, 0.1)

@@ -9,15 +9,15 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import GDI_METHODS, TASK_MEASURES
 from pbl_pipeline.paramset import Paramset
-from schemas import fit, gait, gdi, load_visit, norms, session, video
-from schemas.intake import Methods, VisitRecord, ingest
-from schemas.intake.records import set_condition
-from schemas.method_rows import insert_methods
-from schemas.reading import frames
-from schemas.reading.shown import shown_visit
+from pbl_schemas import fit, gait, gdi, load_visit, norms, session, video
+from pbl_schemas.intake import Methods, VisitRecord, ingest
+from pbl_schemas.intake.records import set_condition
+from pbl_schemas.method_rows import insert_methods
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.shown import shown_visit
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import outcomes, register
-from workers.populate import populate
 
 from . import chain
 

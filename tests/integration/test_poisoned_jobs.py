@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.video
-from schemas import connection, fit, gait, keypoints, tracking, video
-from schemas.job_errors import error_code, error_found
-from schemas.jobs import jobs_of
+from pbl_schemas import connection, fit, gait, keypoints, tracking, video
+from pbl_schemas.job_errors import error_code, error_found
+from pbl_schemas.jobs import jobs_of
+from pbl_workers import queue, requeue, run_job
 from tests.rows import register
-from workers import queue, requeue, run_job
 
 from .jobs import queued, work
 

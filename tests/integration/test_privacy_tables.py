@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.deidentify.video_copy
-import schemas
+import pbl_schemas
 from pbl_pipeline.deidentify import Head, Heads
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.video import VideoInfo, probe
-from schemas import jobs, privacy
-from schemas.operations.forget import forget
-from schemas.reading.status import pipeline_status
-from schemas.reading.why import why
-from schemas.stored_files import file_ref, stored_file
+from pbl_schemas import jobs, privacy
+from pbl_schemas.operations.forget import forget
+from pbl_schemas.reading.status import pipeline_status
+from pbl_schemas.reading.why import why
+from pbl_schemas.stored_files import file_ref, stored_file
+from pbl_workers.populate import populate
 from tests.rows import register, remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
-from workers.populate import populate
 
 N = 12
 
@@ -37,7 +37,7 @@ def find_heads(video: Path, params: object, info: VideoInfo) -> Heads:
 
 @pytest.fixture
 def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    schemas.activate()
+    pbl_schemas.activate()
     monkeypatch.setattr(pbl_pipeline.deidentify.video_copy, "find_heads", find_heads)
     jobs.keys_of.made.pop(privacy.Deidentified, None)
     yield monkeypatch

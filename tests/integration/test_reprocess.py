@@ -5,21 +5,21 @@ from pathlib import Path
 
 import pytest
 
-import schemas
-from schemas import chain as tables_in_order
-from schemas import connection, tracking, video
-from schemas.chain import ON_REQUEST
-from schemas.decisions import review_decisions
+import pbl_schemas
+from pbl_schemas import chain as tables_in_order
+from pbl_schemas import connection, tracking, video
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.decisions import review_decisions
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import register
-from workers.populate import populate
 
 from . import chain
 from .jobs import counts
 
 
 def _chain() -> list[str]:
-    return [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
+    return [t.__name__ for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST]
 
 
 def test_video_info_again_deletes_what_was_computed_from_it(tables: None, tmp_path: Path):
@@ -55,7 +55,7 @@ def test_every_table_has_a_foreign_key_to_each_result_that_it_reads(
     server, asked = connection.connect(), []
     real = server.query
     monkeypatch.setattr(server, "query", lambda text, *a, **k: (asked.append(text), real(text, *a, **k))[1])
-    for table in schemas.computed_tables():
+    for table in pbl_schemas.computed_tables():
         for key in table().keys()[:1]:
             asked.clear()
             table().make_fetch(dict(key))

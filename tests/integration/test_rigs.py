@@ -14,23 +14,23 @@ import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
+from pbl_schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video
+from pbl_schemas.decisions.review_decisions import decide_person
+from pbl_schemas.intake import SeveralCameras, VisitRecord, ingest, register
+from pbl_schemas.job_errors import error_code
+from pbl_schemas.operations.forget import forget
+from pbl_schemas.plan import fit_set_hash
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.visits import methods_of
+from pbl_schemas.reading.why import why
+from pbl_schemas.studies import slices
+from pbl_schemas.studies.study_sheets import import_sheets
+from pbl_workers.populate import populate
 from research.walker.views import observe_views
-from schemas import fit, gait, gdi, jobs, load_visit, norms, validation, video
-from schemas.decisions.review_decisions import decide_person
-from schemas.intake import SeveralCameras, VisitRecord, ingest, register
-from schemas.job_errors import error_code
-from schemas.operations.forget import forget
-from schemas.plan import fit_set_hash
-from schemas.reading import frames
-from schemas.reading.visits import methods_of
-from schemas.reading.why import why
-from schemas.studies import slices
-from schemas.studies.study_sheets import import_sheets
 from tests.command import pbl
 from tests.rows import outcomes
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walking_fit import CYCLE_S
-from workers.populate import populate
 
 from . import chain
 

@@ -10,19 +10,19 @@ import pymysql
 import pytest
 import yaml
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
-from schemas import connection, gdi, lab, session, video, worker
-from schemas.chain import ON_REQUEST
-from schemas.datajoint_setup import dj
-from schemas.intake import VisitRecord, ingest
-from schemas.operations import roles
-from schemas.operations.declare import declare_all
-from schemas.reading import frames
+from pbl_schemas import connection, gdi, lab, session, video, worker
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.datajoint_setup import dj
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.operations import roles
+from pbl_schemas.operations.declare import declare_all
+from pbl_schemas.reading import frames
+from pbl_workers import queue, refresh, run_job
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.rows import remove_all
-from workers import queue, refresh, run_job
-from workers.populate import populate
 
 from . import chain
 
@@ -83,7 +83,7 @@ def refused(sql: str) -> bool:
 def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     chain.install(monkeypatch)
     login("worker")
-    schemas.activate()
+    pbl_schemas.activate()
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
     run = populate()
     assert all(t.done == 1 for t in run.tables if t.table not in ON_REQUEST), run
@@ -95,7 +95,7 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     assert refused("SELECT * FROM mysql.user")
     assert refused("CREATE USER 'x'@'%' IDENTIFIED BY 'long-enough-1'")
     login("analyst")
-    schemas.activate(methods=False)
+    pbl_schemas.activate(methods=False)
     assert frames.session_summary()["subject"].tolist() == ["P001"]
     assert lab.Subject.to_arrays("subject").tolist() == ["P001"]
     for sql in (
@@ -131,7 +131,7 @@ def test_without_the_right_the_account_that_has_it_is_named(
     login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], account: str
 ):
     login("worker")
-    schemas.activate()
+    pbl_schemas.activate()
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
     refresh.refresh()
     (job,) = queue.claim(video.VideoInfo, 1)
@@ -155,7 +155,7 @@ def test_an_analyst_cannot_hold_what_a_refresh_needs(login: Login):
     login("analyst")
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         login("worker")
-        schemas.activate()
+        pbl_schemas.activate()
         worker.Turn.insert1({"work": "refresh", "turn_lock": "of one that was killed", "turn_connection": 1})
         for name in ("pbl_refresh", "refresh", "of one that was killed"):
             cursor.execute("SELECT GET_LOCK(%s, 0)", (name,))
@@ -212,13 +212,13 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     assert done.code == 0, done.err
     assert "maria from 127.0.0.1: select, show view on pbl_*, all on pbl_mylab" in done.out
     login("worker")
-    schemas.activate()
+    pbl_schemas.activate()
     for subject in ("P001", "P002"):
         ingest([chain.small_video(tmp_path, subject)], VisitRecord(subject, "2026-03-01"))
     populate()
 
     login("maria")
-    schemas.activate(methods=False)
+    pbl_schemas.activate(methods=False)
     schema = dj.Schema(connection.schema_name("mylab"), context={"gdi": gdi})
 
     @schema

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.video import read_frames
+from pbl_schemas import gdi, qc
+from pbl_schemas.reading import comparison
+from pbl_workers.populate import populate
 from research.benchmarks.same_walk import VARIANTS, encoded
-from schemas import gdi, qc
-from schemas.reading import comparison
 from tests.rows import register, remove_all
 from tests.unit.test_blazepose import asset
 from tests.videos import write_video
-from workers.populate import populate
 
 pytestmark = [pytest.mark.long, pytest.mark.slow]
 

@@ -16,9 +16,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from pbl_pipeline.errors import PblError
-from schemas import connection
-from schemas.operations import embedded
-from schemas.operations.embedded import Folder, process
+from pbl_schemas import connection
+from pbl_schemas.operations import embedded
+from pbl_schemas.operations.embedded import Folder, process
 from tests.command import PBL
 from tests.database import new_home, remove_home
 
@@ -103,7 +103,7 @@ def cipher() -> str:
 
 
 SHOW = """
-from schemas import connection
+from pbl_schemas import connection
 print("cipher", connection.connect().query("SHOW SESSION STATUS LIKE 'Ssl_cipher'").fetchone()[1] or "none")
 """
 

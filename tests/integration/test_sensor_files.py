@@ -8,16 +8,16 @@ import pytest
 import pbl_pipeline.fit
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
-from schemas import fit, keypoints, lab, load_visit, qc, video
-from schemas.intake import Sensors, VisitRecord, ingest
-from schemas.stored_files import file_ref, stored_file
+from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
+from pbl_schemas.intake import Sensors, VisitRecord, ingest
+from pbl_schemas.stored_files import file_ref, stored_file
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
 from tests.phone_film import as_zip, film, sensor_logger
 from tests.quicktime import insert, meta
 from tests.rows import outcomes, register
-from workers.populate import populate
 
 pytestmark = pytest.mark.usefixtures("tables")
 

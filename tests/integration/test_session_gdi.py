@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from schemas import fit, gait, gdi, qc
-from schemas.reading.status import pipeline_status
-from schemas.rows import delete_below
+from pbl_schemas import fit, gait, gdi, qc
+from pbl_schemas.reading.status import pipeline_status
+from pbl_schemas.rows import delete_below
+from pbl_workers import refresh
+from pbl_workers.populate import populate
 from tests.integration import chain
 from tests.rows import register
-from workers import refresh
-from workers.populate import populate
 
 BEFORE = ["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput", "SessionFit"]
 OF_TRIALS = ["GaitEvents", "GaitCycle", "Spatiotemporal", "GDI"]

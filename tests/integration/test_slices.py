@@ -9,14 +9,14 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import read_study, write_study
 from pbl_pipeline.study_report import all_tables, plan, study_results
-from schemas import fit, gait, gdi, session, study, video
-from schemas.intake import VisitRecord, ingest
-from schemas.intake.records import set_condition
-from schemas.reading import frames
-from schemas.studies import slices
-from schemas.studies.study_sheets import import_sheets
+from pbl_schemas import fit, gait, gdi, session, study, video
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.intake.records import set_condition
+from pbl_schemas.reading import frames
+from pbl_schemas.studies import slices
+from pbl_schemas.studies.study_sheets import import_sheets
+from pbl_workers.populate import populate
 from tests.command import pbl
-from workers.populate import populate
 
 from . import chain
 

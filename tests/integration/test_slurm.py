@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from pbl_pipeline.bench.detect import numbered
-from schemas import tracking, video
-from schemas.operations import embedded
-from schemas.operations.orphans import orphans
+from pbl_schemas import tracking, video
+from pbl_schemas.operations import embedded
+from pbl_schemas.operations.orphans import orphans
 from tests import slurm, until
 from tests.rows import register
 

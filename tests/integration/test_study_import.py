@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from openpyxl import Workbook
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
-from schemas import lab, session, study, video
-from schemas.intake import sheets
-from schemas.studies import study_sheets
+from pbl_schemas import lab, session, study, video
+from pbl_schemas.intake import sheets
+from pbl_schemas.studies import study_sheets
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 
@@ -29,7 +29,7 @@ SCORES = "subject;visit;instrument;value\nP001;pre;10MWT_s;12.5\nP001;after;10MW
 
 @pytest.fixture
 def empty(database: Path) -> Iterator[None]:
-    schemas.activate()
+    pbl_schemas.activate()
     yield
     remove_all()
 

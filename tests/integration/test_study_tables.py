@@ -9,20 +9,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.study import classes_of, minimal_change_at
-from schemas import lab, methods, session, study
-from schemas.instruments import INSTRUMENTS
-from schemas.operations import forget
-from schemas.rows import utc_now
+from pbl_schemas import lab, methods, session, study
+from pbl_schemas.instruments import INSTRUMENTS
+from pbl_schemas.operations import forget
+from pbl_schemas.rows import utc_now
 from tests.rows import remove_all
 
 
 @pytest.fixture
 def two_people(database: Path) -> Iterator[None]:
     """P001 with sessions 1 and 2, P002 with session 3; no videos."""
-    schemas.activate(methods=False)
+    pbl_schemas.activate(methods=False)
     people = ({"subject": s, "population": "patient", "subject_created": utc_now()} for s in ("P001", "P002"))
     lab.Subject.insert(people)
     session.Session.insert(

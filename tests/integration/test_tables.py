@@ -20,28 +20,28 @@ import pbl_pipeline.gait
 import pbl_pipeline.keypoints
 import pbl_pipeline.tracking
 import pbl_pipeline.video
-import schemas
-import workers.populate
+import pbl_schemas
+import pbl_workers.populate
 from docs_site import table_map
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera
-from schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, tracking, video
-from schemas.decisions.candidates import candidates, write_sheet
-from schemas.decisions.review_decisions import decide_person
-from schemas.intake import Methods, VisitRecord, ingest
-from schemas.method_rows import resolve_method
-from schemas.plan import plan_fit_sets
-from schemas.reading import frames
-from schemas.reading.status import pipeline_status
+from pbl_schemas import fit, gait, gdi, keypoints, lab, load_visit, qc, reading, session, tracking, video
+from pbl_schemas.decisions.candidates import candidates, write_sheet
+from pbl_schemas.decisions.review_decisions import decide_person
+from pbl_schemas.intake import Methods, VisitRecord, ingest
+from pbl_schemas.method_rows import resolve_method
+from pbl_schemas.plan import plan_fit_sets
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.status import pipeline_status
+from pbl_workers.populate import populate
 from tests import not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.rows import register, remove_all
 from tests.walking_fit import walking_fit
-from workers.populate import populate
 
 from . import chain
 from .jobs import hold, jobs_left
@@ -408,7 +408,7 @@ def test_a_decision_triggers_exactly_the_rows_that_depend_on_it(tables: None, tm
     populate()
 
     def computed() -> dict[str, dict]:
-        origin = {t: next(c for c in t.heading.names if c.endswith("_computed")) for t in schemas.computed_tables()}
+        origin = {t: next(c for c in t.heading.names if c.endswith("_computed")) for t in pbl_schemas.computed_tables()}
         return {
             t.__name__: {tuple(r[k] for k in t.primary_key): r[column] for r in t.to_dicts()}
             for t, column in origin.items()
@@ -716,7 +716,7 @@ def test_only_errors_that_say_nothing_about_the_video_are_tried_again(tables: No
 def test_datajoints_own_populate_computes_the_whole_chain(tables: None, tmp_path: Path):
     """As somebody who knows DataJoint and nothing of ours would do it: no planning by hand, no worker."""
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2"))
-    for table in schemas.computed_tables():
+    for table in pbl_schemas.computed_tables():
         found = table.populate(reserve_jobs=True, suppress_errors=True)
         assert found["error_list"] == [], table.__name__
     assert len(fit.SessionFit()) == len(gdi.SessionGdi()) == 1
@@ -747,7 +747,7 @@ def test_every_float_column_states_its_unit(declared: None):
 
 
 def test_every_computed_table_states_its_origin(declared: None):
-    for table in schemas.computed_tables():
+    for table in pbl_schemas.computed_tables():
         prefix = table_map.origin_prefix(table)
         assert prefix, table.__name__
         columns = {prefix + c for c in ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")}
@@ -783,8 +783,8 @@ def test_the_page_of_the_tables_is_up_to_date():
 
 
 def test_methods_are_frozen(declared: None):
-    from schemas import methods
-    from schemas.method_rows import insert_methods
+    from pbl_schemas import methods
+    from pbl_schemas.method_rows import insert_methods
 
     before = len(tracking.TrackingMethod()), len(fit.BodyModel()), len(gdi.NormativeSet())
     methods.insert_all()
@@ -800,12 +800,12 @@ def test_methods_are_frozen(declared: None):
 @embedded_only
 def test_the_demo_stops_when_it_is_interrupted(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from pbl_pipeline import assets
-    from workers.cli.demo import demo
+    from pbl_workers.cli.demo import demo
 
     path = chain.small_video(tmp_path, "walk")
     camera = chain.camera_file(tmp_path)
     monkeypatch.setattr(assets, "fetch", lambda name: camera if name == "demo_camera" else path)
-    monkeypatch.setattr(workers.populate, "populate", lambda: workers.populate.Run([], interrupted=True))
+    monkeypatch.setattr(pbl_workers.populate, "populate", lambda: pbl_workers.populate.Run([], interrupted=True))
     result = CliRunner().invoke(demo, ["--out", str(tmp_path / "out")])
     assert result.exit_code == 130, result.output
     assert "[5/5]" not in result.output

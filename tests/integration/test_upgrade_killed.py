@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from pbl_pipeline import settings
-from schemas import connection, migrations
+from pbl_schemas import connection, migrations
 from tests.database import embedded_only, installation, keep, put_back
 from tests.rows import everything
 

@@ -8,23 +8,23 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.body import load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.validation import Reference, compare, reference_of_fit
-from schemas import lab, validation, video
-from schemas.chain import is_wanted
-from schemas.intake import VisitRecord, ingest
-from schemas.intake.references import add_reference, find_video, read_reference
-from schemas.reading import frames
-from schemas.reading.status import pipeline_status
+from pbl_schemas import lab, validation, video
+from pbl_schemas.chain import is_wanted
+from pbl_schemas.intake import VisitRecord, ingest
+from pbl_schemas.intake.references import add_reference, find_video, read_reference
+from pbl_schemas.reading import frames
+from pbl_schemas.reading.status import pipeline_status
+from pbl_workers.populate import populate
 from tests import SHARED
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register
 from tests.walking_fit import walking_fit
-from workers.populate import populate
 
 from . import chain
 
@@ -123,7 +123,7 @@ def test_every_result_of_a_person_goes_with_them_and_nothing_of_another(tables: 
         (number,) = register(path, subject=subject)
         add_reference(number, truth)
     populate()
-    tables_used = [t for t in schemas.computed_tables() if is_wanted(t)]
+    tables_used = [t for t in pbl_schemas.computed_tables() if is_wanted(t)]
     results = {t.__name__: len(t()) for t in tables_used}
     assert set(results.values()) == {2}
     (lab.Subject & {"subject": "P001"}).delete(prompt=False, part_integrity="cascade")

@@ -30,17 +30,17 @@ from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import Tracking
 from pbl_pipeline.video import VideoInfo, probe
 from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit
-from schemas import load_visit as load_from_tables
-from schemas.decisions import event_corrections
-from schemas.intake import Methods, ingest
-from schemas.intake import VisitRecord as Whose
+from pbl_schemas import load_visit as load_from_tables
+from pbl_schemas.decisions import event_corrections
+from pbl_schemas.intake import Methods, ingest
+from pbl_schemas.intake import VisitRecord as Whose
+from pbl_workers.populate import populate
+from pbl_workers.web import ResultsFolder
 from tests import not_none
 from tests.command import pbl
 from tests.integration import chain, test_markers, test_rigs, web
 from tests.rows import register, remove_all
 from tests.same_visit import ROUNDED, as_stored, assert_same, assert_same_exports, assert_same_text, leaves
-from workers.populate import populate
-from workers.web import ResultsFolder
 
 NORM = "gillette-166-three-angles"
 MASS_KG = 70.0

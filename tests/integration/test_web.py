@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 
-from schemas import fit, gdi, qc, study
-from schemas.reading import visit_list
-from schemas.reading.shown import shown_visit
-from schemas.reading.visit_list import Filter, visit_page
+from pbl_schemas import fit, gdi, qc, study
+from pbl_schemas.reading import visit_list
+from pbl_schemas.reading.shown import shown_visit
+from pbl_schemas.reading.visit_list import Filter, visit_page
+from pbl_workers.populate import populate
+from pbl_workers.web import Options, create_app, export
+from pbl_workers.web.access import HOURS, Sessions
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import new_visit, register
-from workers.populate import populate
-from workers.web import Options, create_app, export
-from workers.web.access import HOURS, Sessions
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_filters_that_do_not_exist_are_left_out(four_visits: None, query: str):
 
 
 def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, monkeypatch: pytest.MonkeyPatch):
-    from schemas.operations import embedded
+    from pbl_schemas.operations import embedded
 
     browser = web.client()
     assert browser.get("/visits").status_code == 200

@@ -18,13 +18,13 @@ from click.testing import CliRunner
 from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
+from pbl_workers.cli.web import web
+from pbl_workers.web import Options, Where, accounts, certificates, connections, create_app, serve
+from pbl_workers.web.access import IDLE_HOURS, Sessions
+from pbl_workers.web.accounts import Accounts, Attempts
+from pbl_workers.web.serve import config
 from tests.integration.web import post, running
 from tests.rows import new_visit
-from workers.cli.web import web
-from workers.web import Options, Where, accounts, certificates, connections, create_app, serve
-from workers.web.access import IDLE_HOURS, Sessions
-from workers.web.accounts import Accounts, Attempts
-from workers.web.serve import config
 
 BASE = "https://gait.example"
 WORDS = "correct horse battery staple"
@@ -124,7 +124,7 @@ def test_the_commands(cheap: None, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_backup_has_no_accounts(tables: None, tmp_path: Path, cheap: None):
-    from schemas.operations.backup import backup
+    from pbl_schemas.operations.backup import backup
 
     Accounts().add("A", ["reader"], WORDS)
     try:
@@ -405,14 +405,14 @@ def test_only_the_proxy_is_answered_and_believed(known: Accounts):
 def test_a_page_that_is_ended_stops_the_database_that_it_started(tmp_path: Path, number: signal.Signals):
     script = """
 import contextlib, sys
-from workers.web import Where, serve
+from pbl_workers.web import Where, serve
 @contextlib.contextmanager
 def database():
     try:
         yield
     finally:
         print("stopped", flush=True)
-sys.modules["workers.web.serve"].database = database
+sys.modules["pbl_workers.web.serve"].database = database
 serve(Where(port=0))
 """
     page = subprocess.Popen([sys.executable, "-u", "-c", script], stdout=subprocess.PIPE, text=True)

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 from starlette.routing import Route
 
-from schemas import lab, session, study, video
-from schemas.jobs import jobs_of
+from pbl_schemas import lab, session, study, video
+from pbl_schemas.jobs import jobs_of
+from pbl_workers.populate import populate
+from pbl_workers.web import Options, Where, connections, create_app
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
-from workers.populate import populate
-from workers.web import Options, Where, connections, create_app
 
 #: What a page must never run, whatever it stands in.
 EVIL = '"><img src=x onerror=alert(1)><script>document.title="pwned"</script>'

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas.operations import embedded, forget
-from schemas.review import Viewing
+from pbl_schemas.operations import embedded, forget
+from pbl_schemas.review import Viewing
+from pbl_workers.web import Where, audit, serve
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.web import Where, audit, serve
 
 
 @pytest.fixture

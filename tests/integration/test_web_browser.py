@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
+from pbl_workers.populate import populate
 from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
-from workers.populate import populate
 
 #: In the page: while the video plays, the number in each shown picture (`numbered_frames`: its grey is 8 times the
 #: number modulo 30) and the frame of the body that is drawn then.

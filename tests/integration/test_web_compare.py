@@ -14,14 +14,14 @@ import pbl_pipeline.fit
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import IMPORTANT_CHANGE, chances, change_sd
-from schemas import fit, gait, gdi, study
-from schemas.reading import comparison, frames, registered
+from pbl_schemas import fit, gait, gdi, study
+from pbl_schemas.reading import comparison, frames, registered
+from pbl_workers.populate import populate
+from pbl_workers.web.compare import charts_of, without
 from tests import not_none, until
 from tests.integration import chain, web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.populate import populate
-from workers.web.compare import charts_of, without
 
 #: What the legs' angles of the second visit are of those of the first.
 LESS = 0.8
@@ -248,7 +248,7 @@ def test_the_page_has_curves_measures_and_videos_without_scripts(visits: None):
 
 
 def test_a_video_that_is_gone_leaves_the_rest(visits: None, monkeypatch: pytest.MonkeyPatch):
-    from workers.web.source import Videos
+    from pbl_workers.web.source import Videos
 
     def gone(self: Videos, number: int) -> Path:
         raise PblError("VIDEO_MISSING", found="no file", expected="a video", next_step="bring it back")

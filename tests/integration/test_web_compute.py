@@ -8,17 +8,17 @@ from typing import Any
 
 import pytest
 
-from schemas import fit, gdi, qc, tracking
-from schemas.decisions import review_decisions
-from schemas.jobs import jobs_of
-from schemas.reading.visit_progress import visit_progress
+from pbl_schemas import fit, gdi, qc, tracking
+from pbl_schemas.decisions import review_decisions
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.reading.visit_progress import visit_progress
+from pbl_workers import queue, refresh, run_job
+from pbl_workers.populate import populate
+from pbl_workers.web.computing import told
 from tests import until
 from tests.integration import compute_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
-from workers import queue, refresh, run_job
-from workers.populate import populate
-from workers.web.computing import told
 
 
 @pytest.fixture

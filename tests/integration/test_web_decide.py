@@ -11,22 +11,22 @@ import pymysql
 import pytest
 
 from pbl_pipeline.errors import PblError
-from schemas import fit, gait, gdi, qc, tracking
-from schemas.datajoint_setup import dj
-from schemas.decisions import review_decisions
-from schemas.intake.records import set_height
-from schemas.operations import forget
-from schemas.reading import visit_list
-from schemas.reading.usable import Usable, usable
-from schemas.review import Decision
-from schemas.rows import delete_below
-from schemas.transactions import in_transaction
+from pbl_schemas import fit, gait, gdi, qc, tracking
+from pbl_schemas.datajoint_setup import dj
+from pbl_schemas.decisions import review_decisions
+from pbl_schemas.intake.records import set_height
+from pbl_schemas.operations import forget
+from pbl_schemas.reading import visit_list
+from pbl_schemas.reading.usable import Usable, usable
+from pbl_schemas.review import Decision
+from pbl_schemas.rows import delete_below
+from pbl_schemas.transactions import in_transaction
+from pbl_workers.populate import populate
+from pbl_workers.web.source import TablesSource
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything, register
-from workers.populate import populate
-from workers.web.source import TablesSource
 
 
 @computed_once

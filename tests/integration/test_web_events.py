@@ -13,23 +13,23 @@ import pytest
 
 import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
-from schemas import fit, gait, gdi, load_visit, qc, study
-from schemas.decisions import event_corrections, review_decisions
-from schemas.intake import move
-from schemas.operations.forget import forget
-from schemas.reading import list_fitted
-from schemas.reading.shown import shown_recording, shown_visit
-from schemas.reading.visit_list import Filter, visit_page
-from schemas.review import Decision
-from schemas.rows import delete_below
-from schemas.studies import slices
+from pbl_schemas import fit, gait, gdi, load_visit, qc, study
+from pbl_schemas.decisions import event_corrections, review_decisions
+from pbl_schemas.intake import move
+from pbl_schemas.operations.forget import forget
+from pbl_schemas.reading import list_fitted
+from pbl_schemas.reading.shown import shown_recording, shown_visit
+from pbl_schemas.reading.visit_list import Filter, visit_page
+from pbl_schemas.review import Decision
+from pbl_schemas.rows import delete_below
+from pbl_schemas.studies import slices
+from pbl_workers.populate import populate
+from pbl_workers.web import export
+from pbl_workers.web.corrections import _events
 from tests import not_none
 from tests.integration import decide_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
-from workers.populate import populate
-from workers.web import export
-from workers.web.corrections import _events
 
 
 @computed_once
@@ -220,7 +220,7 @@ def test_what_is_refused_changes_nothing(visit: str):
 def test_two_people_correct_at_the_same_moment(visit: str):
     found = not_none(event_corrections.shown_events(1))
     calls = [(1, moved(by=d), name, found.state) for d, name in ((0.1, "A. First"), (0.05, "B. Second"))]
-    late, done = decide_target.at_once("schemas.decisions.event_corrections.save", *calls)
+    late, done = decide_target.at_once("pbl_schemas.decisions.event_corrections.save", *calls)
     assert (done, late[0]) == (("done", ""), "DECIDED_MEANWHILE")
     assert f"{gait.EventCorrection.fetch1('correction_by')} decided for by hand, changed 1" in late[1]
     assert len(Decision()) == 1
@@ -261,7 +261,7 @@ def test_a_decision_waits_for_the_insert_that_reads_what_it_changes(visit: str):
     """Rows of corrected events that are being read inside a transaction are not changed before its end."""
     from contextlib import closing
 
-    from schemas import connection
+    from pbl_schemas import connection
 
     save(1, moved())
     key = not_none(fit.trial_key(1))

@@ -16,8 +16,9 @@ import pbl_pipeline
 import pbl_pipeline.fit
 from pbl_pipeline import texts
 from pbl_pipeline.kinetics import REASONS
-from schemas import session, study
-from schemas.intake.records import set_condition
+from pbl_schemas import session, study
+from pbl_schemas.intake.records import set_condition
+from pbl_workers.populate import populate
 from tests import not_none
 from tests.german import english_of, english_words
 from tests.html_page import commands_in
@@ -26,7 +27,6 @@ from tests.integration.chain import fit_upright, small_video
 from tests.rows import register
 from tests.source import ROOT, files, nodes
 from tests.videos import constant_rate, numbered_frames, write_video
-from workers.populate import populate
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +245,7 @@ def test_any_value_of_any_field_is_taken_or_refused_beside_it(clinic: None, engl
 
 def advice() -> Iterator[str]:
     """Advice of every check in the library and the tables, with a number for what is filled in."""
-    for file in files("pbl_pipeline", "schemas"):
+    for file in files("pbl_pipeline", "pbl_schemas"):
         tree = nodes(file)
         named: dict[str, list[ast.expr]] = {}
         for node in tree:
@@ -283,10 +283,13 @@ def test_the_advice_of_every_check_has_its_german(english: set[str]):
 
 #: Where a page or what it calls refuses; what only commands and JSON say is left out.
 REFUSING = (
-    "schemas/studies/visit_forms.py", "schemas/decisions/review_decisions.py", "schemas/decisions/event_corrections.py",
-    "schemas/reading/shown.py", "schemas/reading/trend.py", "workers/browser_uploads.py", "workers/phone_uploads.py",
-    "workers/incoming.py:check_room",
-    *(f"workers/web/{name}.py" for name in ("registration", "decide", "computing", "reports", "movement")),
+    *(f"schemas/pbl_schemas/{name}.py" for name in (
+        "studies/visit_forms", "decisions/review_decisions", "decisions/event_corrections", "reading/shown",
+        "reading/trend",
+    )),
+    *(f"workers/pbl_workers/{name}.py" for name in ("browser_uploads", "phone_uploads")),
+    "workers/pbl_workers/incoming.py:check_room",
+    *(f"workers/pbl_workers/web/{name}.py" for name in ("registration", "decide", "computing", "reports", "movement")),
 )  # fmt: skip
 
 

@@ -8,12 +8,12 @@ import pytest
 
 from pbl_pipeline import settings
 from pbl_pipeline.visit import visit_facts
-from schemas import load_visit
+from pbl_schemas import load_visit
+from pbl_workers.populate import populate
 from tests import not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.populate import populate
 
 PAGES = ("/visits.json", "/visits/1.json", "/recordings/1.json", "/compare.json?v=1&v=2")
 

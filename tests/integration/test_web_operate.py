@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from schemas import video
-from schemas.jobs import jobs_of
-from schemas.reading import status
-from schemas.review import Decision
+from pbl_schemas import video
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.reading import status
+from pbl_schemas.review import Decision
+from pbl_workers.populate import populate
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
-from workers.populate import populate
 
 
 @pytest.fixture

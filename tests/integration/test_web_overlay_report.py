@@ -9,16 +9,16 @@ import av
 import pytest
 
 from pbl_pipeline.files import sha256_of
-from schemas import fit, privacy
-from schemas.origin import Origin
+from pbl_schemas import fit, privacy
+from pbl_schemas.origin import Origin
+from pbl_workers.populate import populate
+from pbl_workers.web import reports
 from tests import until
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.html_page import commands_in
 from tests.integration import web
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
-from workers.populate import populate
-from workers.web import reports
 
 FRAMES = 60
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from schemas.intake.records import set_condition
+from pbl_schemas.intake.records import set_condition
+from pbl_workers.populate import populate
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
 from tests.videos import constant_rate, numbered_frames, write_video
-from workers.populate import populate
 
 #: What a page of each kind needs until everything on it is there.
 PAGES = {

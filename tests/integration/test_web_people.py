@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 import pbl_pipeline.tracking
-from schemas import reading, tracking
-from schemas.review import Decision
+from pbl_schemas import reading, tracking
+from pbl_schemas.review import Decision
+from pbl_workers.populate import populate
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.integration.test_visit_contract import track_people
 from tests.rows import register
-from workers.populate import populate
 
 
 @pytest.fixture

@@ -16,23 +16,23 @@ from starlette.testclient import TestClient
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.words import UNUSABLE
-from schemas import keypoints, session, video
-from schemas.capture import PhoneLink, PhoneRecording
-from schemas.cli.capture import capture
-from schemas.intake import phone_recordings
-from schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
-from schemas.intake.protocols import add_protocol, read_protocol
-from schemas.jobs import jobs_of
-from schemas.reading.usable import Next, Usable
-from schemas.rows import check_row
+from pbl_schemas import keypoints, session, video
+from pbl_schemas.capture import PhoneLink, PhoneRecording
+from pbl_schemas.cli.capture import capture
+from pbl_schemas.intake import phone_recordings
+from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
+from pbl_schemas.intake.protocols import add_protocol, read_protocol
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.reading.usable import Next, Usable
+from pbl_schemas.rows import check_row
+from pbl_workers import incoming, phone_uploads, queue
+from pbl_workers.populate import populate
+from pbl_workers.web import Options, Where, create_app
+from pbl_workers.web.phone import next_words, verdict
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.integration.compute_target import nothing
 from tests.rows import new_visit, register
-from workers import incoming, phone_uploads, queue
-from workers.populate import populate
-from workers.web import Options, Where, create_app
-from workers.web.phone import next_words, verdict
 
 
 @pytest.fixture

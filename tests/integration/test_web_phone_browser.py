@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.video import VideoInfo, probe, read_phone_log
-from schemas import video
-from schemas.capture import PhoneRecording
-from schemas.intake import phone_recordings
-from schemas.intake.protocols import Step, add_protocol
+from pbl_schemas import video
+from pbl_schemas.capture import PhoneRecording
+from pbl_schemas.intake import phone_recordings
+from pbl_schemas.intake.protocols import Step, add_protocol
+from pbl_workers import phone_uploads
+from pbl_workers.web import Options, Where, certificates, create_app, phone
 from tests.integration import web
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
 from tests.rows import new_visit
 from tests.videos import numbered_frames
-from workers import phone_uploads
-from workers.web import Options, Where, certificates, create_app, phone
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 #: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.render import body_track
-from schemas import fit, reading, video
+from pbl_schemas import fit, reading, video
+from pbl_workers.populate import populate
+from pbl_workers.web.movement import METRE_STEPS, TURN_STEPS
 from tests import not_none
 from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
-from workers.populate import populate
-from workers.web.movement import METRE_STEPS, TURN_STEPS
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_where_heads_are_to_be_hidden_the_original_is_never_sent(looked_at, monk
 def test_a_fit_of_another_body_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
     import dataclasses
 
-    from schemas.reading import visits
+    from pbl_schemas.reading import visits
 
     _, walk, _ = looked_at
     load = visits.load_trial_fit
@@ -145,7 +145,7 @@ def test_a_fit_of_another_body_says_so(looked_at, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_lost_file_of_the_fit_says_so(looked_at, monkeypatch: pytest.MonkeyPatch):
-    from schemas.reading import objects
+    from pbl_schemas.reading import objects
 
     _, walk, _ = looked_at
     assert fit.SessionFit.Trial & {"video_id": walk}

@@ -10,13 +10,13 @@ import pytest
 
 from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
-from schemas import lab, session, study, video
-from schemas.review import Decision
-from schemas.studies.visit_forms import FACTS, NEW, facts_form
+from pbl_schemas import lab, session, study, video
+from pbl_schemas.review import Decision
+from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
+from pbl_workers.web import multipart
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
-from workers.web import multipart
 
 VISIT = {"subject": "P001", "visit": "2026-01-10"}
 

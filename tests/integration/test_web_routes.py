@@ -9,13 +9,13 @@ import pytest
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from schemas.review import Viewing
+from pbl_schemas.review import Viewing
+from pbl_workers.populate import populate
+from pbl_workers.web import Options, Where, audit, create_app
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.integration.test_web_attacks import rows
 from tests.rows import register
-from workers.populate import populate
-from workers.web import Options, Where, audit, create_app
 
 #: Each address with 1 for its number: the roles that may open it ("*": anybody, "+": whoever is signed in) and what of
 #: a person is looked at. An address that is new belongs in here.

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from schemas import study
-from schemas.cli.study import instrument
-from schemas.review import Decision
-from schemas.studies.visit_forms import enter_scores, scores_form
+from pbl_schemas import study
+from pbl_schemas.cli.study import instrument
+from pbl_schemas.review import Decision
+from pbl_schemas.studies.visit_forms import enter_scores, scores_form
 from tests.integration import web
 from tests.rows import everything, new_visit
 

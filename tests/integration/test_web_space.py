@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
+from pbl_workers.populate import populate
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.populate import populate
 
 #: Byte of everything but the video that a recording's page may load, as it comes over the line.
 WEIGHT = 400_000

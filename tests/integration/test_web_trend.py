@@ -7,15 +7,15 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
-from schemas import gait, gdi
-from schemas.intake.records import set_condition
-from schemas.reading import comparison
-from schemas.reading.trend import trend_of
+from pbl_schemas import gait, gdi
+from pbl_schemas.intake.records import set_condition
+from pbl_schemas.reading import comparison
+from pbl_schemas.reading.trend import trend_of
+from pbl_workers.populate import populate
 from tests import not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
-from workers.populate import populate
 
 INDICES = {1: 80.0, 2: 85.0, 3: 95.0}
 

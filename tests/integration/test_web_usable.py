@@ -8,21 +8,21 @@ import pytest
 import pbl_pipeline.fit
 import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
-from schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
-from schemas.decisions import not_usable, review_decisions
-from schemas.intake import LaboratoryMarkers, SeveralCameras, VisitRecord
-from schemas.plan import plan_fit_sets
-from schemas.reading import registered, visit_list
-from schemas.reading.shown import shown_visit
-from schemas.reading.visit_list import Filter, visit_page
-from schemas.reading.why import why
-from schemas.review import Decision
-from schemas.studies import slices
+from pbl_schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
+from pbl_schemas.decisions import not_usable, review_decisions
+from pbl_schemas.intake import LaboratoryMarkers, SeveralCameras, VisitRecord
+from pbl_schemas.plan import plan_fit_sets
+from pbl_schemas.reading import registered, visit_list
+from pbl_schemas.reading.shown import shown_visit
+from pbl_schemas.reading.visit_list import Filter, visit_page
+from pbl_schemas.reading.why import why
+from pbl_schemas.review import Decision
+from pbl_schemas.studies import slices
+from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
-from workers.populate import populate
 
 
 @computed_once
@@ -159,7 +159,7 @@ def test_a_mark_by_another_route_is_planned_too(visit: tuple[int, int]):
 def test_two_people_decide_at_the_same_moment(visit: tuple[int, int]):
     seen = review_decisions.usable_state(1)
     calls = [(1, reason, "", name, seen) for reason, name in (("helped", "A. First"), ("too_dark", "B. Second"))]
-    late, done = decide_target.at_once("schemas.decisions.review_decisions.mark_not_usable", *calls)
+    late, done = decide_target.at_once("pbl_schemas.decisions.review_decisions.mark_not_usable", *calls)
     assert done == ("done", "")
     assert late[0] == "DECIDED_MEANWHILE"
     mark = not_usable.unusable([1])[1]

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from schemas import gdi, lab, session, video
-from schemas.reading import comparison
-from schemas.review import Decision
+from pbl_schemas import gdi, lab, session, video
+from pbl_schemas.reading import comparison
+from pbl_schemas.review import Decision
+from pbl_workers.on_request import compute_visit
 from tests.integration import compute_target, web
 from tests.integration.chain import small_video
 from tests.unit.test_blazepose import asset
-from workers.on_request import compute_visit
 
 
 @pytest.fixture(params=["stand-ins", pytest.param("real", marks=[pytest.mark.long, pytest.mark.slow])])

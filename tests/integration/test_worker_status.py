@@ -6,28 +6,28 @@ from typing import Any
 
 import pytest
 
-import schemas
-from schemas import connection, video
-from schemas.jobs import jobs_of
-from schemas.reading import status
-from schemas.worker import installation_lock
+import pbl_schemas
+from pbl_schemas import connection, video
+from pbl_schemas.jobs import jobs_of
+from pbl_schemas.reading import status
+from pbl_schemas.worker import installation_lock
 
 
 @pytest.fixture(scope="module")
 def server(database: Path) -> Iterator[Any]:
     """A connection beside the tables' own."""
-    schemas.activate()
+    pbl_schemas.activate()
     found = connection.another()
     yield found
     found.close()
 
 
 def test_queues_are_counted_under_the_names_that_datajoint_gives_them(server: Any):
-    for table in schemas.computed_tables():
+    for table in pbl_schemas.computed_tables():
         schema, name = status.queue_name(table)
         assert f"`{schema}`.`{name}`" == jobs_of(table).full_table_name
     counts = status.queue_counts(server)
-    assert list(counts) == [t.__name__ for t in schemas.computed_tables()]
+    assert list(counts) == [t.__name__ for t in pbl_schemas.computed_tables()]
 
 
 def test_a_queue_that_was_never_used_counts_as_empty(server: Any, monkeypatch: pytest.MonkeyPatch):
@@ -45,10 +45,10 @@ def test_counting_reads_narrow_indexes_and_no_rows(server: Any, monkeypatch: pyt
             asked.append(text)
             return server.query(text)
 
-    for table in schemas.computed_tables():
+    for table in pbl_schemas.computed_tables():
         status._rows(table, Asked())
     status.camera_kinds(Asked())
-    assert len(asked) == len(schemas.computed_tables()) + 1
+    assert len(asked) == len(pbl_schemas.computed_tables()) + 1
     for text in asked:
         plan = server.query(f"EXPLAIN {text}", as_dict=True).fetchall()
         read = [row for row in plan if not str(row["table"]).startswith("<derived")]

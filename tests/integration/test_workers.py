@@ -22,25 +22,25 @@ from click.testing import CliRunner
 
 import pbl_pipeline.fit
 import pbl_pipeline.video
-import schemas
+import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
+from pbl_schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.cli.why import why as why_command
+from pbl_schemas.operations import embedded
+from pbl_schemas.reading.status import live_workers, pipeline_status
+from pbl_schemas.reading.why import why
+from pbl_schemas.rows import utc_now
+from pbl_workers import queue, recover, refresh, registry, requeue, run_job
+from pbl_workers.heartbeat import Heartbeat, Silent
+from pbl_workers.loop import LEAVE_S, Worker, takes
+from pbl_workers.process import Options
+from pbl_workers.recover import CRASHES
+from pbl_workers.supervisor import BATCH_NICE, Supervisor
 from research.benchmarks import worker_replay
-from schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
-from schemas.chain import ON_REQUEST
-from schemas.cli.why import why as why_command
-from schemas.operations import embedded
-from schemas.reading.status import live_workers, pipeline_status
-from schemas.reading.why import why
-from schemas.rows import utc_now
 from tests import until
 from tests.rows import register
-from workers import queue, recover, refresh, registry, requeue, run_job
-from workers.heartbeat import Heartbeat, Silent
-from workers.loop import LEAVE_S, Worker, takes
-from workers.process import Options
-from workers.recover import CRASHES
-from workers.supervisor import BATCH_NICE, Supervisor
 
 from . import chain, worker_target
 from .jobs import beat, counts, first_job, hold, jobs_left, queued, work
@@ -54,9 +54,9 @@ def videos(folder: Path, *names: str) -> list[Path]:
 def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: None, tmp_path: Path, monkeypatch):
     register(*videos(tmp_path, "walk1", "walk2"), session_label="1")
     register(*videos(tmp_path, "walk3"), session_label="2")
-    monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)  # one look at all tables, at the beginning
+    monkeypatch.setattr("pbl_workers.loop.REFRESH_EVERY_S", 1e9)  # one look at all tables, at the beginning
     done = work()
-    expected = {t.__name__: 3 for t in schemas.computed_tables()}
+    expected = {t.__name__: 3 for t in pbl_schemas.computed_tables()}
     of_visits = ("SessionFit", "SessionGdi", "SessionQc", "Kinetics")
     expected |= dict.fromkeys(ON_REQUEST, 0) | dict.fromkeys(of_visits, 2)
     assert counts() == expected
@@ -79,8 +79,8 @@ def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkey
     monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
     for i in range(5):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
-    monkeypatch.setattr("workers.loop.REFRESH_EVERY_S", 1e9)
-    work(*(t for t in schemas.computed_tables() if t is not fit.SessionFit))
+    monkeypatch.setattr("pbl_workers.loop.REFRESH_EVERY_S", 1e9)
+    work(*(t for t in pbl_schemas.computed_tables() if t is not fit.SessionFit))
     assert jobs_left() == {"SessionFit": {"pending": 5}}
     work(batch=2)
     assert batches == [2, 2, 1]
@@ -177,7 +177,7 @@ def test_who_has_the_pictures_takes_all_that_needs_them_unless_another_job_is_mo
     tables: None, tmp_path: Path, priority: int
 ):
     taken: list[queue.Claim] = []
-    one = Worker(schemas.computed_tables(), Silent(), report=lambda job, end: taken.extend([] if end else [job]))
+    one = Worker(pbl_schemas.computed_tables(), Silent(), report=lambda job, end: taken.extend([] if end else [job]))
     other = queued(tmp_path, keypoints.Keypoints, "other")
     held = queue.claim(keypoints.Keypoints)[0]  # by another worker
     mine = queued(tmp_path, video.VideoInfo, "mine")
@@ -360,7 +360,7 @@ def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp
         "fit_sessions",
         lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions],
     )
-    work(*(t for t in schemas.computed_tables() if t is not table))
+    work(*(t for t in pbl_schemas.computed_tables() if t is not table))
     refresh.refresh()
 
     def ends(*_: object) -> None:
@@ -386,7 +386,7 @@ def supervise(**options) -> int:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workers.supervisor.RESTART_S", (0.05, 0.1))
+    monkeypatch.setattr("pbl_workers.supervisor.RESTART_S", (0.05, 0.1))
 
 
 def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(tables, tmp_path: Path, quick: None):
@@ -494,7 +494,7 @@ def test_jobs_of_dead_workers_elsewhere_are_freed(tables: None, tmp_path: Path):
 
 
 def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
-    monkeypatch.setattr("workers.heartbeat.PERIOD_S", 0.05)
+    monkeypatch.setattr("pbl_workers.heartbeat.PERIOD_S", 0.05)
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
@@ -550,7 +550,7 @@ def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, mon
     found = {t.table: (t.empty, t.waiting) for t in few.tables if t.empty or t.waiting}
     assert found == {"SubjectChoice": (1, 1), "Kinetics": (1, 0)}
     assert few.cameras == {"guess": done["Keypoints"]}
-    monkeypatch.setattr("schemas.reading.status.SMALL", 0)  # through connections side by side
+    monkeypatch.setattr("pbl_schemas.reading.status.SMALL", 0)  # through connections side by side
     many = pipeline_status(exact=False)
     assert [(t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in many.tables] == [
         (t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in few.tables

@@ -14,24 +14,24 @@ from pathlib import Path
 
 import pytest
 
-import schemas
+import pbl_schemas
 from pbl_pipeline.body import load_body
 from pbl_pipeline.validation import reference_of_fit
-from schemas import connection, migrations
-from schemas.chain import ON_REQUEST
-from schemas.decisions import event_corrections, review_decisions
-from schemas.intake.references import add_reference
+from pbl_schemas import connection, migrations
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.decisions import event_corrections, review_decisions
+from pbl_schemas.intake.references import add_reference
+from pbl_workers.populate import populate
 from tests.integration import chain, older_tables
 from tests.rows import register
 from tests.walking_fit import walking_fit
-from workers.populate import populate
 
 
 def build(folder: Path) -> None:
     """Three visits through the chain with a correction, decisions and a reference, then all migrations taken back."""
     with pytest.MonkeyPatch.context() as patch:
         chain.install(patch)
-        schemas.activate()
+        pbl_schemas.activate()
         videos = [chain.small_video(folder, name) for name in "abc"]
         first, _, third = (register(v, session_label=f"2026-0{i}-01")[0] for i, v in enumerate(videos, 1))
         body = load_body()
@@ -59,7 +59,7 @@ def build(folder: Path) -> None:
 
 
 def _populate() -> None:
-    names = [t.__name__ for t in schemas.computed_tables() if t.__name__ not in ON_REQUEST]
+    names = [t.__name__ for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST]
     run = populate([*names, "KinematicError"])
     assert not {t.table: t.errors for t in run.tables if t.errors}
 

@@ -11,11 +11,11 @@ from typing import Any
 import uvicorn
 from starlette.testclient import TestClient
 
-from schemas.connection import dj
-from workers.on_request import compute_visit
-from workers.web import Options, ResultsFolder, Where, create_app
-from workers.web.computing import Target
-from workers.web.serve import config
+from pbl_schemas.connection import dj
+from pbl_workers.on_request import compute_visit
+from pbl_workers.web import Options, ResultsFolder, Where, create_app
+from pbl_workers.web.computing import Target
+from pbl_workers.web.serve import config
 
 BASE = "http://127.0.0.1:8484"
 

@@ -17,14 +17,14 @@ import pytest
 
 import pbl_pipeline.tracking
 import pbl_pipeline.video
-from workers import heartbeat, loop, process
-from workers.process import Options
+from pbl_workers import heartbeat, loop, process
+from pbl_workers.process import Options
 
 from . import chain
 
 
 def work(options: Options, pipe: Connection) -> None:
-    """`workers.process.work` with stand-ins."""
+    """`pbl_workers.process.work` with stand-ins."""
     patch = pytest.MonkeyPatch()
     chain.install(patch)
     real = pbl_pipeline.video.probe

@@ -17,7 +17,7 @@ from pbl_pipeline.bench.case import MAIN_JOINTS, PAPER_JOINTS, joint_errors_deg,
 from pbl_pipeline.bench.machine import machine
 from pbl_pipeline.body import load_body
 from pbl_pipeline.cli.bench import bench as command
-from workers.cli.bench_chain import MANY, Measured, text
+from pbl_workers.cli.bench_chain import MANY, Measured, text
 
 NAMES = load_body().joint_names
 

@@ -22,7 +22,7 @@ from pbl_pipeline.keypoints import Keypoints, WorldMarkers, read_trc
 from pbl_pipeline.models import load_spec
 from pbl_pipeline.validation import reference_of_bodies, reference_of_mot
 from pbl_pipeline.video import load_camera, load_camera_poses, read_phone_log
-from schemas.operations import backup
+from pbl_schemas.operations import backup
 from tests.command import pbl
 from tests.guard import guarded
 from tests.inputs import keypoints, markers

@@ -269,7 +269,7 @@ def test_the_kind_of_a_source(source: str, kind: str, calibrated: bool):
 
 
 def test_the_column_knows_every_kind():
-    from schemas.keypoints import Keypoints
+    from pbl_schemas.keypoints import Keypoints
 
     line = next(line for line in Keypoints.definition.splitlines() if line.strip().startswith("camera_kind"))
     assert re.findall(r"'(\w+)'", line) == list(CAMERA_KINDS)

@@ -1,7 +1,7 @@
 """The order of the tables, read from their definitions."""
 
-from schemas import chain
-from workers.registry import STAGES
+from pbl_schemas import chain
+from pbl_workers.registry import STAGES
 
 #: Computed table -> those that it needs. Written out here once, so that a change of a foreign key is seen.
 NEEDS = {
@@ -10,7 +10,7 @@ NEEDS = {
     "SubjectChoice": ["Tracking"],
     "Keypoints": ["SubjectChoice"],
     "TrialInput": ["Keypoints"],
-    "SessionFit": [],  # planned when all trials of a session are decided (schemas.plan)
+    "SessionFit": [],  # planned when all trials of a session are decided (pbl_schemas.plan)
     "GaitEvents": ["SessionFit"],
     "GaitCycle": ["GaitEvents"],
     "Spatiotemporal": ["GaitCycle"],

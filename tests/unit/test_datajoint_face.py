@@ -1,4 +1,4 @@
-"""What `schemas` and `workers` take from DataJoint beyond its public face, and that the installed version has it."""
+"""What `pbl_schemas` and `pbl_workers` take from DataJoint beyond its public face, which the installed version has."""
 
 import ast
 import inspect
@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from datajoint import adapters, autopopulate, connection, diagram, heading, jobs, storage, table, user_tables
 
-from schemas.datajoint_setup import MySQLOrMariaDB, columns_read_once, datajoint
-from tests.source import ROOT, files, nodes
+from pbl_schemas.datajoint_setup import MySQLOrMariaDB, columns_read_once, datajoint
+from tests.source import PACKAGES, ROOT, files, nodes
 
-FACE = ROOT / "schemas" / "datajoint_setup.py"
+FACE = PACKAGES["pbl_schemas"] / "pbl_schemas" / "datajoint_setup.py"
 
 
 def _parameters(function: object) -> list[str]:
@@ -64,7 +64,7 @@ def test_every_private_name_in_use_is_listed_above():
 def test_no_other_file_touches_a_private_name():
     private, found = _of_datajoint(), []
     assert {"_config", "_conn", "_populate1", "_full_path"} <= private
-    for file in [f for f in files("schemas", "workers") if f != FACE]:
+    for file in [f for f in files("pbl_schemas", "pbl_workers") if f != FACE]:
         tree = nodes(file)
         own = {n.name for n in tree if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
         own |= {n.attr for n in tree if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)}
@@ -97,7 +97,7 @@ def test_cascades_read_columns_once_where_they_are_told_to():
 def test_no_delete_of_ours_asks():
     """DataJoint asks at a terminal before it deletes, which is left on for people; without one it would end us."""
     found = []
-    for file in files("schemas", "workers"):
+    for file in files("pbl_schemas", "pbl_workers"):
         for node in nodes(file):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "delete":
                 said = {k.arg: ast.unparse(k.value) for k in node.keywords}

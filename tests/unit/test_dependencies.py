@@ -1,4 +1,4 @@
-"""One direction of dependency: pbl_pipeline <- schemas <- workers; nothing in the wheel imports research or tests."""
+"""One direction of dependency: pbl_pipeline <- pbl_schemas <- pbl_workers; the wheel imports no research, no tests."""
 
 import ast
 import functools
@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.source import ROOT, files, nodes
+from tests.source import PACKAGES, ROOT, files, module_name, nodes
 
 # In a fresh process, so that nothing another test imported counts. `None` in sys.modules makes an import fail.
 BLOCKED = """
 import importlib, pkgutil, sys
-for name in ("datajoint", "schemas", "workers"):
+for name in ("datajoint", "pbl_schemas", "pbl_workers"):
     sys.modules[name] = None
 import pbl_pipeline
 def fail(name):
@@ -35,8 +35,8 @@ def test_the_library_imports_with_the_tables_blocked():
 
 LIGHT = """
 import sys
-import schemas
-from schemas.stages import modules
+import pbl_schemas
+from pbl_schemas.stages import modules
 modules()
 print(*(name for name in ("jax", "mujoco", "cv2", "scipy", "onnxruntime", "ai_edge_litert") if name in sys.modules))
 """
@@ -53,10 +53,10 @@ def test_importing_the_tables_loads_no_numerical_library():
 @pytest.mark.parametrize(
     ("package", "forbidden"),
     [
-        ("pbl_pipeline", {"schemas", "workers", "research", "tests", "datajoint", "pymysql"}),
-        ("schemas", {"workers", "research", "tests"}),
-        ("workers", {"research", "tests"}),
-        ("research", {"schemas", "workers", "datajoint", "tests"}),
+        ("pbl_pipeline", {"pbl_schemas", "pbl_workers", "research", "tests", "datajoint", "pymysql"}),
+        ("pbl_schemas", {"pbl_workers", "research", "tests"}),
+        ("pbl_workers", {"research", "tests"}),
+        ("research", {"pbl_schemas", "pbl_workers", "datajoint", "tests"}),
     ],
 )
 def test_no_import_against_the_direction(package: str, forbidden: set[str]):
@@ -71,9 +71,7 @@ def test_no_import_against_the_direction(package: str, forbidden: set[str]):
 @functools.cache
 def _modules(package: str) -> dict[str, set[str]]:
     """Module of a package -> modules of it that are imported there, also inside functions and for types alone."""
-    module_of = {
-        f: ".".join(f.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for f in files(package)
-    }
+    module_of = {f: module_name(f) for f in files(package)}
     known = set(module_of.values())
     found: dict[str, set[str]] = {}
     for file, name in module_of.items():
@@ -102,7 +100,7 @@ def _in_circles(imports: dict[str, set[str]]) -> dict[str, list[str]]:
         left = {name: left[name] & kept for name in kept}
 
 
-@pytest.mark.parametrize("package", ["pbl_pipeline", "schemas", "workers"])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_no_module_imports_one_that_imports_it(package: str):
     """Types below, methods above: no circle of imports, however long and wherever in a module they stand."""
     imports = _modules(package)
@@ -168,10 +166,10 @@ def _imports(file: Path) -> set[str]:
 
 def test_datajoint_is_configured_before_it_is_imported():
     """A datajoint.json in the working directory must never count, so only one file may import DataJoint itself."""
-    allowed = {"schemas/datajoint_setup.py"}
+    allowed = {"schemas/pbl_schemas/datajoint_setup.py"}
     found = {
         str(f.relative_to(ROOT))
-        for f in files("schemas", "workers")
+        for f in files("pbl_schemas", "pbl_workers")
         if any(n.split(".")[0] == "datajoint" for n in _imports(f))
     }
     assert found == allowed
@@ -182,13 +180,13 @@ def test_datajoint_is_configured_before_it_is_imported():
 
 _FIRST = """
 import importlib, pathlib, sys
-import schemas.reading, workers.web
-root = pathlib.Path(schemas.__file__).parents[1]
-for room in ("schemas", "workers"):
-    for file in sorted((root / room).rglob("*.py")):
+import pbl_schemas.reading, pbl_workers.web
+for package in (pbl_schemas, pbl_workers):
+    root = pathlib.Path(package.__file__).parents[1]
+    for file in sorted((root / package.__name__).rglob("*.py")):
         name = ".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
         if not file.stem[:1].isdigit():
-            for loaded in [n for n in sys.modules if n.partition(".")[0] in ("schemas", "workers")]:
+            for loaded in [n for n in sys.modules if n.partition(".")[0] in ("pbl_schemas", "pbl_workers")]:
                 del sys.modules[loaded]
             try:
                 importlib.import_module(name)

@@ -15,9 +15,9 @@ import yaml
 
 from pbl_pipeline import __version__
 from pbl_pipeline.cli.command_line import cli
+from pbl_workers.supervisor import LAST_S
 from tests.command import program
 from tests.image import sent_to_builder
-from workers.supervisor import LAST_S
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "workers" / "deploy"
@@ -307,8 +307,8 @@ def test_manifests_are_what_their_schemas_allow():
 
 def test_the_number_of_workers_follows_every_queue():
     """The query names the queue of each table that the worker serves (the tables are tested with a database)."""
-    from schemas.chain import tables
-    from workers.registry import GROUPS, STAGES
+    from pbl_schemas.chain import tables
+    from pbl_workers.registry import GROUPS, STAGES
 
     queries = {
         d["metadata"]["name"]: d["spec"]["triggers"][0]["metadata"]["query"]

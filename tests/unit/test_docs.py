@@ -18,14 +18,14 @@ from docs_site import _notebook, api, commands
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.report.words import VERDICT_WORDS
-from schemas import STAGES, computed_tables
+from pbl_schemas import STAGES, computed_tables
 from tests import pages
 from tests.command import pbl
-from tests.source import files
+from tests.source import PACKAGES, files
 
 ROOT = pages.ROOT
 #: Modules of tables: docs/tables.md has what is in them.
-TABLES = {f"schemas.{stage}" for stage in STAGES}
+TABLES = {f"pbl_schemas.{stage}" for stage in STAGES}
 
 
 def test_errors_page_lists_exactly_the_codes():
@@ -36,7 +36,7 @@ def test_errors_page_lists_exactly_the_codes():
 
 def test_readme_names_every_variable_and_command():
     text = (ROOT / "README.md").read_text()
-    source = "".join(file.read_text("utf-8") for file in files("pbl_pipeline", "schemas", "workers"))
+    source = "".join(file.read_text("utf-8") for file in files(*PACKAGES))
     listed = re.findall(r"^\| (`PBL_\w+`[^|]*) \|", text, re.MULTILINE)
     assert sorted(re.findall(r"`(\w+)`", " ".join(listed))) == sorted(set(re.findall(r'"(PBL_[A-Z0-9_]+)"', source)))
     assert not [c.name for c in entry_points(group="pbl.commands") if f"`pbl {c.name}`" not in text]
@@ -68,7 +68,7 @@ def test_the_page_of_reports_names_every_verdict():
 
 def test_the_chain_of_the_contributors_page_is_the_tables_and_their_functions():
     rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", pages.text("docs/house.md"), re.MULTILINE)
-    computed = [f"{table.__module__.removeprefix('schemas.')}.{table.__name__}" for table in computed_tables()]
+    computed = [f"{table.__module__.removeprefix('pbl_schemas.')}.{table.__name__}" for table in computed_tables()]
     beside = {"validation.KinematicError", "privacy.Deidentified"}  # on request
     assert [name for name, _ in rows if name != "fit.FitSet"] == [name for name in computed if name not in beside]
     public = api.public(ROOT)
@@ -115,7 +115,10 @@ def test_what_the_examples_import_is_public_and_in_the_reference():
     found = []
     for page, text in code:
         for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.ImportFrom) and str(node.module).partition(".")[0] in ("pbl_pipeline", "schemas"):
+            if isinstance(node, ast.ImportFrom) and str(node.module).partition(".")[0] in (
+                "pbl_pipeline",
+                "pbl_schemas",
+            ):
                 for alias in node.names:
                     module = f"{node.module}.{alias.name}"
                     if module not in TABLES | public.keys() and alias.name not in public.get(str(node.module), ()):

@@ -30,7 +30,7 @@ from pbl_pipeline.qc import FAIL, Check
 from pbl_pipeline.validation import reference_of_mot
 from pbl_pipeline.video import PhoneLog, Sensor
 from pbl_pipeline.visit import Held, Recording, Visit, save_visit
-from tests import not_none
+from tests import not_none, source
 from tests.command import pbl
 from tests.exported import keypoints_of, marked_fit, with_markers
 from tests.unit.visits import solution_of
@@ -785,8 +785,7 @@ def test_no_table_is_written_past_it():
     }
     found = {
         str(path.relative_to(root))
-        for package in ("pbl_pipeline", "schemas", "workers")
-        for path in (root / package).rglob("*.py")
+        for path in source.files(*source.PACKAGES)
         if any(way in path.read_text("utf-8") for way in (".to_csv(", "csv.writer(", "DictWriter(", ".to_excel("))
     }
     assert found == allowed

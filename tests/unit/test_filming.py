@@ -10,7 +10,7 @@ from pbl_pipeline.filming import Difference, Filming, differences, height_word, 
 from pbl_pipeline.gait import Z90
 from pbl_pipeline.render import SIDE_COLOUR
 from pbl_pipeline.study_report import figures
-from schemas.reading.visit_list import Change, Result, change_since
+from pbl_schemas.reading.visit_list import Change, Result, change_since
 from tests import not_none
 
 FROM_LEFT = Filming(("left",), (), (), ("self_selected",), ("stated",), ("measured",), ("1080p",), "right")

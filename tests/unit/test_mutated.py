@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pbl_workers.web import accounts
 from research.benchmarks import mutated_files as files
 from research.benchmarks.mutated import kinds, outcomes
 from tests import refused
 from tests.guard import guarded
-from workers.web import accounts
 
 KINDS = {kind.name: kind for kind in kinds()}
 

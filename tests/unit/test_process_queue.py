@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from workers.process_queue import ProcessQueue, Task
+from pbl_workers.process_queue import ProcessQueue, Task
 
 
 def write(path: Path, text: str) -> None:

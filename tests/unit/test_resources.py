@@ -14,11 +14,11 @@ from pbl_pipeline import assets, resources
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.resources import keep_large_blocks
-from schemas.operations.embedded import process
+from pbl_schemas.operations.embedded import process
+from pbl_workers import supervisor
+from pbl_workers.process import Options
 from tests.command import pbl
 from tests.ended_process import Ended
-from workers import supervisor
-from workers.process import Options
 
 GB = 2**30
 
@@ -86,7 +86,7 @@ def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: P
 )
 def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, monkeypatch, asked: tuple, shares: list):
     groups(tmp_path, monkeypatch, "0::/", {})
-    monkeypatch.setattr("schemas.activate", lambda **_: None)
+    monkeypatch.setattr("pbl_schemas.activate", lambda **_: None)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
     seen: list[dict[str, str]] = []
     names = (resources.CORES, *resources._THREADS)
@@ -96,7 +96,7 @@ def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, mo
             seen.append({name: os.environ[name] for name in names})
 
     monkeypatch.setattr("multiprocessing.get_context", lambda _: SimpleNamespace(Process=Process, Pipe=Pipe))
-    monkeypatch.setattr("workers.process.given_gpus", tuple)
+    monkeypatch.setattr("pbl_workers.process.given_gpus", tuple)
     assert pbl("worker", *asked).code == 0
     assert seen == [dict.fromkeys(names, share) | {"OMP_NUM_THREADS": "7"} for share in shares]
     assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
@@ -105,8 +105,8 @@ def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, mo
 def worker_options(patch: pytest.MonkeyPatch, gpus: tuple[str, ...], *asked: str) -> Options:
     """The options of `pbl worker --processes auto` on a machine with these GPUs."""
     found: list[Options] = []
-    patch.setattr("schemas.activate", lambda **_: None)
-    patch.setattr("workers.process.given_gpus", lambda: gpus)
+    patch.setattr("pbl_schemas.activate", lambda **_: None)
+    patch.setattr("pbl_workers.process.given_gpus", lambda: gpus)
     patch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
     assert pbl("worker", "--processes", "auto", *asked).code == 0
     return found[0]

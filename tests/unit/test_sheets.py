@@ -13,7 +13,7 @@ from openpyxl import Workbook
 from pbl_pipeline import name_pattern
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.workbook import read_workbook
-from schemas.intake.sheets import read_sheets, write_template
+from pbl_schemas.intake.sheets import read_sheets, write_template
 from tests.guard import guarded
 
 SHEET = "xl/worksheets/sheet1.xml"

@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from pbl_pipeline import temporary
-from schemas.operations.folders import write_json
+from pbl_schemas.operations.folders import write_json
 from tests.command import pbl
+from tests.source import PACKAGES, files
 
 ROOT = Path(__file__).parents[2]
 KILLED = {
-    "page": "from workers.process_queue import ProcessQueue; q = ProcessQueue(1, 1)",
+    "page": "from pbl_workers.process_queue import ProcessQueue; q = ProcessQueue(1, 1)",
     "row": "from pbl_pipeline.temporary import new_folder; f = new_folder()",
 }
 
@@ -66,12 +67,12 @@ def test_beside_a_target_what_killed_processes_left_goes_with_the_next(tmp_path:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("package", ["pbl_pipeline", "schemas", "workers"])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_temporary_files_with_a_name_are_made_at_one_place_alone(package: str):
     named = re.compile(r"\b(mkdtemp|mkstemp|NamedTemporaryFile|TemporaryDirectory|SpooledTemporaryFile|gettempdir)\b")
     found = [
         str(path.relative_to(ROOT))
-        for path in (ROOT / package).rglob("*.py")
+        for path in files(package)
         if named.search(path.read_text("utf-8")) and path != Path(temporary.__file__)
     ]
     assert not found

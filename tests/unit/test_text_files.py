@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from tests.source import ROOT, files, nodes
+from tests.source import PACKAGES, ROOT, files, nodes
 
 
 def without_encoding(source: Iterable[ast.AST]) -> list[int]:
@@ -59,7 +59,7 @@ def test_calls_are_told_apart(source, text):
 
 
 def test_text_files_are_opened_as_utf_8():
-    ours = files("pbl_pipeline", "schemas", "workers")
+    ours = files(*PACKAGES)
     assert len(ours) > 300
     found = [f"{f.relative_to(ROOT)}:{n}" for f in ours for n in without_encoding(nodes(f))]
     assert not found

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from cryptography import x509
 
 from pbl_pipeline.errors import PblError
-from workers.cli.web import web
-from workers.web import certificates
+from pbl_workers.cli.web import web
+from pbl_workers.web import certificates
 
 NAMES = ("127.0.0.1", "gait.example")
 

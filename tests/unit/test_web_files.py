@@ -12,9 +12,9 @@ from pbl_pipeline import texts, words
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.shipped import shipped_text
-from tests.source import files, nodes
+from tests.source import PACKAGES, files, nodes
 
-WEB = Path(texts.__file__).parents[1] / "workers/web"
+WEB = Path(texts.__file__).parents[1] / "workers/pbl_workers/web"
 _PAGES = [*WEB.glob("templates/*.html"), *WEB.glob("*.py"), Path(texts.__file__)]
 
 
@@ -56,7 +56,7 @@ _NAMED_AT = {"Check": 0, "_limit_check": 0, "warn_if": 1}
 def said_by_the_library() -> tuple[set[str], list[re.Pattern[str]], set[str]]:
     """The texts in the library's sources, patterns of those with places, and the names of its checks."""
     plain, placed, checks = set(), [], set()
-    for path in files("pbl_pipeline", "schemas", "workers"):
+    for path in files(*PACKAGES):
         for node in nodes(path):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 plain.add(node.value)
@@ -90,7 +90,7 @@ def test_what_the_library_says_is_in_every_language():
         "the keypoints do not state {fields}: a lens without distortion, a camera that nobody measured and the box "
         "around the points stand for them; write the fields (docs/files.md)",
     }
-    with (WEB.parents[1] / "schemas/instruments.csv").open(encoding="utf-8") as file:
+    with (WEB.parents[1] / "schemas/pbl_schemas/instruments.csv").open(encoding="utf-8") as file:
         instruments = {"points", *(row[1] for row in csv.reader(file))}
     # Put together of more than one text of the library.
     composed = re.compile(

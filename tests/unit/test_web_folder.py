@@ -17,12 +17,12 @@ from pbl_pipeline.body import marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.visit import load_visit, save_beside
+from pbl_workers.web import ResultsFolder, Where, serve
+from pbl_workers.web.pages import plain
 from tests import not_none
 from tests.exported import with_markers
 from tests.integration import web
 from tests.walking_fit import walking_fit
-from workers.web import ResultsFolder, Where, serve
-from workers.web.pages import plain
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from pbl_pipeline.render import body_track, to_camera, to_pixels
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Camera
 from pbl_pipeline.visit import Recording
+from pbl_workers.web import movement
+from pbl_workers.web.movement import Movement, body_json
 from tests.walker import observe
 from tests.walking_fit import LEVEL_CAMERA_QUAT_WXYZ, walking_fit
-from workers.web import movement
-from workers.web.movement import Movement, body_json
 
 STATIC = Path(movement.__file__).parent / "static"
 TESTS = Path(__file__).parent / "web_scripts"

@@ -15,17 +15,17 @@ from unittest import mock
 import pymysql
 import pytest
 
-from schemas import connection, fit
-from schemas.reading import status
-from schemas.store import check_store
+from pbl_schemas import connection, fit
+from pbl_schemas.reading import status
+from pbl_schemas.store import check_store
+from pbl_workers import process, recover, registry, selftest
+from pbl_workers.metrics import Metrics
+from pbl_workers.process import VISIBLE, Options, given_gpus
+from pbl_workers.queue import Claim
+from pbl_workers.run_job import DONE, Outcome
+from pbl_workers.supervisor import Supervisor, _Child
 from tests.command import program
 from tests.ended_process import Ended
-from workers import process, recover, registry, selftest
-from workers.metrics import Metrics
-from workers.process import VISIBLE, Options, given_gpus
-from workers.queue import Claim
-from workers.run_job import DONE, Outcome
-from workers.supervisor import Supervisor, _Child
 
 
 class Process:
@@ -61,7 +61,7 @@ def boss(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     left: list[int] = []
     monkeypatch.setattr(found, "_settle_jobs", lambda child, *_: left.append(len(child.jobs)))
     monkeypatch.setattr(found, "_launch", lambda _: Process().child)
-    monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
+    monkeypatch.setattr("pbl_workers.supervisor.time.sleep", lambda _: None)
     process = Process()
     found._children = [process.child]
     return SimpleNamespace(supervisor=found, process=process, left=left)
@@ -113,7 +113,7 @@ def test_jobs_of_a_process_that_died_while_the_database_is_away_are_settled_late
     monkeypatch.undo()
     monkeypatch.setattr(connection, "connect", connect)
     monkeypatch.setattr(recover, "crashed", lambda job, reason: crashed.append(job.key))
-    monkeypatch.setattr("workers.run_job.DATABASE_PAUSE_S", 0.05)
+    monkeypatch.setattr("pbl_workers.run_job.DATABASE_PAUSE_S", 0.05)
     boss.process.report(1)
     supervisor._listen(0.0)
     supervisor._settle_jobs(boss.process.child, -9)
@@ -134,7 +134,7 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
         return {"SessionFit": {"pending": 7}}
 
     monkeypatch.setattr(status, "queue_counts", queue_counts)
-    monkeypatch.setattr("workers.metrics.READ_EVERY_S", 0.01)
+    monkeypatch.setattr("pbl_workers.metrics.READ_EVERY_S", 0.01)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -152,7 +152,7 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
 
     assert asked("pbl_database_up 1.0")
     assert asked('pbl_queue_jobs{status="pending",table="SessionFit"} 7.0')
-    monkeypatch.setattr("workers.metrics.FRESH_S", 0.2)
+    monkeypatch.setattr("pbl_workers.metrics.FRESH_S", 0.2)
     answers.clear()
     assert asked("pbl_database_up 0.0")
     answers.set()
@@ -289,7 +289,7 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
     """What JAX finds in the environment of the two processes of two GPUs, of the fourth of four, and of the one for
     phones."""
     for name in ("_connected", "to_stderr", "signal.signal"):
-        monkeypatch.setattr(f"workers.process.{name}", lambda *_: False)  # it ends where it would connect
+        monkeypatch.setattr(f"pbl_workers.process.{name}", lambda *_: False)  # it ends where it would connect
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
         for name in (VISIBLE, MEMORY, *CPU):
@@ -313,6 +313,6 @@ def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: p
 
     boss = Supervisor(Options(processes=2, gpus=("4", "7"), once=True))
     monkeypatch.setattr(boss, "_start", SimpleNamespace(Process=Process, Pipe=Pipe))
-    monkeypatch.setattr("workers.supervisor.time.sleep", lambda _: None)
+    monkeypatch.setattr("pbl_workers.supervisor.time.sleep", lambda _: None)
     assert boss.run() == 0
     assert [options.gpus for options in started] == [("4",), ("7",), ("7",)]

@@ -1,0 +1,192 @@
+"""Plan and apply migrations."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from typing import Any
+
+import pymysql
+
+from pbl_pipeline.errors import PblError
+from pbl_schemas import connection
+from pbl_schemas.chain import tables
+from pbl_schemas.datajoint_setup import dj, read_heading_again
+from pbl_schemas.operations import catalog
+from pbl_schemas.operations.declare import declare_all
+from pbl_schemas.stages import STAGES, modules
+from pbl_schemas.tables_version import applied, numbered, record, refuse_newer, title
+
+_error = functools.partial(PblError, "DB_MIGRATION")
+
+#: Time for which a migration waits for the end of another one (s).
+LOCK_S = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A difference between a table and its definition. table: its full name on the server. known: False if the
+    definition refers to something that the server lacks, so that the rest is unknown."""
+
+    table: str
+    what: str
+    known: bool = True
+
+    def __str__(self) -> str:
+        return f"{self.table}: {self.what}"
+
+
+def differences() -> list[Difference]:
+    """Differences of all tables that exist, by DataJoint's own comparison; the schemas must be bound."""
+    conn = connection.connect()
+    conn.dependencies.load()
+    return [d for cls in tables().values() if cls.database and cls().is_declared for d in _compare(conn, cls)]
+
+
+def _compare(conn: Any, cls: Any) -> list[Difference]:
+    name, context = cls.full_table_name, cls.declaration_context
+    try:
+        # FreeTable reads the columns anew; the class keeps those from before a migration.
+        on_server = dj.FreeTable(conn, name).describe(context=context)
+        return [
+            Difference(name, what) for what in dj.declare.alter(cls.definition, on_server, context, conn.adapter)[0]
+        ]
+    except NotImplementedError as error:  # DataJoint compares keys, foreign keys and indexes, but does not list them
+        return [Difference(name, f"its key, foreign keys or indexes differ ({error})")]
+    except dj.DataJointError as error:
+        return [Difference(name, f"it cannot be compared ({error})", known=False)]
+
+
+Say = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Migration:
+    """A module of migrations/. `statements(conn)` returns what is still to be done."""
+
+    number: int
+    name: str
+    statements: Callable[[Any], list[str]]
+
+    @property
+    def title(self) -> str:
+        return title(self.number, self.name)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Outcome of a run, or of a dry run. open: differences that no migration removes, as text."""
+
+    steps: list[tuple[str, list[str]]]
+    created: list[str]
+    open: list[str]
+
+
+def available() -> list[Migration]:
+    """Return all migrations, in the order of their numbers. Raises ValueError as `tables_version.numbered`."""
+    loaded = ((n, name, importlib.import_module(f"pbl_schemas.migrations.{n:04d}_{name}")) for n, name in numbered())
+    return [Migration(n, name, module.statements) for n, name, module in loaded]
+
+
+def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
+    """Bring the tables on the server to their definitions in this version of the code. Safe to repeat.
+
+    Needs an account that may create and alter tables. Stop the workers before.
+
+    Raises `PblError` DB_MIGRATION when the plan leaves differences that no migration removes (before anything is done),
+    when the database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
+    account may not alter tables.
+
+    `dry_run`: change nothing, return what would be done.
+    """
+    refuse_newer()
+    if dry_run:
+        return _plan()
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SELECT GET_LOCK(%s, %s)", (f"{connection.prefix()}_migrate", LOCK_S))
+        if (cursor.fetchone() or (0,))[0] != 1:
+            raise _error("another process is migrating this database", "one at a time", "wait until it has ended")
+        if left := _plan().open:
+            raise _differs(left)
+        created = _bind(create=True)
+        steps = _apply(cursor, say)
+    _reread()  # also where nothing was left to do: an earlier run may have ended before it came to this
+    if left := list(map(str, differences())):
+        raise _differs(left)
+    declare_all()
+    return Outcome(steps, created, [])
+
+
+def _bind(create: bool) -> list[str]:
+    """Bind the classes to the server's tables; returns what is missing, and creates it if `create`."""
+    there, absent = catalog.schemas(), []
+    with dj.config.override(database__create_tables=False):
+        for stage, module in zip(STAGES, modules(), strict=True):
+            name = connection.schema_name(stage)
+            if name not in there:
+                absent.append(f"{name}: the schema is created")
+                if not create:
+                    continue
+            connection.bind(stage, module.schema)
+    for cls in tables().values():
+        if cls.database and not cls().is_declared:
+            absent.append(f"{cls.full_table_name}: the table is created")
+            if create:
+                cls().declare(cls.declaration_context)
+    return absent
+
+
+def _reread() -> None:
+    """Read the tables' columns anew, and where they come from: DataJoint keeps both from before the migrations."""
+    for module in modules():
+        module.schema.rebuild_lineage()
+    for cls in tables().values():
+        read_heading_again(cls)
+
+
+def _plan() -> Outcome:
+    conn, created = connection.connect(), _bind(create=False)
+    done = {a.number for a in applied()}
+    steps = [(m.title, m.statements(conn)) for m in available() if m.number not in done]
+    planned = " ".join(s for _, statements in steps for s in statements)
+    # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
+    left = [str(d) for d in differences() if d.table not in planned and (d.known or not created)]
+    return Outcome(steps, created, left)
+
+
+def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:
+    conn = connection.connect()
+    done = {a.number for a in applied()}
+    steps = []
+    for migration in available():
+        if migration.number in done:
+            continue
+        statements = migration.statements(conn)
+        for statement in statements:
+            say(f"  {statement}")
+            try:
+                cursor.execute(statement)
+            except pymysql.err.Error as error:
+                raise PblError(
+                    "DB_REFUSED",
+                    key=f"{migration.title}: {statement[:200]}",
+                    found=str(error.args[-1]),
+                    expected="an account that may alter the tables, and tables that nobody uses at the moment",
+                    next_step="stop the workers, use the account pbl_owner (pbl db roles), then repeat: it goes on",
+                ) from error
+        record(cursor.execute, migration.number, migration.name, statements)
+        steps.append((migration.title, statements))
+    return steps
+
+
+def _differs(left: Sequence[str]) -> PblError:
+    """DB_MIGRATION, which names one difference a line."""
+    lines = "".join(f"\n    {line}" for line in left)
+    return _error(
+        f"{len(left)} differences that no migration removes:{lines}",
+        "tables as this version defines them",
+        "they need a migration: see docs/deployment.md, section Upgrade",
+    )

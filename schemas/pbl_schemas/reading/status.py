@@ -1,0 +1,353 @@
+"""State of the tables: counts, errors with their next step, videos that wait for a choice."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import functools
+import queue
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from .. import computed_tables, connection, keypoints, tracking, video, worker
+from ..decisions import not_usable
+from ..job_errors import error_code, error_found, error_next_step
+from ..jobs import jobs_of
+from ..operations.catalog import quote
+
+#: With fewer videos than this, keys that are not queued yet are also counted.
+SMALL = 5000
+
+#: Columns that mean "ran well, nothing to produce": table -> (status, values, column of the reason or None).
+EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
+    "SubjectChoice": ("choice_status", ("NO_PERSON",), "choice_reason"),
+    "GaitEvents": ("events_status", ("EMPTY",), "events_reason"),
+    "Spatiotemporal": ("measures_status", ("EMPTY",), "measures_reason"),
+    "GDI": ("gdi_status", ("EMPTY",), None),
+    "SessionGdi": ("session_status", ("EMPTY",), None),
+    "Kinetics": ("forces_status", ("EMPTY",), "forces_reason"),
+    "Deidentified": ("deidentified_status", ("NO_HEAD",), "deidentified_reason"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class TableStatus:
+    """One computed table. pending: keys without a result, a reservation or an error; empty is part of done.
+
+    oldest_s: age of the oldest queued job. per_hour: done in the last hour. left_s: pending at that rate. delayed: why
+    jobs that were put back wait, such as a full store.
+    """
+
+    table: str
+    done: int
+    empty: int
+    pending: int
+    reserved: int
+    error: int
+    waiting: int
+    oldest_s: float | None = None
+    per_hour: float = 0.0
+    left_s: float | None = None
+    delayed: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class ErrorRow:
+    """One error row. `about`: file name where the key has a video."""
+
+    table: str
+    key: dict[str, Any]
+    about: str
+    code: str
+    found: str
+    next_step: str
+    stack: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Running:
+    """A job in a worker's hands. since: by the server's clock."""
+
+    table: str
+    key: dict[str, Any]
+    about: str
+    host: str
+    pid: int
+    since: datetime.datetime | None
+
+
+@dataclasses.dataclass(frozen=True)
+class EmptyRow:
+    """A video for which a stage ended without an error and without a result."""
+
+    table: str
+    video_id: int
+    about: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Waiting:
+    """A video whose person has to be chosen. next_step: the command that chooses; look: the command that writes a
+    picture of the numbered people."""
+
+    video_id: int
+    about: str
+    reason: str
+    persons: list[int]
+    next_step: str
+    look: str
+
+
+@dataclasses.dataclass(frozen=True)
+class LeftOut:
+    """A video that is marked as not usable."""
+
+    video_id: int
+    about: str
+    reason: str
+    by: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """The whole state."""
+
+    videos: int
+    tables: list[TableStatus]
+    errors: list[ErrorRow]
+    empty: list[EmptyRow]
+    waiting: list[Waiting]
+    workers: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    exact: bool = True
+    #: Source of the focal length (file, measured, metadata, preset, guess) -> number of keypoints with it.
+    cameras: dict[str, int] = dataclasses.field(default_factory=dict)
+    not_usable: list[LeftOut] = dataclasses.field(default_factory=list)
+
+
+def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
+    """Query the state of all computed tables. `pbl_schemas.activate()` must have been called.
+
+    `exact`: also count keys that no worker has queued yet; that compares whole tables (seconds each with 300,000
+    videos). None: where there are fewer than `SMALL` videos. `most`: errors, empty, waiting and not usable rows that
+    are listed, each; the counts are of all.
+    """
+    n_videos = int(video.Video.connection.query(f"SELECT COUNT(*) FROM {video.Video.full_table_name}").fetchone()[0])  # noqa: S608
+    exact = n_videos < SMALL if exact is None else exact
+    server = video.Video.connection
+    queues, rates, chain = queue_counts(server), throughput(server), computed_tables()
+    # The longest first: the sources of cameras are long texts, keys grow along the chain.
+    counts = [camera_kinds, *(functools.partial(_rows, t) for t in reversed(chain))]
+    cameras, *rows = [c(server) for c in counts] if n_videos < SMALL else _side_by_side(counts)
+    rows.reverse()
+    states = zip(chain, rows, strict=True)
+    tables = [_table_status(t, n, queues[t.__name__], rates, exact) for t, n in states]
+    errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
+    empty = {t.table for t in tables if t.empty}
+    waiting = _waiting(most) if any(t.waiting for t in tables) else []
+    marked = [
+        LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in not_usable.all_unusable(most)
+    ]
+    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras, marked)
+
+
+def _table_status(
+    table: Any, rows: tuple[int, int, int], counts: dict[str, int], rates: dict[str, float], exact: bool
+) -> TableStatus:
+    name, pending = table.__name__, counts["pending"]
+    if exact:
+        remaining, _ = table().progress()
+        pending = max(0, remaining - counts["reserved"] - counts["error"] - counts["ignore"])
+    done, empty, waiting = rows
+    oldest, reason = _oldest(table) if counts["pending"] else (None, "")
+    per_hour = rates.get(name, 0.0)
+    left = 3600.0 * pending / per_hour if per_hour and pending else None
+    return TableStatus(
+        name, done, empty, pending, counts["reserved"], counts["error"], waiting, oldest, per_hour, left, reason
+    )
+
+
+def _side_by_side(questions: Sequence[Callable[[Any], Any]], at_once: int = 4) -> list[Any]:
+    """Return the answers of functions of a connection, in their order, `at_once` at a time on separate connections."""
+    free: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def ask(question: Callable[[Any], Any]) -> Any:
+        server = free.get()
+        try:
+            return question(server)
+        finally:
+            free.put(server)
+
+    with contextlib.ExitStack() as stack:
+        for _ in range(at_once):
+            free.put(stack.enter_context(contextlib.closing(connection.another())))
+        pool = stack.enter_context(ThreadPoolExecutor(at_once))
+        return list(pool.map(ask, questions))
+
+
+def camera_kinds(server: Any) -> dict[str, int]:
+    """Return the sources of the intrinsics of the keypoints, with how many each has."""
+    table = keypoints.Keypoints.full_table_name
+    rows = server.query(
+        f"SELECT camera_kind, COUNT(*) FROM {table} GROUP BY camera_kind ORDER BY COUNT(*) DESC, camera_kind"  # noqa: S608
+    ).fetchall()
+    return {str(kind): int(n) for kind, n in rows}
+
+
+def queue_name(table: Any) -> tuple[str, str]:
+    """Return schema and name of a computed table's queue. The object of the queue (`jobs_of`) would read all foreign
+    keys of the server, which takes longer than counting its rows."""
+    return str(table.database), "~~" + str(table.table_name).lstrip("_")
+
+
+def queues(server: Any) -> set[tuple[str, str]]:
+    """Return schema and name of every queue that the server has."""
+    rows = server.query("SELECT table_schema, table_name FROM information_schema.tables WHERE table_name LIKE '~~%%'")
+    return {(str(schema), str(name)) for schema, name in rows.fetchall()}
+
+
+def queue_counts(server: Any) -> dict[str, dict[str, int]]:
+    """Return the numbers of job rows of each computed table by status. Only `server` is queried, so that a thread can
+    use its own connection."""
+    there, out = queues(server), {}
+    for table in computed_tables():
+        out[table.__name__] = dict.fromkeys(("pending", "reserved", "error", "ignore"), 0)
+        if queue_name(table) in there:
+            found = server.query(f"SELECT status, COUNT(*) FROM {quote(*queue_name(table))} GROUP BY status")  # noqa: S608
+            out[table.__name__] |= {str(status): int(n) for status, n in found.fetchall()}
+    return out
+
+
+def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
+    """Return the jobs an hour of each table over the last `minutes`, from the first finished one."""
+    table = worker.Throughput.full_table_name
+    rows = server.query(
+        f"SELECT stage, SUM(n_done), TIMESTAMPDIFF(SECOND, MIN(minute), CURRENT_TIMESTAMP) FROM {table}"  # noqa: S608
+        " WHERE minute >= CURRENT_TIMESTAMP - INTERVAL %s MINUTE GROUP BY stage",
+        args=(int(minutes),),
+    ).fetchall()
+    return {str(stage): 3600.0 * float(n) / max(float(seconds), 60.0) for stage, n, seconds in rows}
+
+
+def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
+    """Return the workers with a recent heartbeat: host, process, resource, current job."""
+    alive = worker.Worker & "worker_stopped IS NULL"
+    alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
+    names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
+    return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def running(most: int = 200) -> list[Running]:
+    """Return the running jobs, oldest first; at most so many of each table."""
+    out = []
+    for table, counts in zip(computed_tables(), queue_counts(video.Video.connection).values(), strict=True):
+        if counts["reserved"]:
+            jobs = jobs_of(table)
+            for row in jobs.reserved.to_dicts(order_by="reserved_time", limit=most):
+                key = {k: row[k] for k in jobs.primary_key}
+                since = row["reserved_time"]
+                out.append(Running(table.__name__, key, _file_of(key), str(row["host"]), int(row["pid"]), since))
+    return sorted(out, key=lambda r: (r.since is None, r.since))
+
+
+def span(seconds: float | None) -> str:
+    """Return a duration in a suitable unit: 45 s, 12 min, 3.5 h, 2.1 d."""
+    if seconds is None:
+        return "-"
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length:
+            value = seconds / length
+            return f"{value:.1f} {unit}" if value < 10 and unit != "min" else f"{value:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _oldest(table: Any) -> tuple[float | None, str]:
+    """Return the age (s) of the oldest pending job, and the reason for which jobs were put back."""
+    jobs, server = quote(*queue_name(table)), table.connection
+    age = server.query(
+        f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
+    ).fetchone()[0]
+    why = server.query(
+        f"SELECT error_message FROM {jobs} WHERE status='pending' AND scheduled_time > CURRENT_TIMESTAMP(3)"  # noqa: S608
+        " ORDER BY scheduled_time LIMIT 1"
+    ).fetchone()
+    return (None if age is None else float(age)), (str(why[0]) if why else "")
+
+
+def _rows(table: Any, server: Any) -> tuple[int, int, int]:
+    """Return the numbers of all, empty and waiting rows of a table, from narrow indexes."""
+    if table.__name__ not in EMPTY_COLUMNS:
+        return int(server.query(f"SELECT COUNT(*) FROM {table.full_table_name}").fetchone()[0]), 0, 0  # noqa: S608
+    column, values, _ = EMPTY_COLUMNS[table.__name__]
+    rows = server.query(f"SELECT {column}, COUNT(*) FROM {table.full_table_name} GROUP BY {column}").fetchall()  # noqa: S608
+    counts = {str(value): int(n) for value, n in rows}
+    return sum(counts.values()), sum(counts.get(v, 0) for v in values), counts.get("NEEDS_CHOICE", 0)
+
+
+def empty_rows(table: Any) -> Any:
+    """Return the rows of a computed table that mean "ran well, nothing to produce"."""
+    if table.__name__ not in EMPTY_COLUMNS:
+        return table & False
+    column, values, _ = EMPTY_COLUMNS[table.__name__]
+    return table & [{column: v} for v in values]
+
+
+def _empty(names: Collection[str], most: int) -> list[EmptyRow]:
+    out: list[EmptyRow] = []
+    for table in computed_tables():
+        reason = EMPTY_COLUMNS.get(table.__name__, ("", (), None))[2]
+        if reason is None or table.__name__ not in names or "video_id" not in table.primary_key:
+            continue
+        said = {e.video_id for e in out}  # the first empty table has the reason
+        for row in (empty_rows(table) * video.Video.proj("video_name")).to_dicts(order_by="video_id", limit=most):
+            if int(row["video_id"]) in said:
+                continue
+            out.append(EmptyRow(table.__name__, int(row["video_id"]), row["video_name"], row[reason]))
+    return out
+
+
+def _errors(table: Any, most: int) -> list[ErrorRow]:
+    out = []
+    for row in jobs_of(table).errors.to_dicts(limit=most):
+        key = {k: row[k] for k in jobs_of(table).primary_key}
+        message = row["error_message"]
+        out.append(
+            ErrorRow(
+                table=table.__name__,
+                key=key,
+                about=_file_of(key),
+                code=error_code(message),
+                found=error_found(message),
+                next_step=error_next_step(message),
+                stack=str(row["error_stack"] or ""),
+            )
+        )
+    return out
+
+
+def _file_of(key: dict[str, Any]) -> str:
+    if "video_id" not in key:
+        return ""
+    names = (video.Video & {"video_id": key["video_id"]}).to_arrays("video_name")
+    return str(names[0]) if len(names) else ""
+
+
+def _waiting(most: int) -> list[Waiting]:
+    out = []
+    rows = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
+    for row in (rows - video.NotUsable).to_dicts(order_by="video_id", limit=most):
+        key = {k: row[k] for k in ("video_id", "tracking_method")}
+        persons = sorted(int(p) for p in (tracking.Tracking.Person & key).to_arrays("person_id"))
+        out.append(
+            Waiting(
+                video_id=int(row["video_id"]),
+                about=row["video_name"],
+                reason=row["choice_reason"],
+                persons=persons,
+                next_step=tracking.choose_command(key, "|".join(map(str, persons))),
+                look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
+            )
+        )
+    return out

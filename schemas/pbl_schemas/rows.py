@@ -1,0 +1,220 @@
+"""Values of columns, quality checks as rows, and deletion of rows with their dependent results."""
+
+from __future__ import annotations
+
+import datetime
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pymysql
+
+from pbl_pipeline.errors import PblError
+
+from .datajoint_setup import REPEAT, columns_read_once, dj
+
+if TYPE_CHECKING:
+    from pbl_pipeline.qc import Check
+
+#: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
+#: asks the database each time, `ReadAhead` for many keys at once.
+Rows = Callable[[Any, Mapping[str, Any]], list[dict[str, Any]]]
+
+
+class InputChanged(PblError):
+    """Rows that a computation reads are gone or other ones: it is tried again, a few times."""
+
+    def __init__(self, found: str, key: object = None) -> None:
+        super().__init__(
+            "INPUT_CHANGED",
+            found=found,
+            expected="the rows that were there when the job was queued",
+            next_step="`pbl retry` once the row is there again (`pbl db restore`, `pbl ingest`, or another method)",
+            key=key,
+        )
+
+
+class MadeOnce:
+    """Decorator of a function that makes a query of a table (class): called once, and again where the tables have
+    another connection since. DataJoint takes milliseconds to put a query of several tables together."""
+
+    def __init__(self, make: Callable[[Any], Any]) -> None:
+        self._make, self.made = make, dict[Any, Any]()
+        functools.update_wrapper(self, make)
+
+    def __call__(self, table: Any) -> Any:
+        if table not in self.made or self.made[table].connection is not table().connection:
+            self.made[table] = self._make(table)
+        return self.made[table]
+
+
+def one(query: Any, *columns: str) -> Any:
+    """`query.fetch1(*columns)` for what a computation reads. Raises InputChanged if there is no such row (any
+    longer)."""
+    try:
+        return query.fetch1(*columns)
+    except dj.DataJointError:
+        if len(query):
+            raise
+        raise InputChanged(f"no row of {query.from_clause()} for this key") from None
+
+
+def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of a table that agree with a key, in the order of its primary key."""
+    columns = table.heading.attributes.values()
+    if any(c.codec or c.json or c.uuid for c in columns):
+        return (table & key).to_dicts(order_by="KEY")
+    # Numbers, texts and dates: a third of the time of DataJoint's own, which looks at each value for what to decode.
+    return list((table & key & dj.Top(None, "KEY")).cursor(as_dict=True))
+
+
+def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:
+    """Return the only row of a table that agrees with a key, or with a query where `stored_rows` reads it. Raises
+    `PblError` DB_NOT_FOUND for none, USAGE for several."""
+    found = rows(table, key)
+    if len(found) == 1:
+        return found[0]
+    raise PblError(
+        "USAGE" if found else "DB_NOT_FOUND",
+        key=f"{table.__name__} {dict(key) if isinstance(key, Mapping) else 'of the query'}",
+        found=f"{len(found)} rows",
+        expected="one row",
+        next_step="name more columns of the table's key" if found else "`pbl status` shows what is computed",
+    )
+
+
+class ReadAhead:
+    """Rows of several results of sets, with one question to the database for each table.
+
+    keys: rows with `fit_set` and, where they are known, the methods; videos: numbers of all videos of these sets. Holds
+    the rows of every table that was asked for: for some dozen visits at a time.
+    """
+
+    def __init__(self, keys: Sequence[Mapping[str, Any]], videos: Iterable[int]) -> None:
+        first = keys[0] if keys else {}
+        self._common = {k: v for k, v in first.items() if all(key.get(k) == v for key in keys)}
+        self._values = {"fit_set": {str(key["fit_set"]) for key in keys}, "video_id": {int(v) for v in videos}}
+        self._tables: dict[tuple, dict[Any, list[dict[str, Any]]]] = {}
+        self._names: dict[Any, frozenset[str]] = {}
+
+    def __call__(self, table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
+        if table not in self._names:
+            self._names[table] = frozenset(table.heading.names)
+        names = self._names[table]
+        column = next((c for c in self._values if c in names), None)
+        if column is None:  # no result: a method or a norm, the same for many
+            return self._grouped((table, *key.items()), lambda: stored_rows(table, key), None)[None]
+        common = {k: v for k, v in self._common.items() if k in names and k not in self._values}
+        of_all = inside(column, self._values[column])
+        read = self._grouped((table,), lambda: stored_rows(table & of_all, common), column)
+        return [r for r in read.get(key[column], ()) if all(r[k] == v for k, v in key.items() if k in r)]
+
+    def _grouped(self, name: tuple, read: Callable[[], list[dict[str, Any]]], column: str | None) -> dict[Any, list]:
+        if name not in self._tables:
+            groups: dict[Any, list] = {} if column else {None: []}
+            for row in read():
+                groups.setdefault(column and row[column], []).append(row)
+            self._tables[name] = groups
+        return self._tables[name]
+
+
+def utc_now() -> datetime.datetime:
+    """Return the time in UTC by the clock of the database server for a datetime column: one clock for all machines."""
+    return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
+
+
+def number(value: Any) -> float | None:
+    """Return a float for a nullable column: None if the value is missing or not finite."""
+    if value is None:
+        return None
+    value = float(value)
+    return value if np.isfinite(value) else None
+
+
+def or_nan(value: float | None) -> float:
+    """Return the number of a nullable column; NaN for NULL."""
+    return float("nan") if value is None else float(value)
+
+
+def plain(value: Any) -> Any:
+    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def inside(column: str, values: Iterable[str | int]) -> Any:
+    """Return a restriction to values without quotes (codes and numbers), quick for thousands."""
+    listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
+    return f"{column} IN ({listed})" if listed else False
+
+
+def counted(deleted: Mapping[str, int]) -> str:
+    """Numbers of deleted rows by table (`delete_below`) in words."""
+    return ", ".join(f"{n} of {name}" for name, n in deleted.items())
+
+
+#: Times that a cascade is begun again where another process inserts below it, or holds its locks, meanwhile.
+_DELETES = 5
+
+
+@columns_read_once()
+def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Delete the rows with these keys and all dependent results, in one transaction. Returns table name to
+    number of deleted rows, empty when there was nothing."""
+    if not keys:
+        return {}
+    # As plain keys: a cascade from a restriction by subqueries fails in DataJoint 2.3.5 ("attribute not found").
+    target = table & list(keys)
+    counts = {name: n for name, n in dj.Diagram.cascade(target, part_integrity="cascade").counts().items() if n}
+    for attempt in range(_DELETES):
+        try:
+            target.delete(prompt=False, part_integrity="cascade")
+            break
+        except pymysql.err.OperationalError as error:
+            # In a transaction that is open who opened it begins again (`pbl_schemas.transactions.repeated`).
+            if attempt == _DELETES - 1 or error.args[0] not in REPEAT or target.connection.in_transaction:
+                raise
+        except dj.DataJointError as error:
+            # A worker inserted a row below one that is deleted, after its table's turn; the row above is locked now.
+            if attempt == _DELETES - 1 or not str(error).startswith("Delete blocked"):
+                raise
+            if target.connection.in_transaction:  # it keeps seeing the tables as they were
+                raise pymysql.err.OperationalError(REPEAT[0], str(error)) from error
+    return counts
+
+
+def check_columns(prefix: str) -> str:
+    """Definition lines of a part table of quality checks; the names carry the prefix for the same reason."""
+    return f"""
+    -> master
+    {prefix}_check           : varchar(64)       # name, with its unit
+    ---
+    {prefix}_check_outcome   : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
+    {prefix}_check_value=null     : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_threshold=null : float64      # in the unit (see {prefix}_check)
+    {prefix}_check_advice    : varchar(1000)     # what to do about it
+    """
+
+
+def check_row(prefix: str, check: Check) -> dict[str, Any]:
+    """A library `Check` as values of `check_columns(prefix)`."""
+    return {
+        f"{prefix}_check": check.check,
+        f"{prefix}_check_outcome": check.outcome,
+        f"{prefix}_check_value": number(check.value),
+        f"{prefix}_check_threshold": number(check.threshold),
+        f"{prefix}_check_advice": check.advice[:1000],
+    }
+
+
+def check_values(prefix: str, row: Mapping[str, Any]) -> tuple:
+    """The arguments of the library's `Check` from a row of `check_columns(prefix)`."""
+    return tuple(row[f"{prefix}_check{end}"] for end in ("", "_outcome", "_value", "_threshold", "_advice"))

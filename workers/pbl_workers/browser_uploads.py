@@ -1,0 +1,155 @@
+"""Files that a browser sends for a visit: written to the archive while they arrive, checked, and taken in like an
+upload of the drop folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import os
+import secrets
+import time
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from pbl_pipeline.errors import PblError
+from pbl_schemas import session, video, worker
+from pbl_schemas.decisions.review_decisions import record
+from pbl_schemas.intake import Registered, VisitRecord
+from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
+
+from .incoming import VIDEO_ENDINGS, Copy, check_opens, register_copies
+
+#: Age at which the rest of a broken upload is removed (s).
+_REST_S = 86_400.0
+_PREFIX = "browser-"
+_refused = functools.partial(PblError, "UPLOAD_REFUSED")
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """The visit that files are sent for."""
+
+    session_id: int
+    subject: str
+    label: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """Outcome for a file: its name as it was sent; status as in `Registered`."""
+
+    name: str
+    status: str
+    video_id: int | None = None
+    error: PblError | None = None
+
+
+def place(session_id: int) -> Place:
+    """Return the visit. Raises `PblError` DB_NOT_FOUND."""
+    visit = session.registered_visit(session_id)
+    return Place(session_id, visit["subject"], visit["session_label"])
+
+
+class Arriving:
+    """A file that arrives: written under a new name in the person's folder of the archive, and hashed. Raises
+    `PblError` UPLOAD_REFUSED for another ending than that of a recording or sensor log, or too many bytes; OSError."""
+
+    def __init__(self, to: Place, name: str) -> None:
+        self.name = plain_name(PurePosixPath(name.replace("\\", "/")).name)
+        ending = PurePosixPath(self.name).suffix.lower()
+        if ending not in (*VIDEO_ENDINGS, *LOG_ENDINGS):
+            photo = ending in (".heic", ".heif", ".jpg", ".jpeg", ".png")
+            raise _refused(
+                "a photo" if photo else f"a file that ends in {ending!r}",
+                f"a video ({', '.join(VIDEO_ENDINGS)}), or the sensor log beside it ({', '.join(LOG_ENDINGS)})",
+                "choose the video itself",
+                self.name,
+            )
+        self._most = LARGEST_LOG if ending in LOG_ENDINGS else LARGEST
+        folder = folder_of(archive_dir(), PHONE, to.subject)
+        for rest in folder.glob(f"{_PREFIX}*"):  # of a server that was ended
+            if time.time() - rest.stat().st_mtime > _REST_S:
+                rest.unlink(missing_ok=True)
+        self.path = folder / f"{_PREFIX}{secrets.token_hex(6)}{ending}"
+        self._file = open(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")  # noqa: SIM115
+        self._sum, self._n = hashlib.sha256(), 0
+
+    @property
+    def is_log(self) -> bool:
+        """True for a sensor log, by its ending."""
+        return self.path.suffix in LOG_ENDINGS
+
+    def write(self, piece: bytes) -> None:
+        """Write the next bytes."""
+        self._n += len(piece)
+        if self._n > self._most:
+            found, most = f"a file of more than {self._most / 1e9:g} GB", f"at most {self._most / 1e9:g} GB"
+            raise _refused(found, most, "send a shorter recording", self.name)
+        self._sum.update(piece)
+        self._file.write(piece)
+
+    def finish(self) -> Copy:
+        """Return the whole file, which is on disk then."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        return Copy(self.path, self._sum.hexdigest())
+
+    def discard(self) -> None:
+        """Remove the file; one that was registered has another name and stays."""
+        self._file.close()
+        self.path.unlink(missing_ok=True)
+
+
+def check(arrived: Arriving) -> PblError | None:
+    """Return what is wrong with a file that is to be a video: VIDEO_..., or None. Its first picture is decoded."""
+    try:
+        check_opens(arrived.path, "a video file", "copy it from the phone again")
+    except PblError as error:
+        return error.with_key(arrived.name)
+    return None
+
+
+def register(
+    to: Place, arrived: Sequence[tuple[Arriving, Copy]], activity: str, pace: str, by: str
+) -> list[Outcome] | None:
+    """Register files that arrived whole; a sensor log goes with the video of its name. One outcome for each video and
+    each log without a video; None, with nothing done, while the drop folder is being taken over or a person removed.
+
+    Raises `PblError` DB_NOT_FOUND if the visit is gone, DB_..., FILE_UNWRITABLE.
+    """
+    logs = {PurePosixPath(one.name).stem: copy for one, copy in arrived if one.is_log}
+    out = []
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
+        if not obtained:
+            return None
+        place(to.session_id)  # a visit that was removed is not made again
+        visit = VisitRecord(to.subject, to.label, activity=activity or None, pace=pace or None)
+        for one, copy in arrived:
+            if not one.is_log:
+                log = logs.pop(PurePosixPath(one.name).stem, None)
+                out.append(_register_copies(visit, one.name, [copy, log] if log else [copy], by))
+    alone = functools.partial(
+        _refused,
+        found="a sensor log alone",
+        expected="the video of the same name with it",
+        next_step="send both together",
+    )
+    out += [Outcome(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
+    remove_folders(archive_dir(), to.subject)
+    return out
+
+
+def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
+    try:
+        result: Registered = register_copies(visit, name, copies, archive_dir())
+    except PblError as error:
+        if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
+            raise
+        return Outcome(name, "refused", error=error.with_key(name))
+    assert result.video_id is not None
+    if result.status == "registered":
+        record("recording", by, {}, {}, {"recording": "registered"}, video_id=result.video_id)
+    return Outcome(name, result.status, result.video_id)

@@ -1,0 +1,122 @@
+"""A worker's heartbeat: a thread writes every few seconds that it is alive, its current job, and its finished jobs.
+
+systemd and Kubernetes know whether a process is alive on their machine; this reports it to workers on other machines,
+which free the reservations of dead ones (`recover`), and to `pbl status`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import secrets
+import threading
+from collections import defaultdict
+from typing import Any
+
+import pymysql
+
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_schemas import connection, worker
+from pbl_schemas.connection import dj
+
+#: Seconds between two heartbeats.
+PERIOD_S = 15.0
+
+
+class Silent:
+    """Receiver of a worker's reports; this one ignores them, for a worker without a row in `Worker`."""
+
+    def doing(self, what: str) -> None:
+        """Report the current job."""
+
+    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
+        """Report finished jobs of a stage and the seconds they took."""
+
+
+class Heartbeat(Silent):
+    """A context manager that keeps a row of `Worker` up to date.
+
+    The thread has its own connection (DataJoint's is not safe between threads). While the database is unavailable beats
+    are skipped and counts are kept until they can be written.
+    """
+
+    def __init__(self, resource: str) -> None:
+        self.worker = secrets.token_hex(8)
+        self.resource = resource
+        self._doing = ""
+        self._counts: dict[str, list[float]] = defaultdict(lambda: [0, 0, 0.0])
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
+        self._connection: Any = None
+        self._registered = False
+
+    def __enter__(self) -> Heartbeat:
+        self._try_to_beat()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(timeout=5.0)
+        with contextlib.suppress(pymysql.err.Error, dj.DataJointError, PblError, OSError):
+            self._beat(last=True)
+            self._connection.close()
+
+    def doing(self, what: str) -> None:
+        """Report the current job; written with the next beat."""
+        with self._lock:
+            self._doing = what[:500]
+
+    def count(self, stage: str, done: int, failed: int, busy_s: float) -> None:
+        """Add finished jobs; written with the next beat."""
+        with self._lock:
+            row = self._counts[stage]
+            row[0], row[1], row[2] = row[0] + done, row[1] + failed, row[2] + busy_s
+
+    def _run(self) -> None:
+        while not self._stop.wait(PERIOD_S):
+            self._try_to_beat()
+
+    def _try_to_beat(self) -> None:
+        try:
+            self._beat()
+        except (pymysql.err.Error, dj.DataJointError, PblError, OSError):
+            self._connection = None  # unavailable: try again at the next beat
+
+    def _beat(self, last: bool = False) -> None:
+        if self._connection is None:
+            self._connection = connection.another()
+        run, now = self._connection.query, "CURRENT_TIMESTAMP(3)"
+        table, minutes = worker.Worker.full_table_name, worker.Throughput.full_table_name
+        with self._lock:
+            doing, counts = self._doing, {k: tuple(v) for k, v in self._counts.items()}
+            self._counts.clear()
+        try:
+            if not self._registered:
+                columns = "worker, worker_host, worker_pid, worker_resource, worker_version"
+                run(
+                    f"INSERT INTO {table} ({columns}, worker_started, worker_seen, worker_doing)"  # noqa: S608
+                    f" VALUES (%s, %s, %s, %s, %s, {now}, {now}, '')",
+                    args=(self.worker, platform.node(), os.getpid(), self.resource, code_version()),
+                )
+                self._registered = True
+            stopped = f", worker_stopped={now}" if last else ""
+            run(
+                f"UPDATE {table} SET worker_seen={now}, worker_doing=%s{stopped} WHERE worker=%s",  # noqa: S608
+                args=(doing, self.worker),
+            )
+            minute = f"DATE_FORMAT({now}, '%%Y-%%m-%%d %%H:%%i:00')"
+            while counts:
+                stage, (done, failed, busy) = next(iter(counts.items()))
+                run(
+                    f"INSERT INTO {minutes} (worker, stage, minute, n_done, n_failed, busy)"  # noqa: S608
+                    f" VALUES (%s, %s, {minute}, %s, %s, %s) ON DUPLICATE KEY UPDATE n_done = n_done + VALUES(n_done),"
+                    " n_failed = n_failed + VALUES(n_failed), busy = busy + VALUES(busy)",
+                    args=(self.worker, stage, int(done), int(failed), float(busy)),
+                )
+                del counts[stage]
+        finally:
+            for stage, (done, failed, busy) in counts.items():  # not written yet: with the next beat
+                self.count(stage, int(done), int(failed), float(busy))

@@ -1,0 +1,118 @@
+"""Nightly summary: finished and failed work, workers, free disk space; as text and as a page."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import html
+import shutil
+from pathlib import Path
+
+from pbl_pipeline import settings
+from pbl_pipeline.code_version import code_version
+from pbl_schemas import computed_tables, session, video
+from pbl_schemas.operations.archive import archive_dir
+from pbl_schemas.reading.status import Status, pipeline_status
+from pbl_schemas.rows import utc_now
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """Figures of the time since `since` (UTC): rows per table, new videos and sessions; the state now; disks as
+    (name, free GB, total GB)."""
+
+    since: datetime.datetime
+    until: datetime.datetime
+    new_videos: int
+    new_sessions: int
+    done: dict[str, int]
+    status: Status
+    disks: list[tuple[str, float, float]]
+
+
+def make_summary(hours: float = 24.0) -> Summary:
+    """Count the last hours."""
+    until = utc_now()
+    since = until - datetime.timedelta(hours=hours)
+    text = f"'{since:%Y-%m-%d %H:%M:%S}'"
+    done = {}
+    for table in computed_tables():
+        column = next(n for n in table.heading.names if n.endswith("_computed"))
+        done[table.__name__] = len(table & f"{column} >= {text}")
+    return Summary(
+        since,
+        until,
+        len(video.Video & f"video_created >= {text}"),
+        len(session.Session & f"session_created >= {text}"),
+        done,
+        pipeline_status(most=1000),
+        disks(),
+    )
+
+
+def disks() -> list[tuple[str, float, float]]:
+    """Free and total GB of the disks that hold the database, the arrays and the recordings."""
+    out, seen = [], set()
+    for name, path in (("home", settings.home_dir()), ("store", settings.store_dir()), ("archive", archive_dir())):
+        there = next(p for p in (path, *path.parents) if p.exists())
+        device = there.stat().st_dev
+        if device not in seen:
+            seen.add(device)
+            usage = shutil.disk_usage(there)
+            out.append((f"{name} ({path})", usage.free / 1e9, usage.total / 1e9))
+    return out
+
+
+def rows(found: Summary) -> list[tuple[str, str]]:
+    """Heading and value of each line."""
+    state = found.status
+    out = [
+        ("from, to (UTC)", f"{found.since:%Y-%m-%d %H:%M} to {found.until:%Y-%m-%d %H:%M}"),
+        ("new videos", str(found.new_videos)),
+        ("new sessions", str(found.new_sessions)),
+        ("videos in all", str(state.videos)),
+    ]
+    for table in state.tables:
+        failed = f", {table.error} errors" if table.error else ""
+        waits = f", {table.waiting} wait for a choice" if table.waiting else ""
+        left = f", {table.pending} pending" if table.pending else ""
+        out.append((table.table, f"{found.done[table.table]} new of {table.done}{left}{failed}{waits}"))
+    codes: dict[str, int] = {}
+    for error in state.errors:
+        codes[error.code] = codes.get(error.code, 0) + 1
+    out += [(f"error {code}", str(n)) for code, n in sorted(codes.items(), key=lambda c: -c[1])]
+    out.append(("workers alive", str(len(state.workers))))
+    out += [(f"disk {name}", f"{free:.1f} of {total:.1f} GB free") for name, free, total in found.disks]
+    return out
+
+
+def as_text(found: Summary) -> str:
+    """Return the summary for a terminal or a mail."""
+    width = max(len(name) for name, _ in rows(found))
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows(found)) + "\n"
+
+
+def as_html(found: Summary) -> str:
+    """Return the summary as one page without external resources."""
+    lines = "".join(f"<tr><th>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>" for n, v in rows(found))
+    style = (
+        "body{font-family:system-ui,sans-serif;margin:2rem;color:#1a1a1a}table{border-collapse:collapse}"
+        "th,td{text-align:left;padding:.3rem 1.2rem .3rem 0;border-bottom:1px solid #ddd;font-weight:normal}"
+        "th{color:#555}"
+    )
+    title = f"PBL, {found.until:%Y-%m-%d}"
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{style}</style>'
+        f"<h1>{title}</h1><table>{lines}</table><p>pbl-pipeline {html.escape(code_version())}</p></html>\n"
+    )
+
+
+def write(found: Summary, folder: Path) -> list[Path]:
+    """Write `summary-DATE.txt` and `.html`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for ending, text in (("txt", as_text(found)), ("html", as_html(found))):
+        path = folder / f"summary-{found.until:%Y-%m-%d}.{ending}"
+        path.write_text(text, encoding="utf-8")
+        out.append(path)
+    return out

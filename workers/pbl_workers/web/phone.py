@@ -1,0 +1,290 @@
+"""Film with a phone: the link of a visit as a QR code, and the phone's page, which sends recordings of that visit."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import functools
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import segno
+from markupsafe import Markup
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
+
+from pbl_pipeline import texts
+from pbl_pipeline.bounded import parse_json
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import whole_number
+from pbl_pipeline.words import capital
+from pbl_schemas.capture import UPLOADING
+from pbl_schemas.intake import phone_recordings
+from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
+from pbl_schemas.intake.protocols import Step, steps_of
+from pbl_schemas.reading.usable import Next, Usable, computed, next_pass, usable
+
+from .. import phone_uploads
+from ..incoming import check_room
+from ..process_queue import ProcessQueue
+from . import certificates
+from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
+from .address import FILM, OPEN, Address, number_of
+from .computing import Target
+from .computing import begin as compute
+from .pages import Pages, reader_language
+from .tables import Tables, on_disk
+
+#: The phone's page may use its camera and sensors.
+_MAY = {
+    "permissions-policy": "camera=(self), microphone=(), geolocation=(), accelerometer=(self), gyroscope=(self), "
+    "screen-wake-lock=(self)"
+}
+#: Hours for which a link can be made on the page.
+HOURS = ("2", "8")
+#: Visits for which the gain of one more pass is kept.
+_KEPT = 20
+_RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
+#: Group of the catalogue with the texts of the script.
+_SAID = "capture."
+_NEXT_STEP = "tell who runs the server; the recording stays on the phone until there is room"
+_on_disk = functools.partial(on_disk, _NEXT_STEP)
+
+
+class Phones:
+    """Finds the phone that sends a request, by its cookie."""
+
+    def __init__(self, tables: Tables, secure: bool) -> None:
+        self._tables = tables
+        self.cookie = Cookie(secure, "pbl_phone")
+
+    async def find(self, request: Request) -> Phone | None:
+        """Return the phone; None for a browser that opened no link. Raises `PblError` PHONE_LINK for one whose link
+        has ended."""
+        cookie = self.cookie.of(request)
+        return await self._tables.ask(phone_recordings.phone_of, cookie) if cookie else None
+
+
+def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue, target: Target) -> list[Address]:
+    finishing = asyncio.Lock()
+
+    async def make(request: Request) -> Response:
+        fields = await form_of(request)
+        number, hours = number_of(request), fields.get("hours", "")
+        if hours not in HOURS:
+            raise Refused("form")
+        make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
+        link, key = await tables.ask(make_link, number, sender(request), float(hours))
+        page = f"{request.url.scheme}://{request.headers['host']}/phone"
+        address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
+        shown = {
+            "number": number,
+            "link": link,
+            "address": address,
+            "hours": hours,
+            "secure": request.url.scheme == "https",
+            "trust": qr_code(trust) if certificates.authority().is_file() else "",
+        }
+        return pages.show(request, "film.html", code=qr_code(address), **shown)
+
+    async def end(request: Request) -> Response:
+        fields = await form_of(request)
+        number = number_of(request)
+        if (link := whole_number(fields.get("link", ""))) is None:
+            raise Refused("form")
+        await tables.ask(phone_recordings.end_link, number, link)
+        return RedirectResponse(f"/visits/{number}#film", 303)
+
+    async def opened(request: Request) -> Response:
+        mine = phones.cookie.of(request)
+        cookie = await tables.ask(phone_recordings.use_link, request.query_params.get("key", ""), mine)
+        response = RedirectResponse("/phone", 303)
+        if cookie is not None:
+            phones.cookie.set(response, cookie, int(3600 * MOST_HOURS))
+        return response
+
+    async def page(request: Request) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        every = texts.catalogue()
+        said = {
+            **{f"is_{name}": {k: capital(v) for k, v in every[f"library.{name}"].items()} for name in ACTIVITIES},
+            **{f"is_{name}": every[f"library.{name}"] for name in PACES},
+            **{name.removeprefix(_SAID): own for name, own in every.items() if name.startswith(_SAID)},
+        }
+        return pages.show(
+            request, "capture.html", 200, _MAY, phone=request.state.phone, words=json.dumps(said), part_bytes=PART_BYTES
+        )
+
+    async def state(request: Request) -> Response:
+        phone: Phone = request.state.phone
+        language = reader_language(request)
+        recordings, more, steps = await tables.ask(known, phone.session_id)
+        return JSONResponse(
+            {
+                "visit": phone.session_id,
+                "expires": f"{phone.expires.isoformat()}Z",
+                "recordings": [_shown(language, sent, judged) for sent, judged in recordings],
+                "next": next_words(language, more),
+                "protocol": [dataclasses.asdict(step) for step in steps],
+            }
+        )
+
+    #: Gain of one more pass for the last visits, with the identity of their results.
+    worth: dict[int, tuple[tuple[str, ...], Next | None]] = {}
+
+    def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None, list[Step]]:
+        sent = phone_recordings.recordings(session_id)
+        judged = [(one, None if one.video_id is None else usable(one.video_id)) for one in sent]
+        if worth.get(session_id, ((), None))[0] != (now := computed(session_id)):
+            if len(worth) >= _KEPT:
+                worth.clear()
+            worth[session_id] = now, next_pass(session_id)
+        return judged, worth.get(session_id, ((), None))[1], steps_of(session_id)
+
+    async def begin(request: Request) -> Response:
+        try:
+            stated = parse_json((await _body(request, "application/json", BODY_BYTES)).decode())
+        except ValueError:
+            raise Refused("form") from None
+        sent = await tables.ask(phone_recordings.begin, request.state.phone, stated)
+        return await told(request, sent)
+
+    async def part(request: Request) -> Response:
+        sent = await recording(request)
+        found = _RANGE.fullmatch(request.headers.get("content-range", ""))
+        if found is None:
+            raise Refused("form")
+        number = phone_uploads.check_part(sent, *(int(n) for n in found.groups()))
+        body = await _body(request, "application/octet-stream", PART_BYTES)
+        if len(body) != int(found[2]) - int(found[1]) + 1:
+            raise phone_recordings.upload_refused("a part of another length than it states")
+        sha256 = request.headers.get("x-sha256", "")
+        await _on_disk(phone_uploads.keep_part, request.state.phone, sent, number, body, sha256)
+        try:
+            await recording(request)
+        except PblError as error:
+            await removed(request, sent, error)
+            raise
+        return Response(status_code=204)
+
+    async def finish(request: Request) -> Response:
+        await _body(request, "application/json", BODY_BYTES)
+        phone: Phone = request.state.phone
+        async with finishing:
+            sent = await recording(request)
+            if sent.state == UPLOADING:
+                try:
+                    copies = await _on_disk(phone_uploads.put_together, phone, sent)
+                    await tables.ask(phone_uploads.register, phone, sent, copies)
+                except PblError as error:
+                    if not error.code.startswith(("VIDEO_", "PHONE_LOG")):
+                        await removed(request, sent, error)
+                        raise
+                    await tables.ask(phone_recordings.refused, sent.number, error)
+                    await asyncio.to_thread(phone_uploads.discard, phone, sent)
+                else:
+                    with contextlib.suppress(PblError):  # others wait: its jobs are the first in the queue
+                        compute(computing, target, phone.session_id, False)
+        return await told(request, await recording(request))
+
+    async def recording(request: Request) -> Sent:
+        return await tables.ask(phone_recordings.recording, request.state.phone, number_of(request))
+
+    async def removed(request: Request, sent: Sent, error: PblError) -> None:
+        """Remove the parts of a recording whose visit was removed while they came."""
+        if error.code == "DB_NOT_FOUND":
+            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+
+    async def told(request: Request, sent: Sent) -> Response:
+        missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
+        if len(missing) == sent.n_parts:
+            # Twice: the parts stay until the whole is registered.
+            await _on_disk(check_room, 2 * (sent.video_bytes + sent.log_bytes), _NEXT_STEP)
+        return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
+
+    async def worker(request: Request) -> Response:
+        """Serve a script of a separate thread below the page's address, so that it is also available offline."""
+        path = Path(__file__).parent / "static" / f"capture_{request.url.path.rpartition('/')[2]}"
+        return FileResponse(path, media_type="text/javascript", headers={"service-worker-allowed": "/phone"})
+
+    async def authority(request: Request) -> Response:
+        if not certificates.authority().is_file():
+            raise HTTPException(404)
+        return FileResponse(
+            certificates.authority(), media_type="application/x-x509-ca-cert", filename="laboratory.crt"
+        )
+
+    return [
+        Address("/visits/{session_id:int}/film", make, "decide", methods=["POST"]),
+        Address("/visits/{session_id:int}/film/end", end, "decide", methods=["POST"]),
+        Address("/phone/open", opened, OPEN),
+        Address("/phone", page, FILM),
+        Address("/phone/offline.js", worker, OPEN),
+        Address("/phone/store.js", worker, OPEN),
+        Address("/phone/authority.crt", authority, OPEN),
+        Address("/phone/state.json", state, FILM),
+        Address("/phone/recordings.json", begin, FILM, methods=["POST"]),
+        Address("/phone/recordings/{phone_recording:int}.json", part, FILM, methods=["PUT"]),
+        Address("/phone/finish/{phone_recording:int}.json", finish, FILM, methods=["POST"]),
+    ]
+
+
+def verdict(language: str, judged: Usable | None) -> str:
+    """Return in a sentence whether a recording can be used; empty of one that is not registered."""
+    if judged is None:
+        return ""
+    why = [texts.library_words(language, said) for said in judged.said]
+    if judged.cycles is not None and not any(judged.cycles):
+        why.append(texts.text(language, "capture.no_cycles"))
+    said = texts.text(language, f"capture.{judged.state}", why="; ".join(why))
+    if judged.cycles is not None and any(judged.cycles):
+        left, right = judged.cycles
+        said = f"{said}. {texts.text(language, 'capture.cycles', left=left, right=right)}"
+    return said.removesuffix(".") + "."
+
+
+def next_words(language: str, more: Next | None) -> str:
+    """Return what one more pass would bring, in two sentences; empty if that is not known."""
+    if more is None:
+        return ""
+    now = texts.text(language, "capture.index", now=f"{more.now:.0f}")
+    if round(more.then) >= round(more.now):
+        return now
+    return f"{now} {texts.text(language, f'capture.next_{more.side}', then=f'{more.then:.0f}')}"
+
+
+def qr_code(address: str) -> Markup:
+    """Return a QR code as SVG, black on white in light and dark."""
+    out = io.BytesIO()
+    code = segno.make(address, error="m", micro=False)
+    code.save(out, kind="svg", border=4, light="#fff", dark="#000", xmldecl=False, svgclass="qr", lineclass=None,
+              omitsize=True)  # fmt: skip
+    return Markup(out.getvalue().decode())  # noqa: S704  made here, of nothing but squares
+
+
+async def _body(request: Request, kind: str, most: int) -> bytes:
+    """Return the body of a request. Raises `Refused` for another type, or more bytes than `most`."""
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != kind:
+        raise Refused("form")
+    announced = whole_number(request.headers.get("content-length", "0"))
+    if announced is None or announced > most:
+        raise Refused("size")
+    return await read_body(request, most)
+
+
+def _shown(language: str, sent: Sent, judged: Usable | None) -> dict[str, Any]:
+    why = texts.library_words(language, sent.error.partition(": ")[2])
+    return {
+        "number": sent.number,
+        "sha256": sent.sha256,
+        "state": sent.state,
+        "error": sent.error,
+        "about": sent.about,
+        "verdict": texts.text(language, "capture.refused", why=why) if why else verdict(language, judged),
+    }

@@ -1,0 +1,238 @@
+"""Register visits, send recordings for them, and correct what is stated of them. Each change is a row of Decision."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import functools
+from collections.abc import Mapping, Sequence
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+
+from pbl_pipeline.errors import PblError
+from pbl_schemas import lab
+from pbl_schemas import session as sessions
+from pbl_schemas.studies import visit_forms
+
+from .. import browser_uploads
+from ..browser_uploads import Arriving, Outcome, Place
+from ..incoming import VIDEO_ENDINGS, Copy, check_room
+from ..refresh import queue_visit
+from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
+from .address import Address, number_of, page
+from .connections import MORE_TIME
+from .multipart import Part, is_multipart, parts
+from .pages import NOTHING, Pages, in_field, reader_language
+from .tables import Tables, on_disk
+
+#: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
+_BLOCK, _WAIT_S = 2**20, 60.0
+_NEXT_STEP = "tell who runs the server"
+_on_disk = functools.partial(on_disk, _NEXT_STEP)
+_busy = functools.partial(
+    PblError,
+    "DB_REFUSED",
+    found="recordings of the drop folder are being taken over",
+    expected="one import at a time",
+    next_step="send it again in some minutes",
+)
+_no_file = functools.partial(
+    PblError, "USAGE", found="no file", expected="at least one video", next_step="choose a video, then send it"
+)
+
+
+def routes(pages: Pages, tables: Tables) -> list[Address]:
+    async def new(request: Request) -> Response:
+        today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
+        return await new_page(request, {"visit": today})
+
+    async def new_page(
+        request: Request, values: Mapping[str, str], errors: Mapping[str, PblError] = NOTHING
+    ) -> Response:
+        known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
+        return pages.show(
+            request,
+            "new_visit.html",
+            values=known,
+            errors=errors,
+            longest={**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]},
+            usual_roles=visit_forms.USUAL_ROLES,
+            populations=await tables.ask(_populations),
+        )
+
+    async def register(request: Request) -> Response:
+        fields = await form_of(request)
+        number, errors = await tables.ask(visit_forms.register_visit, fields, sender(request))
+        if errors:
+            return await new_page(request, fields, errors)
+        if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
+            await tables.ask(_queue_visits_of_person, number)
+        return RedirectResponse(f"/visits/{number}", 303)
+
+    async def facts(
+        request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
+    ) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
+        numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
+        return pages.show(
+            request,
+            "facts.html",
+            facts=stored,
+            values={**stored.values, **numbers, **values},
+            errors=errors,
+            longest=visit_forms.FACTS,
+            choices={"activity": ACTIVITIES, "pace": PACES},
+            populations=await tables.ask(_populations),
+        )
+
+    async def correct(request: Request) -> Response:
+        fields = dict(await form_of(request))
+        number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
+        changed, errors = await tables.ask(visit_forms.correct_facts, number, fields, sender(request), seen, reason)
+        if errors:
+            return await facts(request, fields, errors)
+        if changed:
+            await tables.ask(_queue_visits_of_person if "height_m" in changed else queue_visit, number)
+        return RedirectResponse(f"/visits/{number}", 303)
+
+    async def upload(request: Request) -> Response:
+        return upload_page(request, await tables.ask(browser_uploads.place, number_of(request)), {}, [])
+
+    def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
+        from pbl_pipeline.gait import ACTIVITIES, PACES
+
+        return pages.show(
+            request,
+            "upload.html",
+            to=to,
+            values={"activity": "walking", "pace": "", **values},
+            outcomes=outcomes,
+            choices={"activity": ACTIVITIES, "pace": PACES},
+            accepted=", ".join(VIDEO_ENDINGS),
+        )
+
+    async def send(request: Request) -> Response:
+        if not is_multipart(request):
+            await form_of(request)
+            raise Refused("form")
+        to = await tables.ask(browser_uploads.place, number_of(request))
+        request.scope.get(MORE_TIME, lambda: None)()
+        await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
+        arriving: list[Arriving] = []
+        try:
+            fields, outcomes, whole = await _receive(request, to, arriving)
+            stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
+            good = []
+            for one, copy in whole:
+                error = None if one.is_log else await _on_disk(browser_uploads.check, one)
+                if error is None:
+                    good.append((one, copy))
+                else:
+                    outcomes.append(Outcome(one.name, "refused", error=error))
+            if not whole and not outcomes:
+                outcomes.append(Outcome("", "refused", error=_no_file()))
+            outcomes += await taken_in(request, to, good, stated)
+        finally:
+            for one in arriving:
+                await asyncio.to_thread(one.discard)
+        if any(one.video_id is not None for one in outcomes):
+            await tables.ask(queue_visit, to.session_id)
+        if all(one.status == "registered" for one in outcomes):
+            return RedirectResponse(f"/visits/{to.session_id}", 303)
+        return upload_page(request, to, stated, outcomes)
+
+    async def taken_in(
+        request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
+    ) -> list[Outcome]:
+        for _ in range(int(_WAIT_S) if good else 0):
+            done = await tables.ask(
+                browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
+            )
+            if done is not None:
+                return done
+            await asyncio.sleep(1.0)
+        return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
+
+    return [
+        *page("/visits/new", new, "decide"),
+        Address("/visits/new", register, "decide", methods=["POST"]),
+        *page("/visits/{session_id:int}/facts", facts, "look"),
+        Address("/visits/{session_id:int}/facts", correct, "decide", methods=["POST"]),
+        *page("/visits/{session_id:int}/upload", upload, "decide"),
+        Address("/visits/{session_id:int}/upload", send, "decide", methods=["POST"]),
+    ]
+
+
+async def _receive(
+    request: Request, to: Place, arriving: list[Arriving]
+) -> tuple[dict[str, str], list[Outcome], list[tuple[Arriving, Copy]]]:
+    """Return the fields of a form, the files that are refused immediately, and those that are on disk.
+
+    `arriving` gets every file that was begun. Nothing is written before the form's token was read.
+
+    Raises `Refused` "token", "form", "size"; `PblError` USAGE, UPLOAD_REFUSED, FILE_UNWRITABLE.
+    """
+    fields: dict[str, bytearray] = {}
+    outcomes: list[Outcome] = []
+    whole: list[tuple[Arriving, Copy]] = []
+    text: bytearray | None = None
+    file: Arriving | None = None
+    kept = bytearray()
+
+    async def end() -> None:
+        if file is not None:
+            await _on_disk(file.write, bytes(kept))
+            whole.append((file, await _on_disk(file.finish)))
+
+    async for found in parts(request):
+        if isinstance(found, bytes):
+            if text is not None:
+                text += found
+                if len(text) > BODY_BYTES:
+                    raise Refused("size")
+            elif file is not None:
+                kept += found
+                if len(kept) >= _BLOCK:
+                    await _on_disk(file.write, bytes(kept))
+                    kept.clear()
+            continue
+        await end()
+        text, file = None, None
+        kept.clear()
+        if found.file is None:
+            text = fields[found.name] = bytearray()
+        elif found.file:  # an empty one: nothing was chosen
+            check_token(request, fields.get("token", bytearray()).decode(errors="replace"))
+            file = await _begin(to, found, outcomes)
+            arriving += [] if file is None else [file]
+    await end()
+    stated = {name: bytes(value).decode(errors="replace") for name, value in fields.items()}
+    check_token(request, stated.pop("token", ""))
+    check_fields(stated)
+    return stated, outcomes, whole
+
+
+async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | None:
+    """Return the file that begins; one that is refused becomes an outcome, and its bytes are not kept."""
+    assert part.file is not None
+    check_fields({part.name: part.file})
+    try:
+        return await _on_disk(Arriving, to, part.file)
+    except PblError as error:
+        if error.code != "UPLOAD_REFUSED":
+            raise
+        outcomes.append(Outcome(str(error.key), "refused", error=error))
+        return None
+
+
+def _queue_visits_of_person(session_id: int) -> None:
+    subject = (sessions.Session & {"session_id": session_id}).fetch1("subject")
+    for visit in (sessions.Session & {"subject": subject}).to_arrays("session_id"):
+        queue_visit(int(visit))
+
+
+def _populations() -> list[str]:
+    return [str(p) for p in lab.Population().to_arrays("population") if p != "unknown"]

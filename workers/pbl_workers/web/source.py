@@ -1,0 +1,145 @@
+"""Sources of visits, recordings and videos: the tables, or a folder of `pbl run` (`folder.ResultsFolder`)."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import threading
+from collections.abc import Hashable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.visit import Visit
+from pbl_schemas import privacy, video
+from pbl_schemas.decisions import candidates, review_decisions
+from pbl_schemas.intake import phone_recordings, protocols
+from pbl_schemas.reading import shown
+from pbl_schemas.reading.usable import usable
+from pbl_schemas.reading.visit_progress import Progress, visit_progress
+
+from .corrections import Judged, judged
+
+#: De-identified copies out of a remote store that are kept on this disk at a time.
+_KEPT = 8
+
+
+class Videos:
+    """Files that are shown of recordings: the original, or the copy with hidden heads if PBL_DEIDENTIFY asks for it.
+
+    A copy in a remote store is fetched once and kept until others replace it or the page ends.
+    """
+
+    def __init__(self) -> None:
+        self._open: collections.OrderedDict[int, tuple[Path, contextlib.ExitStack]] = collections.OrderedDict()
+        self._lock = threading.Lock()
+
+    def path(self, video_id: int) -> Path:
+        """Return the file to show. Reads tables. Raises `PblError` DB_NOT_FOUND for an unknown video or one without the
+        copy that is asked for, HEAD_NOT_FOUND, VIDEO_MISSING."""
+        with self._lock:
+            if video_id in self._open:
+                self._open.move_to_end(video_id)
+                return self._open[video_id][0]
+            stack = contextlib.ExitStack()
+            copy = stack.enter_context(privacy.shown(video_id))
+            if copy is None:
+                return video.present_file(video_id)
+            self._open[video_id] = (copy, stack)
+            while len(self._open) > _KEPT:
+                self._open.popitem(last=False)[1][1].close()
+            return copy
+
+    def close(self) -> None:
+        """Remove what was fetched."""
+        with self._lock:
+            for _, stack in self._open.values():
+                stack.close()
+            self._open.clear()
+
+
+class Source(Protocol):
+    """Visits and recordings by their numbers, for the pages that both sources have.
+
+    All methods may be slow: they are called away from the loop that answers browsers. An unknown number is a `PblError`
+    DB_NOT_FOUND. A source in which nothing is computed or decided inherits the last four.
+    """
+
+    def visit(self, number: int, result: int, /) -> shown.ShownVisit: ...
+
+    def recording(self, number: int, /) -> shown.ShownRecording:
+        """Return a recording; its arrays are loaded on first access."""
+        ...
+
+    def state(self, number: int, /) -> Hashable:
+        """Return a value that changes with the fit of a recording. Raises `PblError` DB_NOT_FOUND without a fit."""
+        ...
+
+    def video(self, number: int) -> Path:
+        """Return the video that may be shown of a recording. Raises `PblError` VIDEO_MISSING."""
+        ...
+
+    def to_export(self, number: int, result: int) -> Visit:
+        """Return a computed visit. Raises `PblError` DB_NOT_FOUND if it has no result."""
+        ...
+
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
+        """Return the candidates for the measured person by tracking method, and the state that is shown."""
+        return [], []
+
+    def judged(self, number: int, /) -> Judged:
+        """Return the decisions about a recording."""
+        return Judged(None, "", 0, None)
+
+    def progress(self, session_id: int, /) -> Progress:
+        """Return the pending computations of a visit."""
+        return Progress(session_id, 0, (), ())
+
+    def around(self, about: shown.ShownVisit) -> dict[str, Any]:
+        """Return the surroundings of a visit on its page: decisions, accepted checks, entered scores."""
+        return {"decisions": None, "accepted": {}, "entry": None, "film": None}
+
+
+class TablesSource:
+    """The visits of the tables."""
+
+    def __init__(self, videos: Videos) -> None:
+        self._videos = videos
+
+    visit = staticmethod(shown.shown_visit)
+    recording = staticmethod(shown.shown_recording)
+    state = staticmethod(shown.computations)
+    judged = staticmethod(judged)
+    progress = staticmethod(visit_progress)
+
+    def video(self, number: int) -> Path:
+        return self._videos.path(number)
+
+    def to_export(self, number: int, result: int) -> Visit:
+        about = shown.computed_visit(number, result)
+        assert about.visit is not None
+        return about.visit
+
+    def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
+        """Return as `Source.people`; nothing before people are searched."""
+        try:
+            found = candidates.candidates(about.number)
+        except PblError as error:
+            if error.code != "DB_NOT_FOUND":
+                raise
+            return [], []
+        return found, [review_decisions.person_state(about.number, c.key["tracking_method"]) for c in found]
+
+    def around(self, about: shown.ShownVisit) -> dict[str, Any]:
+        from pbl_schemas.studies.visit_forms import scores_form
+
+        number = about.row.session_id
+        film = phone_recordings.filming(number)
+        sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in film["sent"]]
+        film |= {"sent": sent, "steps": protocols.steps_of(number), "protocols": protocols.protocols()}
+        return {
+            "decisions": review_decisions.decisions(number),
+            "accepted": review_decisions.accepted(about.key) if about.key else {},
+            "entry": scores_form(number),
+            "film": film,
+        }

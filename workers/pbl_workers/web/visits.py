@@ -1,0 +1,206 @@
+"""The list of visits with its filters, and the page of a visit with its curves."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+
+from pbl_pipeline import texts
+from pbl_pipeline.code_version import code_version
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import (
+    SIDED,
+    AdultRanges,
+    NormalBands,
+    adult_ranges,
+    far_leg_of,
+    leg_length_m,
+    load_norm,
+    norm_names,
+    normal_bands,
+)
+from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.names import whole_number
+from pbl_pipeline.report.curves import CycleCurve, Ranges, cycle_curves
+from pbl_pipeline.report.forces import force_charts
+from pbl_pipeline.visit import Visit
+from pbl_pipeline.words import ANGLES, KINETICS
+from pbl_schemas.reading import visit_list
+from pbl_schemas.reading.shown import ShownVisit
+from pbl_schemas.subject_codes import day_of
+
+from .access import Session, form_of
+from .address import Address, interval, number_of, page, shown_of
+from .computing import told as told_of
+from .pages import Pages, as_json, plain, reader_language
+from .phone import verdict
+from .source import Source
+from .tables import Asks, Tables
+
+#: Angles of the first screen: those of the index of three angles, and the ankle.
+SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
+
+
+@dataclasses.dataclass(frozen=True)
+class Curves:
+    """The angles of a visit. far: the leg that was behind the other, empty if both were seen alike. adults: ranges
+    of adults beside the children's bands."""
+
+    angles: tuple[CycleCurve, ...]
+    bands: NormalBands
+    far: str
+    adults: AdultRanges
+
+
+def curves_of(visit: Visit, language: str) -> Curves | None:
+    """Return the curves of the cycles that count, None without any."""
+    if visit.measures is None:
+        return None
+    cycles = [c for c in visit.measures.cycles if c.used and c.curves]
+    if not cycles:
+        return None
+
+    def label(title: str, _: Ranges) -> str:
+        return texts.text(language, "curves.chart", name=texts.library_words(language, title))
+
+    leg_m = None if visit.solution is None else leg_length_m(visit.solution.scale)
+    bands = normal_bands(visit.measures.spatiotemporal, leg_m)
+    drawn = cycle_curves(cycles, bands, {name: ANGLES[name] for name in SHOWN}, label)
+    return Curves(tuple(drawn), bands, far_leg_of(cycles), adult_ranges())
+
+
+def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:
+    """Return the forces of a visit (without its trials) with their charts and the body weight (N); None without any."""
+    if visit.kinetics is None:
+        return None
+
+    def label(title: str, unit: str, n: int) -> str:
+        return texts.text(language, "forces.chart", name=texts.library_words(language, title), unit=unit, n=n)
+
+    found = dataclasses.replace(visit.kinetics, trials=())
+    weight_n = None if found.mass_kg is None else GRAVITY * found.mass_kg
+    drawn = [{**c, "svg": texts.in_chart(language, c["svg"])} for c in force_charts(visit.kinetics, label)]
+    return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": drawn}
+
+
+def norm_people(norm: str) -> int | None:
+    """Return how many typically developing children a set of the index that ships is of; None for other sets."""
+    return load_norm(norm).n if norm in norm_names() else None
+
+
+_FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
+
+
+def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
+    """Return the addresses of a visit and of its letter for the record, which tables and folder have."""
+
+    async def visit(request: Request) -> Response:
+        about = await asks.ask(source.visit, number_of(request), shown_of(request))
+        told = told_of(request, await asks.ask(source.progress, about.row.session_id))
+        values = {"about": about, "told": told, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
+        if as_json(request):  # loads arrays, which not every thread may
+            values = await asks.ask(plain, values)
+        return pages.show(request, "visit.html", interval=interval, sided=SIDED, verdict=verdict, **values)
+
+    async def letter(request: Request) -> Response:
+        about = await asks.ask(source.visit, number_of(request), shown_of(request))
+        values = {"about": about, **await asks.ask(source.around, about)}
+        values |= await asks.ask(_drawn, about, reader_language(request))
+        now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC"
+        more = {"interval": interval, "sided": SIDED, "now": now, "version": code_version()}
+        return pages.show(request, "letter.html", **values, **more)
+
+    return [
+        *page("/visits/{session_id:int}", visit, "look"),
+        Address("/visits/{session_id:int}/letter", letter, "look", look="letter"),
+    ]
+
+
+def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
+    """Return the curves and forces of a visit, or why they cannot be shown, and of how many children the norm of its
+    index is."""
+    try:
+        visit = about.visit
+        found = None if visit is None else curves_of(visit, language)
+    except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
+        return {"curves": None, "no_curves": error, "norm_people": None, "forces": None}
+    norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
+    forces = None if visit is None else forces_of(visit, language)
+    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm), "forces": forces}
+
+
+def list_routes(pages: Pages, tables: Tables) -> list[Address]:
+    async def visits(request: Request) -> Response:
+        session: Session = request.state.session
+        asked = dict(request.query_params)
+        wanted, bad = _filter(asked, session)
+        choices = await tables.ask(visit_list.choices)
+        for name in ("cohort", "role"):
+            bad = bad or (bool(getattr(wanted, name)) and getattr(wanted, name) not in choices[name])
+        after = _after(asked.get("after", ""))
+        listed = await tables.ask(visit_list.visit_page, wanted, after)
+        kept = {k: asked[k] for k in ("q", *_FIELDS) if asked.get(k)}
+        older = urlencode({**kept, "after": f"{listed.after[0]}~{listed.after[1]}"}) if listed.after else ""
+        return pages.show(
+            request,
+            "visits.html",
+            page=listed,
+            wanted=wanted,
+            choices={**choices, "quality": visit_list.OUTCOMES, "state": visit_list.STATES},
+            bad=bad,
+            older=older,
+            newest=urlencode(kept),
+            is_first=after is None,
+            interval=interval,
+        )
+
+    async def search(request: Request) -> Response:
+        return RedirectResponse(_address(request.state.session, await form_of(request)), 303)
+
+    return [*page("/visits", visits, "look"), Address("/visits", search, "look", methods=["POST"])]
+
+
+def _address(session: Session, fields: Mapping[str, str]) -> str:
+    """The list's address for a filled-in form. The search text is a number in it, so that no code is part of an
+    address."""
+    search = fields.get("search", "").strip()[:100]
+    asked: dict[str, Any] = {"q": session.search_number(search)} if search else {}
+    asked |= {name: fields[name][:64] for name in _FIELDS if fields.get(name)}
+    return "/visits" + (f"?{urlencode(asked)}" if asked else "")
+
+
+def _filter(asked: Mapping[str, str], session: Session) -> tuple[visit_list.Filter, bool]:
+    """Return the filter of a request, and whether an invalid part of it was left out."""
+    bad = False
+    values: dict[str, Any] = {}
+    for name, allowed in (("quality", visit_list.OUTCOMES), ("state", visit_list.STATES)):
+        if asked.get(name) in allowed:
+            values[name] = asked[name]
+        bad = bad or (bool(asked.get(name)) and name not in values)
+    for name in ("first_day", "last_day"):
+        if asked.get(name):
+            values[name] = _day(asked[name])
+            bad = bad or values[name] is None
+    if (number := whole_number(asked.get("q", ""))) is not None:
+        values["search"] = session.search_text(number)
+        bad = bad or not values["search"]
+    for name in ("cohort", "role"):
+        values[name] = asked.get(name, "")[:64]
+    return visit_list.Filter(**values), bad
+
+
+def _after(text: str) -> tuple[str, int] | None:
+    day, _, visit = text.partition("~")
+    number = whole_number(visit)
+    return None if number is None or _day(day) is None else (day, number)
+
+
+def _day(text: str) -> datetime.date | None:
+    return day_of(text) if len(text) == len("2026-01-10") else None
