@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from research.benchmarks import pbl_workers as queue
+from research.benchmarks import workers as queue
 
 #: Visits of a person.
 VISITS_EACH = 5

@@ -90,7 +90,7 @@ def test_what_the_library_says_is_in_every_language():
         "the keypoints do not state {fields}: a lens without distortion, a camera that nobody measured and the box "
         "around the points stand for them; write the fields (docs/files.md)",
     }
-    with (WEB.parents[1] / "schemas/pbl_schemas/instruments.csv").open(encoding="utf-8") as file:
+    with (PACKAGES["pbl_schemas"] / "pbl_schemas/instruments.csv").open(encoding="utf-8") as file:
         instruments = {"points", *(row[1] for row in csv.reader(file))}
     # Put together of more than one text of the library.
     composed = re.compile(
