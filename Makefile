@@ -11,7 +11,7 @@ JOBS   ?= 2# test processes, a file of tests at a time, in the order of the fold
 # Whatever the shell says, compiled modules are kept: tests start many processes that import them.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-fast lint format lock clean help
+.PHONY: demo docs test test-fast lint format lock dist clean help
 
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -47,6 +47,20 @@ lock: $(READY)  ## choose the newest allowed version of every dependency and wri
 	$(LOCK) --extra s3 --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])' \
 	  | $(LOCK) --output-file workers/deploy/requirements-build.lock -
+
+FILES ?=# address of the files of the tagged commit, https://HOST/OWNER/NAME/blob/TAG: makes the links of README absolute
+TOOLS := build/dist/tools/bin
+
+dist: $(READY)  ## source archive and wheel of the commit, checked: dist/
+	rm -rf build/dist dist && mkdir -p build/dist/source
+	$(BIN)/python -m venv build/dist/tools
+	$(TOOLS)/pip install --quiet --disable-pip-version-check build twine cffconvert
+	git archive HEAD | tar -x -C build/dist/source
+	test -z "$(FILES)" || sed -E -i -e 's#(!\[[^]]*\]\()([^:)]+)\)#\1$(subst /blob/,/raw/,$(FILES))/\2)#g' \
+	  -e 's#([^!]\[[^]]*\]\(|^\[[^]]*\]\()([^:)]+)\)#\1$(FILES)/\2)#g' build/dist/source/README.md
+	PBL_COMMIT=$$(git rev-parse --short=12 HEAD) $(TOOLS)/python -m build --outdir dist build/dist/source
+	$(TOOLS)/twine check --strict dist/*
+	$(TOOLS)/cffconvert --validate --infile CITATION.cff
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
 $(READY): pyproject.toml requirements.lock

@@ -24,7 +24,7 @@ from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import probe
 from pbl_schemas.operations.embedded import APP_USER, HOST, Folder
-from tests import without_posix
+from tests import demo_block, without_posix
 from tests.database import new_home, remove_home
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.html_page import Page, commands_in
@@ -79,6 +79,11 @@ def test_it_ends_well_and_shows_rows_paths_and_progress(demo, out):
     assert re.search(r"populate: .*(row/s|s/row), [A-Z]\w+\]", done.stderr)
     assert "Traceback" not in done.stdout + done.stderr
     assert "The database is stopped" in done.stdout
+
+
+def test_it_prints_what_readme_shows(demo, out):
+    done, _ = demo
+    assert demo_block.differences(demo_block.in_readme(), demo_block.printed_by_demo(done.stdout)) == []
 
 
 def test_the_walker_is_measured_not_the_man(out):

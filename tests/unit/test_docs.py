@@ -11,15 +11,18 @@ from typing import Any
 
 import click
 import pytest
+import yaml
 from markdown.extensions.toc import slugify
+from packaging.requirements import Requirement
 
 import docs_site
+import pbl_pipeline
 from docs_site import _notebook, api, commands
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.report.words import VERDICT_WORDS
 from pbl_schemas import STAGES, computed_tables
-from tests import pages
+from tests import demo_block, pages
 from tests.command import pbl
 from tests.source import PACKAGES, files
 
@@ -34,16 +37,69 @@ def test_errors_page_lists_exactly_the_codes():
     assert sorted(listed) == sorted(CODES)
 
 
-def test_readme_names_every_variable_and_command():
-    text = (ROOT / "README.md").read_text()
+def test_the_settings_page_lists_every_variable():
     source = "".join(file.read_text("utf-8") for file in files(*PACKAGES))
-    listed = re.findall(r"^\| (`PBL_\w+`[^|]*) \|", text, re.MULTILINE)
+    listed = re.findall(r"^\| (`PBL_\w+`[^|]*) \|", pages.text("docs/settings.md"), re.MULTILINE)
     assert sorted(re.findall(r"`(\w+)`", " ".join(listed))) == sorted(set(re.findall(r'"(PBL_[A-Z0-9_]+)"', source)))
-    assert not [c.name for c in entry_points(group="pbl.commands") if f"`pbl {c.name}`" not in text]
 
 
-def test_readme_has_no_placeholder():
+def test_readme_is_short_and_has_no_placeholder():
+    assert len(pages.text("README.md").split()) <= 900
     assert not re.findall(r"@[A-Z]+@", pages.text("README.md"))
+
+
+def test_readme_states_how_far_its_numbers_are_compared():
+    assert demo_block.stated_tolerances() in " ".join(pages.text("README.md").split())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("98.0 steps", "99.2 steps", "cadence"),
+        ("1.225 s", "1.25 s", "stride time"),
+        ("61.9 %", "63.0 %", "stance"),
+        ("right 96.6", "right 98.8", "GDI of three angles"),
+        ("5 cycles", "6 cycles", "GDI of three angles"),
+        ("90 % interval", "95 % interval", "GDI of three angles"),
+        ("86 to 108", "86 to 111", "GDI of three angles"),
+        ("1.9 px", "2.5 px", "residuals of the fit"),
+        ("gdi_cycles, ", "", "QC"),
+    ],
+)
+def test_another_number_in_the_block_of_readme_is_seen(old: str, new: str, line: str):
+    """The test of the demo compares them with what it printed."""
+    ours = demo_block.in_readme()
+    (changed,) = demo_block.differences(ours, [text.replace(old, new) for text in ours])
+    assert changed.startswith(line)
+
+
+def test_small_differences_in_the_block_of_readme_are_allowed_missing_lines_are_not():
+    ours = demo_block.in_readme()
+    close = [t.replace("98.0 steps", "97.1 steps").replace("1.225", "1.210").replace("96.9", "95.1") for t in ours]
+    assert close != ours
+    assert demo_block.differences(ours, close) == []
+    for i in range(len(ours)):
+        less = ours[:i] + ours[i + 1 :]
+        assert len(demo_block.differences(ours, less)) == len(demo_block.differences(less, ours)) == 1
+
+
+def test_the_version_is_the_same_everywhere():
+    """In the package, the citation and the newest heading of the changelog, which a release dates."""
+    citation = yaml.safe_load(pages.text("CITATION.cff"))
+    headings = re.findall(r"^## (.*)$", pages.text("CHANGELOG.md"), re.MULTILINE)
+    assert citation["version"] == pbl_pipeline.__version__
+    assert re.fullmatch(rf"{re.escape(pbl_pipeline.__version__)} \((unreleased|\d{{4}}-\d\d-\d\d)\)", headings[0])
+
+
+def test_the_citation_has_the_fields_of_its_format():
+    """Those that CFF 1.2.0 requires; `make dist` checks it against the schema."""
+    citation = yaml.safe_load(pages.text("CITATION.cff"))
+    (paper,) = citation["references"]
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= citation.keys()
+    assert {"type", "title", "authors"} <= paper.keys()
+    assert paper["title"] in " ".join(pages.text("README.md").split())
+    assert citation["license"] == tomllib.loads(pages.text("pyproject.toml"))["project"]["license"]
 
 
 @pytest.mark.parametrize("page", docs_site.pages())
@@ -59,6 +115,15 @@ def test_no_link_of_a_page_is_dead(page: str):
         if anchor:
             headings = re.findall(r"^#+ (.*)$", file.read_text(), re.MULTILINE)
             assert anchor in [slugify(re.sub(r"[`*]", "", h), "-") for h in headings], target
+
+
+def test_the_page_of_licences_names_every_direct_dependency():
+    project = tomllib.loads(pages.text("pyproject.toml"))["project"]
+    extras = project["optional-dependencies"]
+    wanted = {Requirement(r).name for r in [*project["dependencies"], *extras["s3"], *extras["export"]]}
+    table = pages.text("docs/licences.md").partition("## Direct dependencies")[2]
+    listed = re.findall(r"(?:\| |, )([a-z][\w-]*)(?=,| \(| \|)", "\n".join(re.findall(r"^\| .*", table, re.MULTILINE)[1:]))
+    assert sorted(listed) == sorted(wanted)
 
 
 def test_the_page_of_reports_names_every_verdict():
