@@ -60,7 +60,7 @@ dist: $(READY)  ## source archive and wheel of the commit, checked: dist/
 	  -e 's#([^!]\[[^]]*\]\(|^\[[^]]*\]\()([^:)]+)\)#\1$(FILES)/\2)#g' build/dist/source/README.md
 	PBL_COMMIT=$$(git rev-parse --short=12 HEAD) $(TOOLS)/python -m build --outdir dist build/dist/source
 	$(TOOLS)/twine check --strict dist/*
-	$(TOOLS)/cffconvert --validate --infile CITATION.cff
+	$(TOOLS)/cffconvert --validate --infile build/dist/source/CITATION.cff
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
 $(READY): pyproject.toml requirements.lock

@@ -1,4 +1,4 @@
-"""The package as `pip install` brings it: what is in the wheel, and that it works away from the checkout.
+"""The package as `pip install` brings it: what wheel and source archive hold, and that it works elsewhere.
 
 `pbl run` of the installed wheel is in test_commands.py. What needs a gigabyte of downloads runs where it is asked for:
 `pytest -m machine tests/end_to_end/test_wheel.py`.
@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import tarfile
 import time
 import zipfile
 from pathlib import Path
@@ -20,7 +21,13 @@ from pbl_pipeline.code_version import checked_out_commit
 from tests.database import new_home, remove_home
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("pbl_pipeline", "schemas", "workers")
+#: Installed packages and the folders that hold them.
+PACKAGES = {"pbl_pipeline": ROOT, "pbl_schemas": ROOT / "schemas", "pbl_workers": ROOT / "workers"}
+#: What a source archive has beside them; hatchling adds the last two.
+BESIDE = {
+    *("README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "docker-compose.yml"),
+    *("pyproject.toml", "hatch_build.py", "docs", "schemas", "workers", ".gitignore", "PKG-INFO"),
+}
 
 pytestmark = pytest.mark.slow
 
@@ -31,15 +38,39 @@ def run(words: list[object], folder: Path, **variables: str) -> subprocess.Compl
 
 
 def test_the_wheel_has_every_file_of_the_packages(wheel):
-    files = {p.relative_to(ROOT).as_posix() for name in PACKAGES for p in (ROOT / name).rglob("*") if p.is_file()}
+    found = [(at, p) for name, at in PACKAGES.items() for p in (at / name).rglob("*") if p.is_file()]
+    files = {p.relative_to(at).as_posix() for at, p in found}
     files = {name for name in files if "__pycache__" not in name}
-    assert len([name for name in files if not name.endswith(".py")]) > 40  # body, norms, templates, deploy
+    assert len([name for name in files if not name.endswith(".py")]) > 40  # body, norms, templates
     with zipfile.ZipFile(wheel) as archive:
         inside = set(archive.namelist())
         commit = archive.read("pbl_pipeline/_commit.txt").decode().strip() if checked_out_commit(ROOT) else None
     assert files - inside == set()
     assert {name.split("/")[0] for name in inside if ".dist-info" not in name} == set(PACKAGES)
     assert commit == checked_out_commit(ROOT)
+
+
+def test_the_source_archive_has_what_an_installation_needs_and_builds_the_same_wheel(wheel, tmp_path):
+    build = [sys.executable, "-m", "hatchling", "build", "--directory", tmp_path, "--target"]
+    done = run([*build, "sdist"], ROOT)
+    assert done.returncode == 0, done.stderr
+    (archive,) = tmp_path.glob("*.tar.gz")
+    assert archive.stat().st_size < 5e6
+    with tarfile.open(archive) as file:
+        file.extractall(tmp_path, filter="data")
+    source = archive.with_name(archive.name.removesuffix(".tar.gz"))
+    assert {p.name for p in source.iterdir()} == BESIDE | {"pbl_pipeline"}
+    assert not [p for p in source.rglob("*") if p.name == "__pycache__" or p.suffix in (".pyc", ".mp4", ".db")]
+    done = run([*build, "wheel"], source)
+    assert done.returncode == 0, done.stderr
+    (again,) = tmp_path.glob("*.whl")
+    assert contents(again) == contents(wheel)
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    """The files of a wheel; RECORD lists their sums in the order in which they were added."""
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist() if not name.endswith("/RECORD")}
 
 
 def test_it_is_declared_for_the_pythons_that_were_tried(wheel):
@@ -54,7 +85,8 @@ def test_the_installed_script_is_the_wheels(installed, tmp_path):
     done = run([installed / "bin" / "pbl", "--version"], tmp_path, PYTHONPATH=str(installed))
     said = rf"pbl, version {re.escape(pbl_pipeline.__version__)}\+g[0-9a-f]{{12}}(\.dirty)?\n"
     assert re.fullmatch(said, done.stdout), done.stdout + done.stderr
-    where = "import pbl_pipeline, schemas, workers\nfor m in (pbl_pipeline, schemas, workers): print(m.__file__)"
+    names = ", ".join(PACKAGES)
+    where = f"import {names}\nfor m in ({names}): print(m.__file__)"
     done = run([sys.executable, "-c", where], tmp_path, PYTHONPATH=str(installed))
     assert [Path(line).is_relative_to(installed) for line in done.stdout.splitlines()] == [True] * 3, done.stderr
 
