@@ -34,7 +34,7 @@ class BuildError(RuntimeError):
 def pages() -> dict[str, str]:
     """Path in the repository -> path in the site, of every page that is written by hand."""
     found = {"README.md": "readme.md", "CHANGELOG.md": "changelog.md"}
-    found |= {"CONTRIBUTING.md": "contributing.md", "SECURITY.md": "report_a_weakness.md"}
+    found |= {"CONTRIBUTING.md": "contributing.md", "SECURITY.md": "report_a_vulnerability.md"}
     found |= {f"docs/{p.name}": p.name for p in sorted((ROOT / "docs").glob("*.md"))}
     found |= {
         f"docs/notebooks/{p.name}": f"notebooks/{p.stem}.md" for p in sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
