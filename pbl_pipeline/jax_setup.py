@@ -13,16 +13,18 @@ import warnings
 from typing import Any
 
 import jax
+import jaxlib.version
 
 from pbl_pipeline import settings
 
 #: Programs that compile faster than this are not worth a file.
 MIN_COMPILE_SECONDS = 0.3
-#: Flags of XLA (see `configure`), and the last version of JAX that is known to have them: a library that does not know
-#: a flag ends the process. Those of GPUs do not know all flags of CPUs.
+#: Flags of XLA (see `configure`), and the releases of jaxlib on which they were run: a library ends the process at a
+#: flag that it does not know, so other releases are given none.
 GPU_FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
-CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
-FLAGS_UNTIL = (0, 12)
+GPU_RELEASES = ("0.10.2", "0.11.2")
+CPU_FLAGS = ("--xla_cpu_use_fusion_emitters=false",)
+CPU_RELEASES = ("0.10.2",)  # 0.11.1 and later do not know it
 
 
 @functools.cache
@@ -51,19 +53,18 @@ def configure() -> None:
     # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
     # On a CPU, XLA's newer compiler of fused operations takes longer, and its programs are not faster
     # (docs/benchmarks.md). Read when the first device is asked for.
-    for flag in known_flags(jax.__version__):
+    for flag in known_flags(jaxlib.version.__version__, importlib.util.find_spec("jax_plugins") is not None):
         given = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in given:
             os.environ["XLA_FLAGS"] = f"{given} {flag}".strip()
     jax.monitoring.register_event_duration_secs_listener(_count_compilation)
 
 
-def known_flags(version: str) -> tuple[str, ...]:
-    """Return the flags that the libraries of this version of JAX know, those of its plugins included."""
-    if tuple(int(n) for n in version.split(".")[:2]) > FLAGS_UNTIL:
-        return ()
-    cpu_alone = importlib.util.find_spec("jax_plugins") is None
-    return (*GPU_FLAGS, CPU_FLAG) if cpu_alone else GPU_FLAGS
+def known_flags(release: str, gpu: bool) -> tuple[str, ...]:
+    """Return the flags that were run on this release of jaxlib, with a plugin for GPUs or without one."""
+    if gpu:
+        return GPU_FLAGS if release in GPU_RELEASES else ()
+    return CPU_FLAGS if release in CPU_RELEASES else ()
 
 
 _COMPILED = {"seconds": 0.0}

@@ -27,8 +27,13 @@ def meta(items: Mapping[str, str | float], iso: bool = False) -> bytes:
     return box(b"meta", (bytes(4) if iso else b"") + inside)
 
 
+#: Options of `videos.write_video` for a file that counts in milliseconds: FFmpeg 9 takes the scale of its tracks.
+MILLISECONDS = {"movie_timescale": "1000"}
+
+
 def edit_list(edits: list[tuple[int, int, float]]) -> bytes:
-    """An `edts` box of (length in the file's time scale, start in the track's, speed)."""
+    """An `edts` box of (length in the file's time scale, start in the track's, speed); the file was written with
+    `MILLISECONDS`."""
     rows = b"".join(struct.pack(">IihH", n, start, int(v), round(65536 * (v % 1))) for n, start, v in edits)
     return box(b"edts", box(b"elst", struct.pack(">II", 0, len(edits)) + rows))
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-
-import av
-import cv2
-import numpy as np
+from typing import TYPE_CHECKING
 
 from pbl_pipeline import assets, progress
 from pbl_pipeline.temporary import new_folder
-from pbl_pipeline.video import read_frames
 
 from .run import Column, Row, measured, mega, number, table
+
+if TYPE_CHECKING:
+    import numpy as np
 
 #: The frames of the demo recording in which the woman is wholly in the picture and not near its border.
 _FIRST, _STOP = 60, 166
@@ -26,6 +25,10 @@ def demo_clip(path: Path) -> Path:
 
     Forwards and then backwards: repeated, the person does not jump. Raises the errors of `assets.fetch`.
     """
+    import cv2
+
+    from pbl_pipeline.video import read_frames
+
     source = assets.fetch("demo_video")
     forward = [cv2.resize(f.image, _SIZE, interpolation=cv2.INTER_CUBIC) for f in read_frames(source, _FIRST, _STOP)]
     _write(path, iter([*forward, *forward[-2:0:-1]]), 2 * len(forward) - 2)
@@ -38,6 +41,8 @@ def numbered(film: bytes, number: int) -> bytes:
 
 
 def _write(path: Path, images: Iterator[np.ndarray], n: int) -> None:
+    import av
+
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=_FPS, options={"preset": "veryfast", "crf": "20"})
         assert isinstance(stream, av.VideoStream)

@@ -8,7 +8,6 @@ from pathlib import Path
 import click
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.files import check_out_file, fields_of
 
 from .gait import METHOD_HELP, is_c3d
 
@@ -33,6 +32,7 @@ def events(file: Path, out: Path, method: str) -> None:
     FILE is a fit.npz, a keypoints.npz with 3D markers (its fields decide), or a laboratory's C3D, whose markers are
     searched; its own events are ignored. Without walking, the CSV has only its header and the reason is printed.
     """
+    from pbl_pipeline.files import check_out_file
     from pbl_pipeline.gait import detect_events
 
     check_out_file(out)
@@ -50,6 +50,7 @@ def events(file: Path, out: Path, method: str) -> None:
 
 
 def _feet(path: Path):
+    from pbl_pipeline.files import fields_of
     from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers, read_lab_feet
     from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 

@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 from av.container import InputContainer
@@ -35,6 +36,8 @@ _MAX_PICTURE, _MAX_IN_THREADS = 26 << 20, 128 << 20
 _MAX_THREADS = 8
 #: Most pixels of a picture, in the format with the fewest bytes for each (8 bits, colour at half the resolution).
 _MAX_PIXELS = {"max_pixels": str(_MAX_PICTURE * 2 // 3)}
+#: A header that is not UTF-8 is read all the same: av 18 has to be told so, 19 has no such argument.
+_TEXTS: Any = {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}
 _OPTIONS = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file", **_MAX_PIXELS}
 
 #: Fraction of frames whose stamp may repeat or run backwards and be left out; more means the stamps cannot be trusted.
@@ -95,7 +98,7 @@ class Decoder:
         room = max(1, _MAX_IN_THREADS // max(1, _picture_bytes(self.stream)))
         self.stream.codec_context.thread_count = min(threads or min(cores(), _MAX_THREADS), room)
         self.stream.codec_context.options = _MAX_PIXELS  # also refuses pictures that are larger than announced
-        self.time_base: Fraction = self.stream.time_base or Fraction(1, av.time_base)
+        self.time_base = Fraction(self.stream.time_base or Fraction(1, av.time_base))
         #: Its pictures in order, where the GPU has decoded them; the packets are then only counted.
         self.pictures: list[av.VideoFrame] | None = None
         self.n_frames = 0
@@ -363,7 +366,7 @@ def _open(path: Path) -> InputContainer:
             key=path,
         )
     try:
-        return av.open(str(path), options=_OPTIONS, metadata_errors="replace")
+        return av.open(str(path), options=_OPTIONS, **_TEXTS)
     except FFMPEG_ERRORS as error:
         lost = missing_end(path) if family(path) else None
         if lost is None:
@@ -386,5 +389,5 @@ def _open(path: Path) -> InputContainer:
 
 def _count_packets(path: Path, index: int) -> int:
     """Packets of one stream that are whole, as stored, whatever an edit list says."""
-    with av.open(str(path), options=_OPTIONS | {"ignore_editlist": "1"}, metadata_errors="replace") as container:
+    with av.open(str(path), options=_OPTIONS | {"ignore_editlist": "1"}, **_TEXTS) as container:
         return sum(1 for p in container.demux(container.streams[index]) if p.size and not p.is_corrupt)

@@ -42,10 +42,12 @@ def video(path: Path) -> None:
 
 
 def phone_video(path: Path) -> None:
-    from tests.quicktime import edit_list, insert, meta
+    from tests.quicktime import MILLISECONDS, edit_list, insert, meta
     from tests.videos import constant_rate, numbered_frames, write_video
 
-    write_video(path, numbered_frames(12), constant_rate(12), rotation_deg=90, b_frames=2)
+    write_video(
+        path, numbered_frames(12), constant_rate(12), rotation_deg=90, b_frames=2, container_options=MILLISECONDS
+    )
     tags = {"com.apple.quicktime.camera.focal_length.35mm_equivalent": 27, "com.apple.quicktime.camera.lens_model": "x"}
     insert(path, of_track=meta(tags), of_file=meta({"com.apple.quicktime.model": "iPhone 13"}))
     insert(path, of_track=edit_list([(400, 0, 1.0)]))

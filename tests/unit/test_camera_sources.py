@@ -17,7 +17,7 @@ from pbl_pipeline.video.lens_calibration import preset_camera, presets, quarter_
 from research.phone_cameras import build
 from tests import not_none
 from tests.inputs import keypoints, video_info
-from tests.quicktime import edit_list, insert, meta
+from tests.quicktime import MILLISECONDS, edit_list, insert, meta
 from tests.videos import constant_rate, numbered_frames, write_video
 
 APPLE = {
@@ -98,7 +98,13 @@ def test_android_at_the_rate_it_says_passes(tmp_path):
 
 def test_slow_motion_with_an_edit_list(tmp_path):
     """240 frames a second of real time; the edit list plays the second half at an eighth and hides nothing."""
-    path = write_video(tmp_path / "slow.mov", numbered_frames(48), constant_rate(48, 240), ticks_per_s=2400)
+    path = write_video(
+        tmp_path / "slow.mov",
+        numbered_frames(48),
+        constant_rate(48, 240),
+        ticks_per_s=2400,
+        container_options=MILLISECONDS,
+    )
     insert(path, of_track=edit_list([(100, 0, 1.0), (800, 240, 0.125)]))
     info = probe(path)
     np.testing.assert_allclose(np.diff(info.time_s), 1 / 240, atol=1e-3)

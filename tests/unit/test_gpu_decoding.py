@@ -85,7 +85,8 @@ def test_pictures_and_facts_are_those_of_ffmpeg(
     with frames_kept():
         found = probe(path)
         np.testing.assert_array_equal(found.time_s, facts.time_s)
-        assert dataclasses.replace(found, time_s=facts.time_s) == facts
+        others = [field.name for field in dataclasses.fields(facts) if field.name != "time_s"]
+        assert [getattr(found, name) for name in others] == [getattr(facts, name) for name in others]
         assert decoder.n_videos == 1
         assert pictures(path) == expected
 

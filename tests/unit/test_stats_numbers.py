@@ -112,7 +112,7 @@ def test_groups():
     assert (apart.value, apart.high) == (1, 1)
     assert apart.low < 0.8
     assert shapiro_wilk(PRE).statistic == pytest.approx(0.9258060286, abs=1e-9)
-    assert shapiro_wilk(PRE).p == pytest.approx(0.4079287935, abs=1e-9)
+    assert shapiro_wilk(PRE).p == pytest.approx(0.407928795, abs=2e-9)  # scipy 1.17: ...7935, 1.18: ...7964
 
 
 def test_hedges_g_with_his_exact_correction():

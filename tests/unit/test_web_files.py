@@ -12,7 +12,7 @@ from pbl_pipeline import texts, words
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.shipped import shipped_text
-from tests.source import PACKAGES, files, nodes
+from tests.source import PACKAGES, ROOT, files, nodes
 
 WEB = Path(texts.__file__).parents[1] / "workers/pbl_workers/web"
 _PAGES = [*WEB.glob("templates/*.html"), *WEB.glob("*.py"), Path(texts.__file__)]
@@ -109,7 +109,7 @@ def test_what_the_library_says_is_in_every_language():
     )
     report = re.sub(r'aria-label="(.*?)"', r">\1<", shipped_text("report/templates/report.html"))
     report = html.unescape(re.sub(r"\s*(<[^>]*>|\{[%{].*?[%}]\})", "\0", report))
-    report += "\0".join(f.read_text("utf-8") for f in sorted((WEB.parents[1] / "pbl_pipeline/report").glob("*.py")))
+    report += "\0".join(f.read_text("utf-8") for f in sorted((ROOT / "pbl_pipeline/report").glob("*.py")))
     report = re.sub(r'"\n +f?"', "", report)  # a text over several lines
     pool = "\0".join([*plain, report])
     parts = {e: [part.strip() for part in re.split(r"\{\w+\}", e)] if "{" in e else [] for e in ours}
