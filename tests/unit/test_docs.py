@@ -29,6 +29,8 @@ from tests.source import PACKAGES, files
 ROOT = pages.ROOT
 #: Modules of tables: docs/tables.md has what is in them.
 TABLES = {f"pbl_schemas.{stage}" for stage in STAGES}
+#: Files for deployment that name our images.
+DEPLOYED = ("workers/deploy/Dockerfile", "workers/deploy/kubernetes/kustomization.yaml")
 
 
 def test_errors_page_lists_exactly_the_codes():
@@ -84,10 +86,12 @@ def test_small_differences_in_the_block_of_readme_are_allowed_missing_lines_are_
 
 
 def test_the_version_is_the_same_everywhere():
-    """In the package, the citation and the newest heading of the changelog, which a release dates."""
+    """Package, citation, newest heading of changelog, which a release dates, and images' tags."""
     citation = yaml.safe_load(pages.text("CITATION.cff"))
     headings = re.findall(r"^## (.*)$", pages.text("CHANGELOG.md"), re.MULTILINE)
     assert citation["version"] == pbl_pipeline.__version__
+    for page in ("docker-compose.yml", "docs/deployment.md", *DEPLOYED):
+        assert set(re.findall(r"(\d+\.\d+\.\d+)-[cg]pu\b", pages.text(page))) == {pbl_pipeline.__version__}, page
     assert re.fullmatch(rf"{re.escape(pbl_pipeline.__version__)} \((unreleased|\d{{4}}-\d\d-\d\d)\)", headings[0])
 
 
