@@ -26,3 +26,10 @@ def load_visit(restriction: Any) -> Visit:
     from .reading import load_visit as load
 
     return load(restriction)
+
+
+def visits_of(sessions: Any) -> Any:
+    """Return our visits of rows of a linked laboratory's Session: see `pbl_schemas.linking`."""
+    from .linking import visits_of as linked
+
+    return linked(sessions)

@@ -95,14 +95,15 @@ def schema_name(stage: str) -> str:
     return f"{prefix()}_{stage}"
 
 
-def bind(stage: str, schema: datajoint.Schema) -> None:
+def bind(stage: str, schema: datajoint.Schema, create_tables: bool = True) -> None:
     """Create the missing schema and tables of a stage, and bind the classes to them.
 
-    Call it in the order of dependency: a table can only refer to tables that are bound.
+    Call it in the order of dependency: a table can only refer to tables that are bound. `create_tables`: False creates
+    none, True those that DataJoint's configuration allows.
     """
     server = connect()
     try:
-        schema.activate(schema_name(stage), connection=server)
+        schema.activate(schema_name(stage), connection=server, create_tables=None if create_tables else False)
     except Exception:
         schema.database = None  # otherwise DataJoint would consider it bound
         raise

@@ -24,9 +24,9 @@ def check_subject(code: str, next_step: str, key: object = None) -> None:
 
 
 def day_of(label: str) -> datetime.date | None:
-    """Return the day in a session's label (ISO, such as YYYY-MM-DD); None for any other text."""
+    """Return the day in a session's label (ISO, such as YYYY-MM-DD, also with a time); None for any other text."""
     try:
-        return datetime.date.fromisoformat(label)
+        return datetime.datetime.fromisoformat(label).date()
     except ValueError:
         return None
 

@@ -88,12 +88,13 @@ def record(execute: Callable[..., object], number: int, name: str, statements: C
     )
 
 
-def check_version() -> None:
-    """Refuse tables of another version; on a server without any, record the migrations that new ones need not go
-    through. Call it before the tables are declared. Raises `PblError` DB_MIGRATION."""
+def check_version(new: bool = True) -> None:
+    """Refuse tables of another version; on a server without any, unless they are not to be created (`new`), record the
+    migrations that new ones need not go through. Call it before the tables are declared. Raises `PblError`
+    DB_MIGRATION."""
     if any(not table.startswith("~") for _, table in catalog.names()):
         refuse_other_version()
-    elif not applied():
+    elif new and not applied():
         query = connection.connect().query
         query(f"CREATE DATABASE IF NOT EXISTS `{connection.schema_name('lab')}`")
         for number, name in numbered():

@@ -17,6 +17,7 @@ from pbl_schemas.datajoint_setup import dj
 from pbl_schemas.operations import client_config
 from pbl_schemas.store import further_stores
 from tests.command import pbl
+from tests.database import embedded_only
 
 #: In a process that knows DataJoint and nothing of this project.
 PLAIN = """
@@ -104,6 +105,38 @@ def test_plain_datajoint_connects_with_what_is_written(tried, tmp_path):
     assert (client_config.AGGREGATE in done.out) == client_config.is_mariadb()
     assert "Commit deletes?" in asked.stdout  # safemode asks a person, who says no
     assert len(tried()) == 1
+
+
+#: A schema of the user's own, in a process that knows DataJoint only.
+OWN = """
+import datajoint as dj
+schema = dj.Schema("maria_b_mylab")
+
+@schema
+class Walk(dj.Manual):
+    definition = "walk : int32"
+
+Walk.insert1({"walk": 1})
+print("rows", len(Walk()))
+schema.drop(prompt=False)
+try:
+    dj.Schema("maria")
+except dj.DataJointError as error:
+    print(error)
+"""
+
+
+@embedded_only
+def test_the_user_of_the_embedded_database_creates_schemas_of_the_users_own(database, tmp_path, monkeypatch):
+    monkeypatch.setenv("LOGNAME", "Maria.B")
+    done = pbl("db", "config", "--out", tmp_path)
+    assert "Your own schemas begin with maria_b_ or pbl_, such as dj.Schema('maria_b_mylab')" in done.out
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("DJ_", "PBL_", "PYTHONPATH"))}
+    own = subprocess.run(
+        [sys.executable, "-P", "-c", OWN], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert "rows 1\n" in own.stdout, own.stderr
+    assert "could not be created" in own.stdout
 
 
 def test_files_that_are_there_are_left_unless_told(database, tmp_path):

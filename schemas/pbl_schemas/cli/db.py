@@ -149,11 +149,12 @@ def config(out: Path, overwrite: bool) -> None:
     """Write datajoint.json and .secrets/ of the database in use, so that plain `import datajoint` connects to it.
 
     The login is the one of this call: DJ_USER's, or the embedded database's. .secrets/ is readable for you alone and
-    keeps itself out of git. DataJoint continues asking before it deletes (safemode).
+    keeps itself out of git. DataJoint continues asking before it deletes (safemode). Prints which custom schemas the
+    account may create; on the embedded database this call allows those that begin with your user name.
 
     Example: pbl db config --out notebooks
     """
-    from pbl_schemas.operations.client_config import AGGREGATE, is_mariadb, write_config
+    from pbl_schemas.operations.client_config import AGGREGATE, is_mariadb, own_schemas, write_config
 
     for path in write_config(out, overwrite):
         click.echo(path)
@@ -162,6 +163,7 @@ def config(out: Path, overwrite: bool) -> None:
             "The server is MariaDB, where A.aggr(B) of plain DataJoint fails (error 1055). After each connect:\n"
             f"{AGGREGATE}"
         )
+    click.echo(own_schemas())
 
 
 # Each command imports what it needs: `pbl db --help` should not wait for the table engine.

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_height, check_label, check_mass, is_plain
 
-from .. import fit, gait, gdi, kinetics, lab, session, video
+from .. import fit, gait, gdi, kinetics, lab, linking, session, video
 from ..rows import counted, delete_below, inside, number, utc_now
 from ..session import UNLABELLED
 from ..subject_codes import check_subject, day_of
@@ -236,6 +236,7 @@ def _no_video(code: str, found: str, path: Path) -> PblError:
 def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     """Return the number of the session of each visit, by subject and label; people and sessions are registered where
     they are new, and population, height, mass and date are changed where they are stated. Call it in a transaction.
+    Raises what `linking.link_people` raises.
     """
     visits = list(dict.fromkeys(visits))
     add_people(visits)
@@ -258,6 +259,7 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
         }
         for key in missing
     )
+    linking.link_visits({key: numbers[key] for key in keys})
     for key, date in dates.items():
         if key in stored and stored[key]["session_date"] != date:
             session.Session.update1({"session_id": numbers[key], "session_date": date})
@@ -277,6 +279,7 @@ def add_people(visits: Iterable[VisitRecord]) -> None:
     about = {"population": "unknown", "subject_created": utc_now()}
     new = ({"subject": code, "project": projects.get(code), **about} for code in codes if code not in known)
     lab.Subject.insert(new, skip_duplicates=True)
+    linking.link_people(codes)
     for v in visits:
         set_population(v.subject, v.population)
         if v.height_m is not None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import getpass
+import re
 from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_schemas import connection
 from pbl_schemas.datajoint_setup import dj
+from pbl_schemas.operations import embedded
 from pbl_schemas.operations.folders import private_folder, write_json, write_text
 from pbl_schemas.tables_version import refuse_other_version
 
@@ -52,6 +56,23 @@ def write_config(folder: Path, overwrite: bool = False) -> list[Path]:
             write_text(kept / name, value)  # other files in this folder stay
         write_json(here, content, 0o644)
     return [here, *(kept / name for name in secrets)]
+
+
+def own_schemas() -> str:
+    """Allow the user of the embedded server schemas that begin with the user's name; return, in words, which custom
+    schemas the account of `write_config` may create."""
+    user = ours = connection.prefix()
+    if connection.external():
+        grant = f"pbl db roles --role analyst --user {dj.config['database.user']} --schema NAME"
+        return f"A custom schema, {ours}_NAME, is granted by the administrator: {grant}"
+    with contextlib.suppress(KeyError, OSError):  # an account without a name
+        name = re.sub("[^a-z0-9]", "_", getpass.getuser().lower())[:30]
+        user = name if name[:1].isalpha() else user
+    embedded.allow_prefix(user)
+    return (
+        f"Your own schemas begin with {user}_ or {ours}_, such as dj.Schema('{user}_mylab'). "
+        f"`pbl db backup` saves those with {ours}_, and `pbl forget` removes a person from them."
+    )
 
 
 def is_mariadb() -> bool:

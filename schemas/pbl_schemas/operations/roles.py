@@ -6,6 +6,8 @@
 | worker | read, insert, change and delete rows; no table is created, changed or dropped |
 | analyst | read |
 
+Each may read the schemas that PBL_LINKING_MODULE links; the admin may refer to them.
+
 The statements are the same on MySQL 8 and MariaDB. DataJoint creates tables on first use, so an admin declares all of
 them before (`pbl db init`, `pbl db migrate`).
 """
@@ -26,7 +28,7 @@ import pymysql
 from pymysql.converters import escape_string
 
 from pbl_pipeline.errors import PblError, os_errors_as
-from pbl_schemas import connection
+from pbl_schemas import connection, linking
 from pbl_schemas.stages import STAGES
 
 from . import embedded
@@ -39,6 +41,8 @@ ROLES: dict[str, tuple[str, ...]] = {
     "analyst": ("SELECT", "SHOW VIEW"),
 }
 
+#: Role -> rights in the schemas of a linked laboratory (`pbl_schemas.linking`).
+_OF_LINKED = {"admin": "SELECT, REFERENCES", "worker": "SELECT", "analyst": "SELECT"}
 #: Role -> end of the default account's name, after the prefix. The embedded server has its own `pbl_admin`.
 _ENDINGS = {"admin": "owner", "worker": "worker", "analyst": "analyst"}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
@@ -108,12 +112,17 @@ def statements(account: Account, password: str, require_tls: bool = False) -> li
         f"GRANT {', '.join(ROLES[account.role])} ON `{pattern()}%`.* TO {account.name}",
         *more,
         *(f"GRANT ALL PRIVILEGES ON `{p}`.* TO {account.name}" for p in own),
+        *(f"GRANT {_OF_LINKED[account.role]} ON `{p}`.* TO {account.name}" for p in map(_escaped, linking.schemas())),
     ]
 
 
 def _own(name: str) -> str:
     """Return the name of a custom schema for GRANT."""
-    return pattern() + name.replace("_", r"\_")
+    return pattern() + _escaped(name)
+
+
+def _escaped(name: str) -> str:
+    return name.replace("_", r"\_")
 
 
 def password_file(folder: Path, account: Account) -> Path:
