@@ -60,29 +60,25 @@ class Linked:
         """Return the key of each person by our code. Raises `PblError` USAGE for a code of two."""
         return self._named((str(self.subject_code(key)), key) for key in self.subject.keys())  # noqa: SIM118
 
-    def visits(self, people: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, Any]]:
-        """Return the key of each visit of these people by code and label. Raises `PblError` USAGE for a name of two."""
+    def visits(self, people: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Return the key of each visit of these people by `code/label`. Raises `PblError` USAGE for a name of two."""
         codes = {tuple(key[name] for name in self.owner.values()): code for code, key in people.items()}
         rows = self.session & [dict(zip(self.owner, values, strict=True)) for values in codes]
         found = []
         for row in rows.proj(*self.owner).to_dicts():
             key = {name: row[name] for name in self.session.primary_key}
-            found.append(((codes[tuple(row[name] for name in self.owner)], str(self.session_label(key))), key))
+            found.append((f"{codes[tuple(row[name] for name in self.owner)]}/{self.session_label(key)}", key))
         return self._named(found)
 
-    def _named(self, pairs: Iterable[tuple[Any, dict[str, Any]]]) -> dict[Any, dict[str, Any]]:
-        out: dict[Any, dict[str, Any]] = {}
+    def _named(self, pairs: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+        out: dict[str, dict[str, Any]] = {}
         for name, key in pairs:
             if out.setdefault(name, key) is not key:
-                raise _usage(f"{_text(name)} for {out[name]} and {key}", "one row of each name", key=self.module)
+                raise _usage(f"{name} for {out[name]} and {key}", "one row of each name", key=self.module)
         return out
 
 
 _linked: Linked | None = None
-
-
-def _text(name: str | tuple[str, str]) -> str:
-    return name if isinstance(name, str) else "/".join(name)
 
 
 def _joined(columns: Iterable[str], key: Mapping[str, Any]) -> str:
@@ -183,14 +179,14 @@ def link_people(codes: Iterable[str], only_known: bool = False) -> None:
 def link_visits(numbers: Mapping[tuple[str, str], int], only_known: bool = False) -> None:
     """Link registered visits (code and label -> session_id) with the laboratory's, as `link_people` does people."""
     lacking = set(_without_link(session.Session, numbers.values()))
-    if wanted := {name: number for name, number in numbers.items() if number in lacking}:
-        linked, codes = _required(), {code for code, _ in wanted}
+    if wanted := {f"{code}/{label}": number for (code, label), number in numbers.items() if number in lacking}:
+        linked, codes = _required(), {code for code, _ in numbers}
         visits = linked.visits({code: key for code, key in linked.people().items() if code in codes})
         _insert(session.Session, linked.session, wanted, visits, only_known)
 
 
-def _insert(master: Any, theirs: Any, wanted: Mapping[Any, Any], found: Mapping[Any, Any], only_known: bool) -> None:
-    absent = [_text(name) for name in wanted if name not in found]
+def _insert(master: Any, theirs: Any, wanted: Mapping[str, Any], found: Mapping[str, Any], only_known: bool) -> None:
+    absent = [name for name in wanted if name not in found]
     if absent and not only_known:
         raise PblError(
             "DB_NOT_FOUND",

@@ -185,13 +185,22 @@ try:
 except dj.DataJointError as error:
     print(str(error).split("`.")[0])
 print(len(one), one.delete(prompt=False, part_integrity="cascade"))
+import mylab, pbl_schemas
+try:
+    pbl_schemas.activate(linking_module=mylab)
+except Exception as error:
+    print(error.code, error.found)
 """
 
 
-def test_deleting_the_laboratorys_visit_deletes_ours_if_told_to(mylab: Any, visits: list[int], tmp_path: Path):
+def test_deleting_the_laboratorys_visit_deletes_ours_if_told_to(
+    mylab: Any, visits: list[int], folder: Path, tmp_path: Path
+):
     assert pbl("db", "config", "--out", tmp_path).code == 0
-    plain = {"DJ_IGNORE_CONFIG_FILE": "false"}
-    assert python(tmp_path, PLAIN, **plain) == "Attempt to delete part table `pbl_session\n1 1\n"
+    plain = {"DJ_IGNORE_CONFIG_FILE": "false", "PYTHONPATH": str(folder)}
+    assert python(tmp_path, PLAIN, **plain) == (
+        "Attempt to delete part table `pbl_session\n1 1\nUSAGE it connected before pbl_schemas did\n"
+    )
     assert len(video.Video & {"video_id": visits[1]}) == 0
     assert (gdi.SessionGdi * session.Session).to_arrays("subject").tolist() == ["P001"]
     assert len(lab.Subject & {"subject": "P002"}) == 1
@@ -279,7 +288,7 @@ def test_a_module_that_cannot_be_linked_is_refused_and_nothing_is_made(folder: P
     for line, expected in zip(said, WRONG.values(), strict=True):
         assert line.startswith(f"USAGE {expected}")
     assert links == "[]"
-    assert visits == "{('2', '7'): {'visit': 7}}"
+    assert visits == "{'2/7': {'visit': 7}}"
 
 
 NOTHING_MADE = """

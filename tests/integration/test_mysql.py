@@ -40,6 +40,7 @@ FILES = (
     "test_backup.py",
     "test_migrations.py",
     "test_catalog.py",
+    "test_linking.py",
 )
 
 pytestmark = pytest.mark.machine
