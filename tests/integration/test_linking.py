@@ -60,6 +60,7 @@ def folder(database: Path, tmp_path_factory: pytest.TempPathFactory, module_patc
     """The folder of the laboratory's module `mylab`, from which it is imported."""
     out = tmp_path_factory.mktemp("mylab")
     (out / "mylab.py").write_text(MYLAB)
+    (out / "renamed.py").write_text(RENAMED)
     module_patch.syspath_prepend(out)
     may_create("mylab")
     return out
@@ -94,6 +95,12 @@ def test_what_was_registered_before_is_linked_as_far_as_the_laboratory_has_it(my
     assert linked() == [("P001", FIRST, 1, MORNING)]
     assert lab.Subject.Link.to_dicts() == [{"subject": "P001", "linked_subject": 1}]
     assert len(session.Session()) == 2
+
+
+def test_a_database_is_linked_with_the_same_tables_only(mylab: Any):
+    with pytest.raises(PblError, match=r"links of Session refer to .*mylab_core.*session"):
+        pbl_schemas.activate(linking_module="renamed")
+    assert session.Session.Link.heading.names[1:] == ["linked_subject", "linked_session_datetime"]
 
 
 def test_migrations_find_nothing_to_do(mylab: Any):
@@ -280,7 +287,6 @@ Session = Visit
 def test_a_module_that_cannot_be_linked_is_refused_and_nothing_is_made(folder: Path):
     for i, text in enumerate(WRONG):
         (folder / f"wrong{i}.py").write_text(text)
-    (folder / "renamed.py").write_text(RENAMED)
     may_create("other")
     *said, links, visits = python(
         folder, REFUSE.replace("NUMBER", str(len(WRONG))), PYTHONPATH=str(folder)
