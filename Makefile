@@ -2,7 +2,8 @@
 
 VENV   := .venv
 BIN    := $(VENV)/bin
-READY  := $(VENV)/.installed
+RUNS   := $(VENV)/.runs# what a worker needs: the lock of its image
+READY  := $(VENV)/.installed# that and what tests need
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
             if command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
             then echo $$p; break; fi; done)
@@ -16,7 +17,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist l
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
 
-demo: $(READY)  ## put the demo recording through every table and show the result
+demo: $(RUNS)   ## put the demo recording through every table and show the result
 	$(BIN)/pbl demo --out $(OUT)
 
 docs: $(READY)  ## the site of the documentation: build/docs/site/index.html
@@ -43,8 +44,8 @@ LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --genera
 lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' three
 	$(BIN)/pip install --quiet uv
 	$(LOCK) --extra dev --output-file requirements.lock pyproject.toml
-	$(LOCK) --extra s3 --output-file workers/deploy/requirements-cpu.lock pyproject.toml
-	$(LOCK) --extra s3 --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
+	$(LOCK) --extra s3 --extra figures --output-file workers/deploy/requirements-cpu.lock pyproject.toml
+	$(LOCK) --extra s3 --extra figures --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])' \
 	  | $(LOCK) --output-file workers/deploy/requirements-build.lock -
 
@@ -63,7 +64,7 @@ dist: $(READY)  ## source archive and wheel of the commit, checked: dist/
 	$(TOOLS)/cffconvert --validate --infile build/dist/source/CITATION.cff
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
-$(READY): pyproject.toml requirements.lock
+$(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "installing Debian's python3-venv (needed once)"; \
@@ -71,8 +72,13 @@ $(READY): pyproject.toml requirements.lock
 	  $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r workers/deploy/requirements-cpu.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $(RUNS)
+
+$(READY): $(RUNS) requirements.lock
+	@echo "installing what the tests need"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	@touch $(READY)
 
 clean:          ## remove the virtual environment and the demo's output; the database and the cache stay

@@ -23,7 +23,8 @@ class CommitHook(BuildHookInterface):
             return
         commit = os.environ.get("PBL_COMMIT") or _checked_out_commit(root)
         if commit:
-            file = Path(tempfile.mkdtemp(prefix="pbl-build-")) / "_commit.txt"
+            self._folder = tempfile.TemporaryDirectory(prefix="pbl-build-")  # removed with the hook
+            file = Path(self._folder.name) / "_commit.txt"
             file.write_text(commit + "\n")
             build_data["force_include"][str(file)] = TARGET
 

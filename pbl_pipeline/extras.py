@@ -7,18 +7,25 @@ from types import ModuleType
 
 from pbl_pipeline.errors import PblError
 
+#: Module of an optional package -> the extra that brings it.
+EXTRAS = {"ezc3d": "export", "pyarrow": "export", "matplotlib": "figures"}
 
-def needed(module: str, extra: str, purpose: str) -> ModuleType:
-    """The module of a package of an optional extra of this project.
 
-    Raises `PblError` PACKAGE_MISSING, with the command that installs it.
-    """
+def needed(module: str, purpose: str) -> ModuleType:
+    """The module of an optional package. Raises `PblError` PACKAGE_MISSING, with the command that installs it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise PblError(
-            "PACKAGE_MISSING",
-            found=str(error),
-            expected=f"the package {module.split('.')[0]} for {purpose}",
-            next_step=f"pip install 'pbl-pipeline[{extra}]'",
-        ) from error
+        raise absent(error, module, purpose) from error
+
+
+def absent(error: ImportError, module: str, purpose: str = "this step") -> PblError:
+    """PACKAGE_MISSING for a module of another package that is not installed, or only in parts."""
+    package = module.partition(".")[0]
+    extra = EXTRAS.get(package)
+    return PblError(
+        "PACKAGE_MISSING",
+        found=str(error),
+        expected=f"the package {package} for {purpose}",
+        next_step=f"pip install 'pbl-pipeline[{extra}]'" if extra else "`pbl doctor` says how to mend it",
+    )

@@ -113,7 +113,8 @@ class NpmPackage(Package):
         return shlex.join(["npm", *self._pack(".")])
 
     def environment(self, scratch: Path) -> dict[str, str]:
-        return {"npm_config_cache": str(scratch)}
+        # Node keeps compiled modules among the temporary files as well, and nobody removes them.
+        return {"npm_config_cache": str(scratch), "TMPDIR": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
         """Npm's first sentence after its codes; a failed connection comes first."""

@@ -15,6 +15,7 @@ import click
 from pbl_pipeline import progress, temporary
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.extras import absent
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
@@ -123,7 +124,8 @@ def _explain(error: Exception) -> None:
 
 
 def _unforeseen(error: Exception) -> PblError:
-    """Convert an error without a code: a full disk and a name too long have codes, all others are INTERNAL."""
+    """Convert an error without a code: a full disk, a name too long and a package that cannot be imported have codes,
+    all others are INTERNAL."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
         return PblError(
             "FILE_UNWRITABLE",
@@ -141,6 +143,10 @@ def _unforeseen(error: Exception) -> PblError:
             key=str(error.filename)[:200],
         )
     frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, ImportError):
+        module = error.name or Path(frames[-1].filename).parent.name
+        if not module.startswith("pbl_"):
+            return absent(error, module)
     where = f", at {Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}" if frames else ""
     return PblError(
         "INTERNAL",

@@ -63,6 +63,7 @@ def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
     return [
         *(_python(), *_packages()),
         _loads("JAX device", _jax_device, "pip install --upgrade jax jaxlib"),
+        _loads("MuJoCo", _mujoco, "pip install --force-reinstall --no-deps mujoco mujoco-core mujoco-studio"),
         _loads("compile cache", _jax_cache, "pip install --upgrade jax mujoco-mjx"),
         _loads("LiteRT", _litert, "pip install ai-edge-litert"),
         _loads("ONNX runtime", _onnx, "pip install onnxruntime, or correct PBL_ONNX_DEVICE"),
@@ -138,6 +139,13 @@ def _jax_device() -> Finding:
     if devices[0].platform == "cpu" and (shutil.which("nvidia-smi") or ctypes.util.find_library("cuda")):
         return Finding("JAX device", NOTE, f"{detail}; an NVIDIA GPU is not used", "pip install 'pbl-pipeline[gpu]'")
     return Finding("JAX device", OK, detail)
+
+
+def _mujoco() -> Finding:
+    """Load it: an upgrade from version 3 with pip leaves parts of both, and nothing that pip checks."""
+    import mujoco
+
+    return Finding("MuJoCo", OK, mujoco.__version__)
 
 
 def _jax_cache() -> Finding:

@@ -34,7 +34,7 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
 
     Raises `PblError` PACKAGE_MISSING without ezc3d.
     """
-    ezc3d: Any = needed("ezc3d.ezc3d", "export", "writing C3D files")
+    ezc3d: Any = needed("ezc3d.ezc3d", "writing C3D files")
     even = trial.even
     file = _Parameters(ezc3d)
     # In this order: ezc3d accepts no further channel once it knows the rate of the points.

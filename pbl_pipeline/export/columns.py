@@ -144,8 +144,8 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
 
     Raises `PblError` PACKAGE_MISSING without pyarrow.
     """
-    pa: Any = needed("pyarrow", "export", "writing Parquet files")
-    parquet: Any = needed("pyarrow.parquet", "export", "writing Parquet files")
+    pa: Any = needed("pyarrow", "writing Parquet files")
+    parquet: Any = needed("pyarrow.parquet", "writing Parquet files")
     arrays = []
     for c in table.columns:
         if isinstance(c.values, Labels):

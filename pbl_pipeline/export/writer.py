@@ -141,9 +141,9 @@ def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> N
             next_step="spell the name without accents, or use a code",
         )
     if "c3d" in formats:
-        needed("ezc3d", "export", "writing C3D files")
+        needed("ezc3d", "writing C3D files")
     if "parquet" in formats:
-        needed("pyarrow", "export", "writing Parquet files")
+        needed("pyarrow", "writing Parquet files")
     check_out_folder(out)
     if not options.overwrite and out.is_dir() and any(out.iterdir()):
         raise PblError(

@@ -231,6 +231,28 @@ def test_an_unforeseen_error_asks_to_be_reported(monkeypatch, folder, tmp_path):
     assert "Traceback" in with_stack.err
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ImportError("No module named 'matplotlib'", name="matplotlib.axes"), "pip install 'pbl-pipeline[figures]'"),
+        (ImportError("libmujoco.so: cannot open", name="mujoco"), "`pbl doctor`"),
+        (ImportError("core bindings are missing"), "`pbl doctor`"),  # as raised by the package itself
+    ],
+)
+def test_a_package_that_is_missing_or_broken_is_named(monkeypatch, folder, tmp_path, error, said):
+    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(error))
+    done = pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")
+    check(done, "PACKAGE_MISSING")
+    assert str(error) in done.err
+    assert said in done.err
+
+
+def test_a_name_of_ours_that_is_missing_is_our_fault(monkeypatch, folder, tmp_path):
+    error = ImportError("cannot import name 'x' from 'pbl_pipeline.gait'", name="pbl_pipeline.gait")
+    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(error))
+    check(pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv"), "INTERNAL")
+
+
 def test_a_full_disk_is_named(monkeypatch, folder, tmp_path):
     full = OSError(errno.ENOSPC, "No space left on device", "walk.events.csv")
     monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(full))

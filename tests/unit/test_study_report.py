@@ -311,6 +311,14 @@ def test_the_script_of_a_folder_makes_the_same_tables(written):
         assert (out / "tables" / path.name).read_bytes() == path.read_bytes()
 
 
+def test_without_the_extra_the_report_names_it(tmp_path):
+    code = "import sys; sys.modules['matplotlib'] = None; from pbl_pipeline.cli import main; main()"
+    words = ["study", "report", tmp_path, "--out", tmp_path / "out"]
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr.partition(":")[0]) == (1, "PACKAGE_MISSING"), done.stderr[-2000:]
+    assert "pip install 'pbl-pipeline[figures]'" in done.stderr
+
+
 def test_a_figure_is_the_same_each_time(study, results):
     one, again = (study_figures(study, results)["5D_groups"] for _ in range(2))
     assert one.pdf(["footer"]) == again.pdf(["footer"]) == one.pdf(["footer"])
