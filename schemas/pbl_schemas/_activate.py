@@ -9,8 +9,6 @@ from pbl_pipeline.errors import PblError
 
 from .stages import STAGES, modules
 
-_methods_done: set[str] = set()
-
 
 def activate(
     prefix: str | None = None,
@@ -41,9 +39,10 @@ def activate(
         Start the embedded server when it is not running.
     methods
         Insert the method, body and norm rows of this version of the code (loads the numerical libraries, a few
-        seconds). Commands that only look leave it out.
+        seconds). Commands that only look leave it out: False inserts them only where there are none.
     """
-    from . import connection, fit, linking, plan, tables_version
+    from . import connection, fit, jobs, linking, plan, store, tables_version
+    from .methods import insert_if_none, insert_once
     from .operations import catalog, embedded
 
     if prefix is not None:
@@ -58,20 +57,16 @@ def activate(
             expected="the schemas of all tables, because none may be created",
             next_step="check the prefix, or leave out create_schema=False",
         )
-    tables_version.check_version(create_tables)
+    new = tables_version.check_version(create_tables)
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema, create_tables)
     linking.link(linking_module, create_tables)
     fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)
-    if connection.prefix() in _methods_done or not create_tables:
-        return
-    from .methods import add_instruments, insert_all
-
-    if methods:
-        insert_all()
-        _methods_done.add(connection.prefix())
-    else:
-        add_instruments()
+    if create_tables:
+        insert_once() if methods else insert_if_none()
+    if new and create_tables:  # as `pbl db init` leaves them, whatever came first
+        jobs.declare()
+        store.check_store(connection.store_backend(), create=True)
 
 
 def _use(prefix: str) -> None:

@@ -10,7 +10,7 @@ from pbl_pipeline.errors import PblError
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
 from .datajoint_setup import dj
-from .method_rows import method_columns, method_row, resolve_method
+from .method_rows import method_columns, method_row, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
 from .rows import InputChanged, Rows, check_columns, check_row, number, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
@@ -406,10 +406,7 @@ def norm_keys(name: str) -> list[str]:
     if found:
         return found
     raise PblError(
-        "NORM_UNKNOWN",
-        found=f"normative set {name!r}",
-        expected=f"one of {', '.join(sorted({row['norm_name'] for row in rows}))}",
-        next_step="choose one of the names above (`pbl norm list`)",
+        "NORM_UNKNOWN", found=f"normative set {name!r}", **one_of({row["norm_name"] for row in rows}, "pbl norm list")
     )
 
 

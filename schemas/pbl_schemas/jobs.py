@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Collection
 from typing import Any
 
@@ -42,6 +43,18 @@ def jobs_of(table: Any) -> Any:
         _add(jobs, missing)
         jobs = table.jobs
     return jobs
+
+
+def declare() -> None:
+    """Declare the queue of every computed table, which a worker's account may not."""
+    log = logging.getLogger("datajoint")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it warns of types that it chooses itself for the keys of a queue
+    try:
+        for table in computed_tables():
+            jobs_of(table)
+    finally:
+        log.setLevel(level)
 
 
 def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:

@@ -5,7 +5,7 @@ A method table states its `stage` (`pbl_pipeline.methods.STAGES`); its columns c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from pbl_pipeline import methods
@@ -73,11 +73,21 @@ def stored_keys(table: Any, name: str) -> list[str]:
     if found := [r[f"{prefix}_method"] for r in rows if name in (r[f"{prefix}_method"], r[f"{prefix}_method_name"])]:
         return found
     raise PblError(
-        "SOLVER_UNKNOWN",
-        found=f"no {prefix} method {name!r}",
-        expected="one of " + ", ".join(sorted({r[f"{prefix}_method_name"] for r in rows})),
-        next_step="choose one of the names above",
+        "SOLVER_UNKNOWN", found=f"no {prefix} method {name!r}", **one_of({r[f"{prefix}_method_name"] for r in rows})
     )
+
+
+def one_of(names: Collection[str], list_of_them: str = "pbl list methods") -> dict[str, str]:
+    """`expected` and `next_step` of an error for an unknown name, where these are known."""
+    if not names:
+        return {
+            "expected": "the methods and norms of this version, of which the tables have none",
+            "next_step": "`pbl db init`, with an account that may insert",
+        }
+    return {
+        "expected": "one of " + ", ".join(sorted(names)),
+        "next_step": f"choose one of the names above (`{list_of_them}`)",
+    }
 
 
 def register(table: Any, offered: methods.Method[Any]) -> tuple[str, bool]:

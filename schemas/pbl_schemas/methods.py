@@ -5,7 +5,7 @@ from __future__ import annotations
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, gait, gdi, keypoints, kinetics, study, tracking
+from . import connection, fit, gait, gdi, keypoints, kinetics, study, tracking
 from .instruments import INSTRUMENTS
 from .method_rows import insert_methods
 
@@ -19,6 +19,31 @@ METHOD_TABLES = (
     gdi.GdiModel,
     kinetics.KineticsMethod,
 )
+
+#: Prefixes under which this process has inserted the rows of this version.
+_done: set[str] = set()
+
+
+def insert_once() -> None:
+    """`insert_all`, once in a process."""
+    if connection.prefix() not in _done:
+        insert_all()
+        _done.add(connection.prefix())
+
+
+def insert_if_none() -> None:
+    """`insert_once` if a table has no row, which one query finds out; else the missing instruments. Nothing if the
+    account may not insert."""
+    tables = (*METHOD_TABLES, fit.BodyModel, gdi.NormativeSet)
+    filled = " AND ".join(f"EXISTS (SELECT 1 FROM {table.full_table_name})" for table in tables)  # noqa: S608
+    if connection.connect().query(f"SELECT {filled}").fetchone()[0]:
+        add_instruments()
+        return
+    try:
+        insert_once()
+    except PblError as error:
+        if error.code != "DB_REFUSED":
+            raise
 
 
 def insert_all() -> None:

@@ -88,17 +88,19 @@ def record(execute: Callable[..., object], number: int, name: str, statements: C
     )
 
 
-def check_version(new: bool = True) -> None:
+def check_version(new: bool = True) -> bool:
     """Refuse tables of another version; on a server without any, unless they are not to be created (`new`), record the
-    migrations that new ones need not go through. Call it before the tables are declared. Raises `PblError`
-    DB_MIGRATION."""
+    migrations that new ones need not go through. Return True if there were none. Call it before the tables are
+    declared. Raises `PblError` DB_MIGRATION."""
     if any(not table.startswith("~") for _, table in catalog.names()):
         refuse_other_version()
-    elif new and not applied():
+        return False
+    if new and not applied():
         query = connection.connect().query
         query(f"CREATE DATABASE IF NOT EXISTS `{connection.schema_name('lab')}`")
         for number, name in numbered():
             record(lambda statement, values=(): query(statement, args=values), number, name)
+    return True
 
 
 def refuse_other_version() -> None:

@@ -16,7 +16,7 @@ import pytest
 import pbl_schemas
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_schemas import connection, gait, gdi, jobs, lab, migrations, session, stages, validation, video
+from pbl_schemas import connection, gait, gdi, jobs, lab, methods, migrations, session, stages, validation, video
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.decisions import event_corrections
 from pbl_schemas.intake import VisitRecord, ingest
@@ -234,7 +234,7 @@ def _unbind(patch: pytest.MonkeyPatch) -> None:
     from pbl_schemas.chain import tables
 
     patch.setattr(jobs.jobs_of, "made", {})
-    patch.setattr(pbl_schemas._activate, "_methods_done", set())
+    patch.setattr(methods, "_done", set())
     for module in stages.modules():
         patch.setattr(module.schema, "database", None)
         patch.setattr(module.schema, "connection", None)

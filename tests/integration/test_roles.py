@@ -12,7 +12,7 @@ import yaml
 
 import pbl_schemas
 from pbl_pipeline.errors import PblError
-from pbl_schemas import connection, gdi, lab, session, video, worker
+from pbl_schemas import connection, gdi, kinetics, lab, methods, session, video, worker
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.datajoint_setup import dj
 from pbl_schemas.intake import VisitRecord, ingest
@@ -149,6 +149,18 @@ def test_without_the_right_the_account_that_has_it_is_named(
     assert f"DJ_USER={account} " in done.err
     assert "denied" in done.err
     assert "Traceback" not in done.err
+
+
+def test_an_analyst_before_there_are_methods(login: Login, monkeypatch: pytest.MonkeyPatch):
+    """Tables without method rows are read as before; the first account that may insert inserts them."""
+    kinetics.KineticsMethod().delete_quick()
+    monkeypatch.setattr(methods, "_done", set())
+    login("analyst")
+    pbl_schemas.activate(methods=False)
+    assert len(kinetics.KineticsMethod()) == len(lab.Subject()) == 0
+    login("worker")
+    pbl_schemas.activate(methods=False)
+    assert len(kinetics.KineticsMethod()) > 0
 
 
 def test_an_analyst_cannot_hold_what_a_refresh_needs(login: Login):

@@ -18,6 +18,7 @@ from .. import fit, gait, gdi, keypoints, kinetics, session, tracking, video
 from ..datajoint_setup import DuplicateError, dj
 from ..jobs import forget_errors
 from ..method_rows import resolve_method
+from ..methods import insert_once
 from ..plan import default_fit
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id
@@ -45,6 +46,7 @@ DEFAULT_MARKER_FIT = "markers"
 def resolve(named: Methods, markers: bool = False) -> dict[str, str]:
     """Return the keys of the method rows of a video, or of laboratory markers, with defaults filled in. Raises
     `PblError` SOLVER_UNKNOWN, NORM_UNKNOWN."""
+    insert_once()  # a page activates without, and may be the first of a new version
 
     def key(table: Any, name: str | None) -> str:
         return resolve_method(table, name or of_stage(table.stage).default)

@@ -180,10 +180,10 @@ def serve(
         app = _opened_by_links(where, port, options, visit)
     click.echo("The page ends with Ctrl-C.")
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    threading.Thread(target=_warm, daemon=True).start()
     signal.signal(signal.SIGTERM, _end)  # uvicorn raises the signal again when it has ended, and the database ends too
     needed = database() if folder is None else contextlib.nullcontext()
     with needed, contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
+        threading.Thread(target=_warm, daemon=True).start()
         uvicorn.Server(config(app, where)).run(sockets=[listening])
 
 
@@ -229,8 +229,9 @@ def _opened_by_links(where: Where, port: int, options: Options, visit: int | Non
 def database() -> Iterator[None]:
     """The embedded database, started where it is used and not running, and stopped again then. Tables of another
     version are refused; of a database that is away the pages say so, until it answers."""
-    from pbl_schemas import connection, tables_version
-    from pbl_schemas.operations import embedded
+    import pbl_schemas
+    from pbl_schemas import connection
+    from pbl_schemas.operations import catalog, embedded
 
     started = connection.external() is None and not embedded.status().running
     if started:
@@ -238,7 +239,9 @@ def database() -> Iterator[None]:
     try:
         try:
             connection.connect()
-            tables_version.refuse_other_version()
+            if not catalog.schemas():
+                click.echo("Creating the tables and the method rows of this version")
+            pbl_schemas.activate(methods=False)
         except PblError as error:
             if error.code != "DB_NOT_RUNNING":
                 raise
