@@ -4,15 +4,16 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 RUNS   := $(VENV)/.runs# what a worker needs: the lock of its image
 READY  := $(VENV)/.installed# that and what tests need
-PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3; do \
-            if command -v $$p >/dev/null && $$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; \
-            then echo $$p; break; fi; done)
+FITS   := -B -c 'from pbl_pipeline.interpreter import require; require()'
+# The first that fits. If none does, python3, which is then refused.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13; do $$p $(FITS) 2>/dev/null && break; p=python3; done; echo $$p)
+ROOM   := 4000# MB for the environment of the tests (2,200) and what pip downloads for it
 OUT    ?= pbl_demo
 JOBS   ?= 2# test processes, a file of tests at a time, in the order of the folders: the longest come first
 # Whatever the shell says, compiled modules are kept: tests start many processes that import them.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo docs test test-fast lint format lock dist clean help
+.PHONY: demo docs test test-fast test-newest lint format lock dist clean help
 
 help:           ## what can be made
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 16
@@ -28,6 +29,9 @@ test: $(READY)  ## the tests
 
 test-fast: $(READY) ## the tests that take 90 s on two idle cores: no database, no fit, no network over a video
 	$(PYTEST) tests -m "not slow and not database and not browser and not needs_extra"
+
+test-newest: $(READY) ## wheel, demo and fast tests on the newest other Python of this machine; PYTHONS="a b" names some
+	$(BIN)/python -m tests.other_python $(PYTHONS)
 
 lint: $(READY)  ## style, formatting and types
 	$(BIN)/ruff check .
@@ -65,12 +69,17 @@ dist: $(READY)  ## source archive and wheel of the commit, checked: dist/
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
 $(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
-	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed: apt-get install python3"; exit 1; }
+	@command -v $(PYTHON) >/dev/null || { echo "PYTHON_UNSUPPORTED: there is no $(PYTHON) on this machine. Python 3.11 or \
+	newer of 64 bits is needed: apt-get install python3-venv, or make demo PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) $(FITS)
+	@free=$$(df -Pm . | awk 'NR == 2 {print $$4}'); test -x $(BIN)/pbl || test "$$free" -ge $(ROOM) || { \
+	  echo "FILE_UNWRITABLE: $$free MB are free on this disk, $(VENV) takes up to $(ROOM): free some, or move the checkout"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "installing Debian's python3-venv (needed once)"; \
 	  sudo=$$(test "$$(id -u)" = 0 || echo sudo); $$sudo apt-get update -qq && \
 	  $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python $(FITS)
 	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r workers/deploy/requirements-cpu.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
