@@ -37,7 +37,7 @@ _NO_BROWSER = " and ".join(
 
 #: Markers of tests that run only where they are asked for, and why.
 _LEFT_OUT = {
-    "machine": "starts services, fetches a gigabyte or needs two idle cores",
+    "machine": "starts services or needs two idle cores",
     "long": "takes tens of seconds for what few changes touch",
 }
 

@@ -1,16 +1,13 @@
 """The package as `pip install` brings it: what wheel and source archive hold, and that it works elsewhere.
 
-`pbl run` of the installed wheel is in test_commands.py. What needs a gigabyte of downloads runs where it is asked for:
-`pytest -m machine tests/end_to_end/test_wheel.py`.
+`pbl run` of the installed wheel is in test_commands.py; `make test-newest` installs it into an empty environment.
 """
 
-import json
 import os
 import re
 import subprocess
 import sys
 import tarfile
-import time
 import zipfile
 from pathlib import Path
 
@@ -18,7 +15,6 @@ import pytest
 
 import pbl_pipeline
 from pbl_pipeline.code_version import checked_out_commit
-from tests.database import new_home, remove_home
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Installed packages and the folders that hold them.
@@ -91,25 +87,27 @@ def test_the_installed_script_is_the_wheels(installed, tmp_path):
     assert [Path(line).is_relative_to(installed) for line in done.stdout.splitlines()] == [True] * 3, done.stderr
 
 
-@pytest.mark.machine
-@pytest.mark.parametrize("python", ["python3.11", "python3.12", "python3.13"])
-def test_an_empty_environment_to_the_first_report_by_one_command(wheel, tmp_path, python):
-    """Nothing but Python, the wheel and what pip brings; empty cache, no database yet."""
-    if run([python, "-c", "import venv, ensurepip"], tmp_path).returncode:
-        pytest.skip(f"no {python} with venv on this machine")
-    assert run([python, "-m", "venv", tmp_path / "env"], tmp_path).returncode == 0
-    program = tmp_path / "env" / "bin"
-    began = time.monotonic()
-    done = run([program / "python", "-m", "pip", "install", "--quiet", wheel], tmp_path)
-    assert done.returncode == 0, done.stderr
-    fetched, home = time.monotonic(), new_home()
-    try:
-        done = run([program / "pbl", "demo"], tmp_path, PBL_HOME=str(home), PBL_CACHE=str(tmp_path / "cache"))
-    finally:
-        remove_home(home)
-    took = f"{python}: installed in {fetched - began:.0f} s, demo {time.monotonic() - fetched:.0f} s"
-    sys.stdout.write(took + "\n")  # `pytest -rP` shows it
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert "</html>" in (tmp_path / "pbl_demo" / "report.html").read_text(encoding="utf-8")
-    session = json.loads((tmp_path / "pbl_demo" / "metrics.json").read_text(encoding="utf-8"))["session"]
-    assert session["cadence_steps_per_min"]["mean"] == pytest.approx(98, rel=0.025)  # by eye, see test_demo.py
+LAB = """
+import importlib.metadata, schemas.ours, workers.ours
+for group in ("pbl.commands", "pbl.bench", "pbl.study", "pbl.study_data"):
+    for entry in importlib.metadata.entry_points(group=group):
+        entry.load()
+import pbl_schemas.stages, pbl_workers.web.app
+pbl_schemas.stages.modules()
+print(schemas.ours.NAME, workers.ours.NAME)
+"""
+
+
+@pytest.mark.parametrize("package", [True, False])
+def test_a_laboratory_has_its_own_schemas_and_workers(installed, tmp_path, package):
+    """With and without `__init__.py`, beside a notebook and on PYTHONPATH."""
+    for name in ("schemas", "workers"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "ours.py").write_text(f"NAME = {name!r}\n")
+        if package:
+            (tmp_path / name / "__init__.py").touch()
+    path = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{installed}", "PBL_HOME": str(tmp_path / "home")}
+    done = run([sys.executable, "-c", LAB], tmp_path, **path)
+    assert (done.returncode, done.stdout) == (0, "schemas workers\n"), done.stderr[-3000:]
+    done = run([installed / "bin" / "pbl", "status"], tmp_path, **path)
+    assert (done.returncode, done.stderr.partition(":")[0]) == (1, "DB_NOT_RUNNING"), done.stderr
