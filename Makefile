@@ -7,7 +7,7 @@ READY  := $(VENV)/.installed# that and what tests need
 FITS   := -B -c 'from pbl_pipeline.interpreter import require; require()'
 # The first that fits. If none does, python3, which is then refused.
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13; do $$p $(FITS) 2>/dev/null && break; p=python3; done; echo $$p)
-ROOM   := 4000# MB for the environment of the tests (2,200) and what pip downloads for it
+ROOM   := 2500# MB: 1,300 for the environment of the demo, the rest for what pip downloads and for tests
 OUT    ?= pbl_demo
 JOBS   ?= 2# test processes, a file of tests at a time, in the order of the folders: the longest come first
 # Whatever the shell says, compiled modules are kept: tests start many processes that import them.
@@ -73,7 +73,7 @@ $(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
 	newer of 64 bits is needed: apt-get install python3-venv, or make demo PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) $(FITS)
 	@free=$$(df -Pm . | awk 'NR == 2 {print $$4}'); test -x $(BIN)/pbl || test "$$free" -ge $(ROOM) || { \
-	  echo "FILE_UNWRITABLE: $$free MB are free on this disk, $(VENV) takes up to $(ROOM): free some, or move the checkout"; exit 1; }
+	  echo "FILE_UNWRITABLE: $$free MB are free on this disk, $(VENV) needs $(ROOM) MB: free some, or move the checkout"; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "installing Debian's python3-venv (needed once)"; \
 	  sudo=$$(test "$$(id -u)" = 0 || echo sudo); $$sudo apt-get update -qq && \

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import hashlib
 import os
+import shutil
 import subprocess
 import threading
 import tomllib
@@ -82,7 +83,7 @@ def folder() -> Path:
         path = settings.cache_dir() / "assets"
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(error) from error
+        raise _unwritable(f"the cache folder cannot be written ({error})") from error
     return path
 
 
@@ -108,7 +109,7 @@ def fetch(name: str) -> Path:
             if not _is_pinned(asset.path, asset.sha256):  # another process may have fetched it meanwhile
                 _bring(asset)
     except OSError as error:
-        raise _unwritable(error) from error
+        raise _unwritable(f"the cache folder cannot be written ({error})") from error
     return asset.path
 
 
@@ -143,6 +144,11 @@ def _download(asset: Asset, into: Path) -> Path:
     package = asset.package
     if absent := package.absent():
         raise _missing(asset, absent)
+    # The client has the file twice for a moment.
+    needed = 2 * package.size_bytes + sum(a.size_bytes for a in ASSETS.values() if a.package is package)
+    needed += package.client_bytes()
+    if (free := shutil.disk_usage(into).free) < needed:
+        raise _unwritable(f"{free / 1e6:.0f} MB are free in {folder()}, {package.requirement} needs {needed / 1e6:.0f}")
     # The client collects the download in a temporary folder: placed here, its growth is the progress.
     scratch = into / "scratch"
     scratch.mkdir()
@@ -211,11 +217,11 @@ def _missing(asset: Asset, found: str) -> PblError:
     )
 
 
-def _unwritable(error: OSError) -> PblError:
+def _unwritable(found: str) -> PblError:
     return PblError(
         "ASSET_MISSING",
-        found=f"the cache folder cannot be written ({error})",
-        expected="a folder for model and demo files with 400 MB free",
+        found=found,
+        expected="a folder for model and demo files with 450 MB free",
         next_step="set PBL_CACHE to a folder of your own with free space",
     )
 

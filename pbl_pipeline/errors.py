@@ -58,6 +58,7 @@ CODES: dict[str, str] = {
     "NORM_UNKNOWN": "no normative set has that name",
     "NORM_INVALID": "the normative data cannot support the index (too few cycles, wrong size)",
     "EXPORT_INPUT": "the fit cannot be exported in that form",
+    "PYTHON_UNSUPPORTED": "this Python is too old, or has 32 bits",
     "PACKAGE_MISSING": "a package that this step needs is not installed",
     "STATS_INPUT": "the values do not support the statistic: too few, missing, without variation, or of another shape",
     "STUDY_INVALID": "the parts of a study contradict each other, or one lacks what it must have",

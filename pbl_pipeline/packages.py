@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import importlib.util
+import re
 import shlex
 import shutil
 import subprocess
@@ -42,6 +43,10 @@ class Package(abc.ABC):
     @abc.abstractmethod
     def environment(self, scratch: Path) -> dict[str, str]:
         """Variables that make the client collect the download in the folder `scratch`."""
+
+    def client_bytes(self) -> int:
+        """Space for the client itself, where it has to be fetched."""
+        return 0
 
     @abc.abstractmethod
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
@@ -78,11 +83,17 @@ class Wheel(Package):
         return {"TMPDIR": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Pip's last error. Without a connection that is only that nothing matches, so the cause comes first."""
+        """Pip's last error. Where the index could not be reached, or sent no list of files, that is only that nothing
+        matches, so the cause comes first."""
         errors = _lines(done.stderr, "ERROR")
         reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
-        unreachable = "connection broken" in done.stderr or "ConnectionError" in done.stderr
-        return f"no connection to the package index ({reason})" if unreachable else reason
+        if reason.endswith("Exception:"):  # of pip itself, a full disk for one: the traceback ends with it
+            reason = done.stderr.strip().splitlines()[-1]
+        if broken := re.findall("connection broken by (.*): /", done.stderr):
+            return f"no connection to the package index ({reason}; {broken[-1]})"
+        if "ConnectionError" in done.stderr:
+            return f"no connection to the package index ({reason})"
+        return f"{_NOT_AN_INDEX} ({reason})" if "from versions: none" in done.stderr else reason
 
     def read(self, path: Path, member: str) -> bytes:
         with zipfile.ZipFile(path) as archive:
@@ -116,14 +127,19 @@ class NpmPackage(Package):
         # Node keeps compiled modules among the temporary files as well, and nobody removes them.
         return {"npm_config_cache": str(scratch), "TMPDIR": str(scratch)}
 
+    def client_bytes(self) -> int:
+        return 0 if shutil.which("npm") else npm_by_pip.SIZE_BYTES
+
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
         """Npm's first sentence after its codes; a failed connection comes first."""
         lines = _lines(done.stderr, "npm ERR!", "npm error", "ERROR")
         errors = [line for line in lines if line and not line.startswith(("code ", "syscall ", "errno "))]
         reason = errors[0] if errors else f"npm ended with code {done.returncode} and brought another file"
-        codes = ("ENOTFOUND", "ECONNREFUSED", "EAI_AGAIN", "ETIMEDOUT", "connection broken", "ConnectionError")
-        unreachable = any(code in done.stderr for code in codes)
-        return f"no connection to the package registry ({reason})" if unreachable else reason
+        codes = "ENOTFOUND|ECONNREFUSED|EAI_AGAIN|ETIMEDOUT|ECONNRESET|connection broken|ConnectionError"
+        if re.search(codes, done.stderr):
+            return f"no connection to the package registry ({reason})"
+        other = "invalid json response" in done.stderr or "from versions: none" in done.stderr
+        return f"{_NOT_AN_INDEX} ({reason})" if other else reason
 
     def read(self, path: Path, member: str) -> bytes:
         with tarfile.open(path, "r:gz") as archive:
@@ -131,6 +147,12 @@ class NpmPackage(Package):
             assert file is not None  # a member of a file whose hash was checked
             return file.read()
 
+
+#: The likely cause, which pip and npm do not name: a network shows its page to sign in at every address.
+_NOT_AN_INDEX = (
+    "the registry answered, but not with this package: open a page in a browser of this machine, where the network may "
+    "ask you to sign in, and check the proxy or mirror that is configured"
+)
 
 #: Client -> the kind of package that it downloads.
 CLIENTS: dict[str, type[Package]] = {"pip": Wheel, "npm": NpmPackage}

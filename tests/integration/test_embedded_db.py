@@ -1,5 +1,6 @@
 """The embedded server and the connection to it, on servers of their own."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -22,6 +23,7 @@ from pbl_schemas.cli.db import db
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import binaries, process, server
 from pbl_schemas.operations.embedded.folder import UNPRIVILEGED, server_account
+from tests import refused
 from tests.command import PBL, program
 from tests.database import new_home, remove_home
 
@@ -189,7 +191,23 @@ def test_too_little_space_is_said_before_anything_is_written(fresh: Path, monkey
     with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
         embedded.start(folder=folder(fresh))
     assert caught.value.found.startswith("30 MB")
-    assert list(folder(fresh).data.iterdir()) == []
+    assert not folder(fresh).path.exists()
+
+
+def test_a_set_up_that_ended_half_way_is_begun_again(fresh: Path, monkeypatch: pytest.MonkeyPatch):
+    """A full disk leaves nothing behind; the remains of a killed process are replaced."""
+    where, real = folder(fresh), server.get_server()
+    half = 'for a in "$@"; do case $a in --datadir=*) echo half > "${a#*=}/ibdata1";; esac; done\n'
+    full = program(fresh, "install", f'{half}echo "[ERROR] Errcode: 28 No space left on device"; exit 1\n')
+    monkeypatch.setattr(server, "get_server", lambda say: dataclasses.replace(real, install_db=full))
+    error = refused("DB_UNAVAILABLE", embedded.start, folder=where)
+    assert "No space left on device" in error.found
+    assert not where.initialised()
+    assert not where.data.exists()
+    monkeypatch.undo()
+    where.data.mkdir()
+    (where.data / "ibdata1").write_text("half")
+    assert embedded.start(folder=where).running
 
 
 @pytest.mark.parametrize(

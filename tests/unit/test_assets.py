@@ -131,6 +131,33 @@ def test_pip_failures_are_told(index):
     assert "No matching distribution" in refused("ASSET_MISSING", assets.fetch, "one").text()
 
 
+@pytest.mark.parametrize(
+    ("printed", "reason"),
+    [
+        (  # pip 23.2 and 26.3, where a page of HTML without links answers for the index
+            "ERROR: Could not find a version that satisfies the requirement carrier==1.0 (from versions: none)\n"
+            "ERROR: No matching distribution found for carrier==1.0\n",
+            "the registry answered, but not with this package: open a page in a browser",
+        ),
+        (  # a proxy that refuses; pip 26.3
+            "WARNING: Retrying (Retry(total=0, connect=None, read=None, redirect=None, status=None)) after connection "
+            "broken by 'OSError('Tunnel connection failed: 403 Forbidden')': /simple/carrier/\nERROR: Could not find a "
+            "version (from versions: none)\nERROR: No matching distribution found for carrier==1.0\n",
+            "no connection to the package index (ERROR: No matching distribution found for carrier==1.0; 'OSError("
+            "'Tunnel connection failed: 403 Forbidden')')",
+        ),
+        (  # a disk that another program fills meanwhile
+            "ERROR: Exception:\nTraceback (most recent call last):\nOSError: [Errno 28] No space left on device\n",
+            "could not be downloaded: OSError: [Errno 28] No space left on device",
+        ),
+    ],
+)
+def test_what_pip_does_not_say(index, printed, reason):
+    index.error = printed
+    assert reason in refused("ASSET_MISSING", assets.fetch, "one").found
+    assert names_in_folder() == set()
+
+
 def test_no_pip(index, monkeypatch):
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     assert "ensurepip" in refused("ASSET_MISSING", assets.fetch, "one").text()
@@ -256,6 +283,12 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
     npm.error = "npm error code E404\nnpm error 404 No match found for version 1.0\n"
     refusal = refused("ASSET_MISSING", assets.fetch, "heavy").text()
     assert "@made/carrier@1.0 could not be downloaded: 404 No match found" in refusal
+    npm.error = (
+        "npm error code FETCH_ERROR\nnpm error errno FETCH_ERROR\nnpm error invalid json response body at http://a/b"
+    )
+    refusal = refused("ASSET_MISSING", assets.fetch, "heavy").found
+    assert "the registry answered, but not with this package" in refusal
+    assert "(invalid json response body at http://a/b)" in refusal
     monkeypatch.setattr(packages.shutil, "which", lambda name: None)
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     assert "apt-get install npm" in refused("ASSET_MISSING", assets.fetch, "heavy").text()

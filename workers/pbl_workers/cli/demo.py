@@ -45,9 +45,12 @@ def demo(context: click.Context, out: Path, no_database: bool, language: str) ->
 
     check_out_folder(out)
     begin = time.monotonic()
+    _step(1, "models and the demo recording")
+    embedded.prepare(say=click.echo)  # no files are fetched where there can be no server, and without them no database
+    files = _fetched()
     was_running = embedded.status().running
     try:
-        _run(out, language)
+        _run(files, out, language)
     finally:
         if not was_running:
             embedded.stop(say=click.echo, on_demand=True)
@@ -60,7 +63,7 @@ def _fetched() -> dict[str, Path]:
     return {name: assets.fetch(name) for name in assets.needed()}
 
 
-def _run(out: Path, language: str) -> None:
+def _run(files: dict[str, Path], out: Path, language: str) -> None:
     import pbl_schemas
     from pbl_schemas import connection
     from pbl_schemas.intake import VisitRecord, ingest
@@ -70,14 +73,12 @@ def _run(out: Path, language: str) -> None:
     from pbl_workers.cli.populate import summary
     from pbl_workers.populate import populate
 
-    _step(1, "database")
+    for name, path in files.items():
+        click.echo(f"{name}: {path}")
+    _step(2, "database")
     embedded.start(say=click.echo)
     connection.connect()
     pbl_schemas.activate()
-    _step(2, "models and the demo recording")
-    files = _fetched()
-    for name, path in files.items():
-        click.echo(f"{name}: {path}")
     _step(3, "ingest")
     visit = VisitRecord(SUBJECT, SESSION, PROJECT, camera_file=files["demo_camera"])
     for result in ingest([files["demo_video"]], visit):

@@ -8,4 +8,4 @@ MySQL 8 server is used by naming it in DJ_HOST, DJ_PORT, DJ_USER and DJ_PASS.
 from .binaries import Binaries, find_server, get_server
 from .folder import ADMIN_USER, APP_USER, HOST, Credentials, Folder
 from .process import admin
-from .server import Status, allow_prefix, grant, not_running, start, starts_on_demand, status, stop
+from .server import Status, allow_prefix, grant, not_running, prepare, start, starts_on_demand, status, stop

@@ -18,6 +18,8 @@ from pbl_pipeline.errors import PblError
 #: The bare programs: no service, no system user, nothing started.
 PACKAGES = ("mariadb-server-core", "mariadb-client-core")
 TIMEOUT_S = 600.0
+#: Without it `apt-get update` ends with code 0 where no list could be fetched (apt 2.6; known since 2.1).
+_STRICT = ("-o", "APT::Update::Error-Mode=any")
 
 Say = Callable[[str], None]
 
@@ -35,7 +37,8 @@ def install(say: Say) -> str | None:
     if failure is None:
         return None
     say(f"  the package list may be missing or old ({failure}): apt-get update")
-    return _run([*command, "update"])[0] or _run(add)[0]
+    stale, failure = _run([*command, *_STRICT, "update"])[0], _run(add)[0]
+    return failure and (stale or failure)
 
 
 def unpack(folder: Path, say: Say) -> str | None:
@@ -53,7 +56,8 @@ def unpack(folder: Path, say: Say) -> str | None:
             say("  fetching a separate package list")
             lists = f"Dir::State::Lists={work / 'lists'}"
             own = ("-o", lists, "-o", f"Dir::Cache={work}", "-o", "Debug::NoLocking=1")
-            failure = _run(["apt-get", *own, "-q", "update"])[0] or _download(work, say, own)
+            stale, failure = _run(["apt-get", *own, *_STRICT, "-q", "update"])[0], _download(work, say, own)
+            failure = failure and (stale or failure)
         for package in sorted((work / "archives").glob("*.deb")):
             failure = failure or _run(["dpkg", "-x", str(package), str(work / "root")])[0]
         if failure is None:
@@ -98,9 +102,9 @@ def _run(command: Sequence[str], cwd: Path | None = None) -> tuple[str | None, s
         return f"{command[0]} took more than {TIMEOUT_S:.0f} s", ""
     if done.returncode == 0:
         return None, done.stdout
-    # The reason: apt's first error (E: ...), else the last line.
+    # The reason: apt's first error (E: ...), else the last line. A list that is a web page is "not signed" first.
     lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith("E: ")]
+    errors = sorted((line for line in lines if line.startswith("E: ")), key=lambda e: "Failed to fetch" not in e)
     return next(iter([*errors, *lines[-1:]]), f"{command[0]} ended with code {done.returncode}"), done.stdout
 
 

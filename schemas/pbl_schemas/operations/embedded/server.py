@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -17,12 +18,12 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .binaries import Binaries, Say, check_obtainable, get_server, silent
-from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, free_port, server_account
+from .binaries import Binaries, Say, check_obtainable, find_server, get_server, silent
+from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, folder_error, free_port, server_account
 from .process import LOG_SIZE, admin, alive, launch, running_pid, wait_until_answers
 
 SETUP_TIMEOUT_S = 300.0
-#: An empty database takes 290 MB, nearly all of it the log that is laid out in advance.
+#: An empty database takes 110 MB, most of it the log that is laid out in advance.
 NEEDED_MB = 500
 
 #: The installation leaves up to four root accounts without a password (localhost, the machine's name, 127.0.0.1, ::1).
@@ -36,16 +37,7 @@ DROP_EVERY_ACCOUNT = (
 
 def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     """Fill `folder.data` and write the credentials, which mark the set-up as complete. Raises `PblError` DB_UNAVAILABLE
-    for too little space, or with the output of the program that failed."""
-    free_mb = shutil.disk_usage(folder.path).free // 2**20
-    if free_mb < NEEDED_MB:
-        raise PblError(
-            "DB_UNAVAILABLE",
-            key=folder.path,
-            found=f"{free_mb} MB are free on this disk",
-            expected=f"at least {NEEDED_MB} MB for an empty database",
-            next_step="free some space, or set PBL_HOME to a folder on another local disk",
-        )
+    with the output of the program that failed."""
     # The remains of an interrupted first start are not a database: nothing was ever stored in it.
     shutil.rmtree(folder.data, ignore_errors=True)
     folder.create(account)
@@ -68,6 +60,42 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     _run(bootstrap, "\n".join(statements) + "\n", folder, binaries, account)
     folder.write_state(port=free_port(), pid=None, prefixes=["pbl"])
     folder.write_credentials(credentials)
+
+
+def check_place(folder: Folder) -> None:
+    """Check that a database can be made in `folder`, or is there; makes nothing. Raises `PblError` DB_UNAVAILABLE for a
+    place that cannot be written, or that has too little space."""
+    if folder.initialised():
+        return
+    try:
+        there = next(p for p in (folder.path, *folder.path.parents) if p.exists())
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(there))
+        free_mb = shutil.disk_usage(there).free // 2**20
+    except OSError as error:
+        raise folder_error(folder.path, error) from error
+    if free_mb < NEEDED_MB:
+        raise PblError(
+            "DB_UNAVAILABLE",
+            key=folder.path,
+            found=f"{free_mb} MB are free on this disk",
+            expected=f"at least {NEEDED_MB} MB for an empty database",
+            next_step="free some space, or set PBL_HOME to a folder on another local disk",
+        )
+
+
+def prepare(say: Say = silent) -> None:
+    """Get the server of the default folder if it is absent, and check its place; makes no database. Raises `PblError`
+    DB_UNAVAILABLE as `start` does."""
+    folder = Folder.default()
+    if running_pid(folder) is not None:
+        return
+    check_obtainable()
+    check_place(folder)
+    if find_server() is None:
+        folder.create(server_account(folder.data))
+        with folder.locked():
+            get_server(say)
 
 
 def grant(prefix: str) -> str:
@@ -152,6 +180,7 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     folder = folder or Folder.default()
     if running_pid(folder) is None:
         check_obtainable()  # before a folder is made
+        check_place(folder)
     account = server_account(folder.data)
     folder.create(account)
     with folder.locked():

@@ -1,0 +1,244 @@
+"""What stops an installation or a first run: each a coded error before anything is half done (docs/install.md).
+
+Stand-ins for what tests as root cannot have: another Python, a full disk, a folder that may not be written.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+
+from pbl_pipeline import assets, interpreter
+from pbl_pipeline.errors import CODES
+from pbl_schemas.operations.embedded import binaries, server
+from tests import refused
+from tests.command import PBL, pbl, program
+from tests.source import ROOT
+from tests.videos import constant_rate, numbered_frames, write_video
+
+OLD, NARROW = "sys.version_info = (3, 10, 13, 'final', 0)", "struct.calcsize = lambda _: 4"
+
+
+def python(folder: Path, name: str, what: str) -> Path:
+    """A Python of this name that takes itself for another one."""
+    site = folder / f"site-of-{name}"
+    site.mkdir(parents=True)
+    (site / "sitecustomize.py").write_text(f"import struct, sys\n{what}\n")
+    return program(folder, name, f'PYTHONPATH={site} exec {sys.executable} "$@"\n')
+
+
+# --- another Python
+
+
+@pytest.mark.parametrize("what", [OLD, NARROW])
+def test_no_command_begins_on_another_python(tmp_path, what):
+    command = [python(tmp_path, "python3", what), *PBL[1:], "doctor"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"PYTHON_UNSUPPORTED: {CODES['PYTHON_UNSUPPORTED']}\n  found:    Python 3.")
+    assert ("3.10 of 64 bits" if what == OLD else "of 32 bits") in done.stderr
+    assert "make demo PYTHON=" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_the_oldest_python_is_that_of_the_package():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
+    assert stated == ">=" + ".".join(map(str, interpreter.OLDEST))
+    interpreter.require()
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch) -> Path:
+    """A checkout with what `make` reads before it installs, and a PATH of stand-ins."""
+    if shutil.which("make") is None:
+        pytest.skip("no make")
+    here, programs = tmp_path / "checkout", tmp_path / "bin"
+    (here / "pbl_pipeline").mkdir(parents=True)
+    programs.mkdir()
+    for file in ("Makefile", "pyproject.toml", "pbl_pipeline/__init__.py", "pbl_pipeline/interpreter.py"):
+        shutil.copy(ROOT / file, here / file)
+    for lock in ("requirements.lock", "workers/deploy/requirements-cpu.lock"):
+        (here / lock).parent.mkdir(parents=True, exist_ok=True)
+        (here / lock).write_text("")
+    for name in ("make", "df", "awk", "id"):  # no links: a stand-in that is written later would go into the real one
+        program(programs, name, f'exec {shutil.which(name)} "$@"\n')
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "PYTHON"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PATH", str(programs))
+    return here
+
+
+def make(checkout: Path, *arguments: str) -> str:
+    """What a failed `make demo` printed. It made nothing."""
+    before = sorted(checkout.rglob("*"))
+    command = ["make", "demo", *arguments]
+    done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stdout
+    assert sorted(checkout.rglob("*")) == before
+    return done.stdout + done.stderr
+
+
+def test_make_refuses_another_python_before_it_makes_anything(checkout):
+    programs = checkout.parent / "bin"
+    assert "PYTHON_UNSUPPORTED: there is no python3 on this machine" in make(checkout)
+    python(programs, "python3", OLD)
+    assert f"found:    Python 3.10 of 64 bits, {sys.executable}" in make(checkout)
+    python(programs, "python3.11", NARROW)
+    assert "found:    Python 3.10 of 64 bits" in make(checkout)
+    assert "of 32 bits" in make(checkout, "PYTHON=python3.11")
+    assert "there is no python9 on this machine" in make(checkout, "PYTHON=python9")
+
+
+def test_make_takes_a_python_that_fits_and_refuses_an_environment_of_another(checkout):
+    programs = checkout.parent / "bin"
+    python(programs, "python3", OLD)
+    python(programs, "python3.11", NARROW)
+    python(programs, "python3.12", "")
+    plan = subprocess.run(["make", "-n", "demo"], cwd=checkout, capture_output=True, text=True, check=True).stdout
+    assert "python3.12 -m venv .venv" in plan
+    (checkout / ".venv/bin").mkdir(parents=True)
+    python(checkout / ".venv/bin", "python", OLD)
+    assert "Python 3.10 of 64 bits" in make(checkout)
+
+
+def test_make_refuses_a_full_disk(checkout):
+    python(checkout.parent / "bin", "python3", "")
+    program(checkout.parent / "bin", "awk", "echo 12\n")
+    assert "FILE_UNWRITABLE: 12 MB are free on this disk, .venv needs 2500 MB" in make(checkout)
+
+
+# --- the first run
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch) -> Path:
+    """An empty home and cache, a MariaDB that was never started, and no program that could fetch: `calls` notes those
+    that are called."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name in ("pip", "npm", "apt-get", "dpkg", "sudo", "mariadbd", "mariadb-install-db"):
+        program(programs, name, f'echo "{name} $*" >> {tmp_path / "calls"}; exit 1\n')
+    pip = f'*"-m pip"*) echo "$*" >> {tmp_path / "calls"}; exit 1'  # glfw calls Python as well
+    program(programs, "python", f'case "$*" in {pip};; *) exec {sys.executable} "$@";; esac\n')
+    monkeypatch.setattr(sys, "executable", str(programs / "python"))
+    monkeypatch.setattr(binaries, "PLACES", ())
+    monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
+    monkeypatch.setenv("PATH", f"{programs}:/bin")
+    monkeypatch.setenv("PBL_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PBL_OFFLINE", "1")
+    for name in ("DJ_HOST", "PBL_STORE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def without_mariadb(machine: Path) -> None:
+    (machine / "bin/mariadbd").unlink()
+
+
+def calls(machine: Path) -> str:
+    file = machine / "calls"
+    return file.read_text() if file.exists() else ""
+
+
+def made(machine: Path) -> set[str]:
+    return {p.name for p in machine.iterdir()} - {"bin", "cache", "calls", "walk.mp4"}
+
+
+@pytest.mark.parametrize("how", [(), ("--no-database",)])
+def test_the_demo_without_files_and_network_makes_nothing(machine, how):
+    done = pbl("demo", *how)
+    assert (done.code, done.error_code) == (1, "ASSET_MISSING"), done.err
+    assert "PBL_OFFLINE forbids fetching" in done.err
+    assert "pip download" in done.err
+    assert (made(machine), calls(machine)) == (set(), "")
+    assert not any((machine / "cache/assets").glob("[!.]*"))
+
+
+def test_a_run_without_models_and_network_makes_nothing(machine):
+    write_video(machine / "walk.mp4", numbered_frames(5), constant_rate(5))
+    done = pbl("run", machine / "walk.mp4", "--out", "results")
+    assert (done.code, done.error_code) == (1, "ASSET_MISSING"), done.err
+    assert (made(machine), calls(machine)) == (set(), "")
+
+
+def test_without_a_server_and_network_nothing_is_fetched_or_made(machine):
+    without_mariadb(machine)
+    done = pbl("demo")
+    assert (done.code, done.error_code) == (1, "DB_UNAVAILABLE"), done.err
+    assert "PBL_OFFLINE" in done.err
+    assert (made(machine), calls(machine)) == (set(), "")
+    assert not (machine / "cache").exists()
+
+
+APT = {
+    "no network": """W: Failed to fetch http://deb/InRelease  Could not resolve 'deb'
+E: Some index files failed to download.""",
+    "a web page": """E: The repository 'http://deb InRelease' is not signed.
+E: Failed to fetch http://deb/InRelease  Clearsigned file isn't valid, got 'NOSPLIT' (...)""",
+}
+
+
+@pytest.mark.parametrize(("case", "reason"), [("no network", "Some index files"), ("a web page", "NOSPLIT")])
+def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(machine, monkeypatch, case, reason):
+    without_mariadb(machine)
+    (machine / "bin/printed").write_text(APT[case])
+    update = f"*Error-Mode=any*update*) cat {machine / 'bin/printed'}"
+    other = '*) echo "E: Unable to locate package mariadb"'
+    program(machine / "bin", "apt-get", f'case "$*" in {update};; {other};; esac; exit 100\n')
+    monkeypatch.delenv("PBL_OFFLINE")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    done = pbl("demo")
+    assert (done.code, done.error_code) == (1, "DB_UNAVAILABLE"), done.err
+    assert "sudo asks for a password" in done.out
+    assert reason in done.err
+    assert "pbl demo --no-database" in done.err
+    assert not (machine / "cache").exists()
+    assert not list((machine / "home").glob("server*"))
+    assert not list((machine / "home/db/data").iterdir())
+
+
+def test_a_home_or_cache_that_is_a_file_is_named_before_anything_is_made(machine, monkeypatch):
+    (machine / "walk.mp4").write_text("not a folder")
+    monkeypatch.setenv("PBL_CACHE", str(machine / "walk.mp4"))
+    done = pbl("demo")
+    assert (done.error_code, "set PBL_CACHE" in done.err) == ("ASSET_MISSING", True), done.err
+    assert (made(machine), calls(machine)) == (set(), "")
+    monkeypatch.setenv("PBL_CACHE", str(machine / "cache"))
+    for variable in ("PBL_HOME", "HOME"):
+        monkeypatch.setenv("PBL_HOME", str(machine / "walk.mp4") if variable == "PBL_HOME" else "")
+        monkeypatch.setenv("HOME", str(machine / "walk.mp4"))
+        monkeypatch.setattr(os, "geteuid", lambda: 1000)  # root's home is another
+        done = pbl("demo")
+        assert (done.error_code, "set PBL_HOME" in done.err) == ("DB_UNAVAILABLE", True), done.err
+        assert (made(machine), calls(machine)) == (set(), "")
+    assert not (machine / "cache").exists()
+
+
+def test_a_home_that_may_not_be_written_is_named_before_anything_is_made(machine, monkeypatch):
+    monkeypatch.setattr(server.os, "access", lambda path, mode: Path(path) != machine)
+    error = refused("DB_UNAVAILABLE", server.prepare)
+    assert f"Permission denied ({machine})" in error.found
+    assert "set PBL_HOME" in error.next_step
+    assert made(machine) == set()
+
+
+def test_a_full_disk_is_told_before_any_work(machine, monkeypatch):
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000_000))
+    write_video(machine / "walk.mp4", numbered_frames(5), constant_rate(5))
+    done = pbl("run", machine / "walk.mp4", "--out", "results")
+    assert (done.error_code, "20 MB are free" in done.err) == ("FILE_UNWRITABLE", True), done.err
+    refused("DB_UNAVAILABLE", server.prepare)
+    monkeypatch.delenv("PBL_OFFLINE")
+    error = refused("ASSET_MISSING", assets.fetch, "demo_video")
+    assert "20 MB are free in" in error.found
+    assert error.found.endswith("sports2d==0.8.34 needs 22")  # MB: the wheel twice, and its two files
+    assert "PBL_CACHE" in error.next_step
+    assert (made(machine), calls(machine)) == (set(), "")
