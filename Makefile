@@ -77,9 +77,11 @@ $(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "installing Debian's python3-venv (needed once)"; \
 	  sudo=$$(test "$$(id -u)" = 0 || echo sudo); $$sudo apt-get update -qq && \
-	  $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python $(FITS)
+	  $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null; } || { \
+	  echo "PACKAGE_MISSING: $(PYTHON) has no venv, and apt did not install it (above). As root: apt-get install python3-venv," \
+	    "or without root: make demo PYTHON=/path/to/python3.11 of uv, pyenv or conda"; exit 1; }
+	@test ! -x $(BIN)/python || $(BIN)/python $(FITS)
+	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv $(VENV)
 	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r workers/deploy/requirements-cpu.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .

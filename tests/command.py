@@ -48,6 +48,7 @@ def pbl(*arguments: object) -> Done:
 def program(folder: Path, name: str, text: str) -> Path:
     """A shell script that stands in for a program of this name."""
     path = folder / name
+    path.unlink(missing_ok=True)  # written into a link, it would replace a program of the system
     path.write_text("#!/bin/sh\n" + text)
     path.chmod(0o755)
     return path

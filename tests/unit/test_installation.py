@@ -107,6 +107,14 @@ def test_make_takes_a_python_that_fits_and_refuses_an_environment_of_another(che
     assert "Python 3.10 of 64 bits" in make(checkout)
 
 
+def test_make_without_venv_and_root_names_the_package(checkout):
+    python(checkout.parent / "bin", "python3", "sys.modules['ensurepip'] = None")
+    program(checkout.parent / "bin", "id", "echo 1000\n")
+    printed = make(checkout)
+    assert "PACKAGE_MISSING: python3 has no venv" in printed
+    assert "apt-get install python3-venv" in printed
+
+
 def test_make_refuses_a_full_disk(checkout):
     python(checkout.parent / "bin", "python3", "")
     program(checkout.parent / "bin", "awk", "echo 12\n")
@@ -179,14 +187,14 @@ def test_without_a_server_and_network_nothing_is_fetched_or_made(machine):
 
 
 APT = {
-    "no network": """W: Failed to fetch http://deb/InRelease  Could not resolve 'deb'
+    "no network": """E: Failed to fetch http://deb/InRelease  Temporary failure resolving 'deb'
 E: Some index files failed to download.""",
     "a web page": """E: The repository 'http://deb InRelease' is not signed.
 E: Failed to fetch http://deb/InRelease  Clearsigned file isn't valid, got 'NOSPLIT' (...)""",
 }
 
 
-@pytest.mark.parametrize(("case", "reason"), [("no network", "Some index files"), ("a web page", "NOSPLIT")])
+@pytest.mark.parametrize(("case", "reason"), [("no network", "Temporary failure resolving"), ("a web page", "NOSPLIT")])
 def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(machine, monkeypatch, case, reason):
     without_mariadb(machine)
     (machine / "bin/printed").write_text(APT[case])
@@ -203,6 +211,8 @@ def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(machine
     assert not (machine / "cache").exists()
     assert not list((machine / "home").glob("server*"))
     assert not list((machine / "home/db/data").iterdir())
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    assert reason in (binaries.install(print) or "")
 
 
 def test_a_home_or_cache_that_is_a_file_is_named_before_anything_is_made(machine, monkeypatch):
