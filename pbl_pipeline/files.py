@@ -23,7 +23,7 @@ from pbl_pipeline.names import is_plain
 Shape = tuple[int | None, ...]
 #: Largest width or height (px) of a picture that a file names.
 _WIDEST_PX = 100_000
-#: Free space (MB) below which no work is begun; a walk's results take 3 to 30.
+#: Free space (MB) below which no work is begun; the results of the demo take 3.
 _ROOM_MB = 50
 _unwritable = functools.partial(PblError, "FILE_UNWRITABLE", next_step="pass another place with --out")
 _bad_field = functools.partial(PblError, "FILE_FORMAT", next_step="write the field as docs/files.md describes it")
@@ -161,10 +161,10 @@ def complete_file(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def check_out_folder(path: Path) -> None:
+def check_out_folder(path: Path, room_mb: int = _ROOM_MB) -> None:
     """Make sure that a folder for results exists or can be made, and has room; makes nothing. Raises `PblError`
     FILE_UNWRITABLE."""
-    _check_place(path, path)
+    _check_place(path, path, room_mb)
 
 
 def check_out_file(path: Path) -> None:
@@ -180,13 +180,13 @@ def check_out_file(path: Path) -> None:
         raise _unwritable(error.strerror or str(error), "a folder you may write to", key=path) from error
 
 
-def _check_place(folder: Path, about: Path) -> None:
+def _check_place(folder: Path, about: Path, room_mb: int = _ROOM_MB) -> None:
     there = folder.absolute()
-    while not there.exists() and there != there.parent:
+    while not os.path.exists(there) and there != there.parent:
         there = there.parent
     if not there.is_dir():
         raise _unwritable(f"{there} is not a folder", "a folder", key=about)
     if not os.access(there, os.W_OK | os.X_OK):
         raise _unwritable(f"you may not write to {there}", "a folder you may write to", key=about)
-    if (free_mb := shutil.disk_usage(there).free / 1e6) < _ROOM_MB:
-        raise _unwritable(f"{free_mb:.0f} MB are free there", f"{_ROOM_MB} MB and more for results", key=about)
+    if (free_mb := shutil.disk_usage(there).free / 1e6) < room_mb:
+        raise _unwritable(f"{free_mb:.0f} MB are free on this disk", f"at least {room_mb} MB", key=about)

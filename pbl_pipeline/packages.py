@@ -44,10 +44,6 @@ class Package(abc.ABC):
     def environment(self, scratch: Path) -> dict[str, str]:
         """Variables that make the client collect the download in the folder `scratch`."""
 
-    def client_bytes(self) -> int:
-        """Space for the client itself, where it has to be fetched."""
-        return 0
-
     @abc.abstractmethod
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
         """The client's error in one line."""
@@ -83,17 +79,12 @@ class Wheel(Package):
         return {"TMPDIR": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Pip's last error. Where the index could not be reached, or sent no list of files, that is only that nothing
-        matches, so the cause comes first."""
+        """Pip's last error, or the end of its traceback (of a full disk, for one)."""
         errors = _lines(done.stderr, "ERROR")
         reason = errors[-1] if errors else f"pip ended with code {done.returncode} and brought another file"
-        if reason.endswith("Exception:"):  # of pip itself, a full disk for one: the traceback ends with it
-            reason = done.stderr.strip().splitlines()[-1]
-        if broken := re.findall("connection broken by (.*): /", done.stderr):
-            return f"no connection to the package index ({reason}; {broken[-1]})"
-        if "ConnectionError" in done.stderr:
-            return f"no connection to the package index ({reason})"
-        return f"{_NOT_AN_INDEX} ({reason})" if "from versions: none" in done.stderr else reason
+        return _explained(
+            done.stderr.strip().splitlines()[-1] if reason.endswith("Exception:") else reason, done.stderr
+        )
 
     def read(self, path: Path, member: str) -> bytes:
         with zipfile.ZipFile(path) as archive:
@@ -127,19 +118,12 @@ class NpmPackage(Package):
         # Node keeps compiled modules among the temporary files as well, and nobody removes them.
         return {"npm_config_cache": str(scratch), "TMPDIR": str(scratch)}
 
-    def client_bytes(self) -> int:
-        return 0 if shutil.which("npm") else npm_by_pip.SIZE_BYTES
-
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:
-        """Npm's first sentence after its codes; a failed connection comes first."""
+        """Npm's first sentence after its codes."""
         lines = _lines(done.stderr, "npm ERR!", "npm error", "ERROR")
         errors = [line for line in lines if line and not line.startswith(("code ", "syscall ", "errno "))]
         reason = errors[0] if errors else f"npm ended with code {done.returncode} and brought another file"
-        codes = "ENOTFOUND|ECONNREFUSED|EAI_AGAIN|ETIMEDOUT|ECONNRESET|connection broken|ConnectionError"
-        if re.search(codes, done.stderr):
-            return f"no connection to the package registry ({reason})"
-        other = "invalid json response" in done.stderr or "from versions: none" in done.stderr
-        return f"{_NOT_AN_INDEX} ({reason})" if other else reason
+        return _explained(reason, done.stderr)
 
     def read(self, path: Path, member: str) -> bytes:
         with tarfile.open(path, "r:gz") as archive:
@@ -148,14 +132,23 @@ class NpmPackage(Package):
             return file.read()
 
 
-#: The likely cause, which pip and npm do not name: a network shows its page to sign in at every address.
-_NOT_AN_INDEX = (
-    "the registry answered, but not with this package: open a page in a browser of this machine, where the network may "
-    "ask you to sign in, and check the proxy or mirror that is configured"
-)
-
 #: Client -> the kind of package that it downloads.
 CLIENTS: dict[str, type[Package]] = {"pip": Wheel, "npm": NpmPackage}
+
+
+#: Of a failed connection, and of an answer without packages: a network shows its page to sign in at every address.
+_UNREACHABLE = "ENOTFOUND|ECONNREFUSED|EAI_AGAIN|ETIMEDOUT|ECONNRESET|connection broken|ConnectionError"
+_OTHER_ANSWER = "invalid json response|from versions: none"
+
+
+def _explained(reason: str, printed: str) -> str:
+    """The error of pip or npm with its cause: after either of the two, pip says only that nothing matches."""
+    if re.search(_UNREACHABLE, printed):
+        causes = re.findall("connection broken by (.*): /", printed)
+        return f"no connection to the package registry ({'; '.join([reason, *causes[-1:]])})"
+    advice = "open a page in a browser, where the network may ask you to sign in, and check the proxy or mirror in use"
+    other = re.search(_OTHER_ANSWER, printed)
+    return f"the registry answered, but not with this package: {advice} ({reason})" if other else reason
 
 
 def _lines(text: str, *starts: str) -> list[str]:

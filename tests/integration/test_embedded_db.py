@@ -187,7 +187,7 @@ def test_a_server_that_cannot_start_says_why(fresh: Path):
 
 
 def test_too_little_space_is_said_before_anything_is_written(fresh: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30 * 2**20))
+    monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30_000_000))
     with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
         embedded.start(folder=folder(fresh))
     assert caught.value.found.startswith("30 MB")

@@ -126,7 +126,7 @@ def test_the_remedy_works(index, monkeypatch):
 
 def test_pip_failures_are_told(index):
     index.error = "WARNING: connection broken by 'NewConnectionError'\nERROR: No matching distribution found"
-    assert "no connection to the package index" in refused("ASSET_MISSING", assets.fetch, "one").text()
+    assert "no connection to the package registry" in refused("ASSET_MISSING", assets.fetch, "one").text()
     index.error = "ERROR: No matching distribution found for carrier==1.0"
     assert "No matching distribution" in refused("ASSET_MISSING", assets.fetch, "one").text()
 
@@ -143,7 +143,7 @@ def test_pip_failures_are_told(index):
             "WARNING: Retrying (Retry(total=0, connect=None, read=None, redirect=None, status=None)) after connection "
             "broken by 'OSError('Tunnel connection failed: 403 Forbidden')': /simple/carrier/\nERROR: Could not find a "
             "version (from versions: none)\nERROR: No matching distribution found for carrier==1.0\n",
-            "no connection to the package index (ERROR: No matching distribution found for carrier==1.0; 'OSError("
+            "no connection to the package registry (ERROR: No matching distribution found for carrier==1.0; 'OSError("
             "'Tunnel connection failed: 403 Forbidden')')",
         ),
         (  # a disk that another program fills meanwhile

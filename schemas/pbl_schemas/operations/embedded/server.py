@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import re
 import shutil
@@ -17,9 +16,10 @@ from textwrap import indent
 import pymysql
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import check_out_folder
 
 from .binaries import Binaries, Say, check_obtainable, find_server, get_server, silent
-from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, folder_error, free_port, server_account
+from .folder import ADMIN_USER, APP_USER, HOST, Account, Credentials, Folder, free_port, server_account
 from .process import LOG_SIZE, admin, alive, launch, running_pid, wait_until_answers
 
 SETUP_TIMEOUT_S = 300.0
@@ -62,36 +62,20 @@ def initialise(folder: Folder, binaries: Binaries, account: Account) -> None:
     folder.write_credentials(credentials)
 
 
-def check_place(folder: Folder) -> None:
-    """Check that a database can be made in `folder`, or is there; makes nothing. Raises `PblError` DB_UNAVAILABLE for a
-    place that cannot be written, or that has too little space."""
-    if folder.initialised():
-        return
-    try:
-        there = next(p for p in (folder.path, *folder.path.parents) if p.exists())
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(there))
-        free_mb = shutil.disk_usage(there).free // 2**20
-    except OSError as error:
-        raise folder_error(folder.path, error) from error
-    if free_mb < NEEDED_MB:
-        raise PblError(
-            "DB_UNAVAILABLE",
-            key=folder.path,
-            found=f"{free_mb} MB are free on this disk",
-            expected=f"at least {NEEDED_MB} MB for an empty database",
-            next_step="free some space, or set PBL_HOME to a folder on another local disk",
-        )
-
-
-def prepare(say: Say = silent) -> None:
-    """Get the server of the default folder if it is absent, and check its place; makes no database. Raises `PblError`
+def prepare(say: Say = silent, folder: Folder | None = None) -> None:
+    """Get the server if it is absent, and check the place of a new database; makes none. Raises `PblError`
     DB_UNAVAILABLE as `start` does."""
-    folder = Folder.default()
+    folder = folder or Folder.default()
     if running_pid(folder) is not None:
         return
     check_obtainable()
-    check_place(folder)
+    try:
+        check_out_folder(folder.path, 0 if folder.initialised() else NEEDED_MB)
+    except PblError as error:
+        next_step = "free some space, or set PBL_HOME to a folder of your own on a local disk"
+        raise PblError(
+            "DB_UNAVAILABLE", error.found, f"a folder with {NEEDED_MB} MB free", next_step, folder.path
+        ) from error
     if find_server() is None:
         folder.create(server_account(folder.data))
         with folder.locked():
@@ -178,9 +162,7 @@ def start(say: Say = silent, folder: Folder | None = None) -> Status:
     Returns `Status`, with `running` True.
     """
     folder = folder or Folder.default()
-    if running_pid(folder) is None:
-        check_obtainable()  # before a folder is made
-        check_place(folder)
+    prepare(say, folder)  # before a folder is made
     account = server_account(folder.data)
     folder.create(account)
     with folder.locked():
