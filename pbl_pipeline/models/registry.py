@@ -157,7 +157,7 @@ class ModelStatus:
 def registered() -> list[ModelStatus]:
     """List the registered models by name, with their errors; checks the bytes of the graphs."""
     folder = settings.models_dir()
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # `Path.is_dir` raises where a parent may not be entered
         return []
     names = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
     return [_status(name, folder / name) for name in names]
@@ -165,7 +165,7 @@ def registered() -> list[ModelStatus]:
 
 def is_registered(name: str) -> bool:
     """True if a model of that name is registered here, damaged or not."""
-    return "/" not in name and not name.startswith(".") and (settings.models_dir() / name / SPEC_FILE).is_file()
+    return "/" not in name and not name.startswith(".") and os.path.isfile(settings.models_dir() / name / SPEC_FILE)
 
 
 def find(name: str) -> Path:

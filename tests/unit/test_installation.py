@@ -240,6 +240,25 @@ def test_a_home_that_may_not_be_written_is_named_before_anything_is_made(machine
     assert made(machine) == set()
 
 
+def test_a_home_that_may_not_be_entered_is_named(machine, monkeypatch):
+    """As of `su` without `-`: HOME is another user's."""
+    real = os.stat
+
+    def closed(path, *given, **named):
+        if isinstance(path, (str, os.PathLike)) and str(machine / "home") in os.fspath(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, *given, **named)
+
+    monkeypatch.setattr(os, "stat", closed)
+    monkeypatch.setattr(Path, "read_text", lambda path, **_: closed(path))
+    for command in ("start", "status"):
+        done = pbl("db", command)
+        assert done.error_code == ("DB_UNAVAILABLE" if command == "start" else "DB_NOT_RUNNING"), done.err
+    assert "set PBL_HOME" in pbl("demo").err
+    assert "no registered model" in pbl("models", "list").out  # of `pbl doctor` as well
+    assert made(machine) == set()
+
+
 def test_a_full_disk_is_told_before_any_work(machine, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000_000))
     write_video(machine / "walk.mp4", numbered_frames(5), constant_rate(5))

@@ -183,7 +183,7 @@ class Folder:
 
     def initialised(self) -> bool:
         """Return whether the set-up of the first start is complete (the credentials are written last)."""
-        return self.credentials_file.exists()
+        return os.path.exists(self.credentials_file)  # `Path.exists` raises where the folder may not be entered
 
     def create(self, account: Account) -> None:
         """Make the folders; `account` owns those of the server. Raises `PblError` DB_UNAVAILABLE when they cannot be
@@ -263,7 +263,7 @@ class Folder:
                 return found
         except FileNotFoundError:
             return {}
-        except NotADirectoryError as error:
+        except (NotADirectoryError, PermissionError) as error:
             raise folder_error(self.path, error) from error
 
     def write_state(self, **changes: Any) -> dict[str, Any]:
