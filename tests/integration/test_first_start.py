@@ -1,4 +1,4 @@
-"""Whatever uses an empty database first leaves the tables as `pbl db init` does."""
+"""The first use of an empty database, whichever it is, leaves the tables as `pbl db init` does."""
 
 import json
 import subprocess
@@ -48,7 +48,7 @@ LOADED = LOOK + "; print([n for n in ('jax', 'mujoco', 'cv2', 'scipy', 'onnxrunt
 
 
 def child(home: Path, *arguments: object) -> list[str]:
-    """Lines that the program printed in a process of its own, with this PBL_HOME."""
+    """Lines that the program printed in a separate process, with this PBL_HOME."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PBL_HOME", str(home))
         command = [sys.executable, "-c", FIRST, *map(str, arguments)]

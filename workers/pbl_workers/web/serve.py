@@ -266,6 +266,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((host, port))
+        listening.listen()  # a browser that is quicker than the database waits, instead of being refused
     except OSError as error:
         listening.close()
         raise PblError(
