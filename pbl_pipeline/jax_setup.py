@@ -22,7 +22,7 @@ MIN_COMPILE_SECONDS = 0.3
 #: Flags of XLA (see `configure`), and the releases of jaxlib on which they were run: a library ends the process at a
 #: flag that it does not know, so other releases are given none.
 GPU_FLAGS = ("--xla_gpu_autotune_level=0", "--xla_gpu_enable_triton_gemm=false")
-GPU_RELEASES = ("0.10.2", "0.11.2")
+GPU_RELEASES = ("0.10.2", "0.11.2", "0.12.0.1")
 CPU_FLAGS = ("--xla_cpu_use_fusion_emitters=false",)
 CPU_RELEASES = ("0.10.2",)  # 0.11.1 and later do not know it
 
