@@ -18,7 +18,7 @@ from .binaries import Binaries
 from .folder import ADMIN_USER, HOST, Account, Folder, folder_error, free_port, port_free
 
 START_TIMEOUT_S = 60.0
-#: An empty database takes 110 MB with these, and 349 MB with 256M and the growth by 64 MB that is the default.
+#: An empty database takes 100 MB with these, and 349 MB with 256M and the growth by 64 MB that is the default.
 LOG_SIZE = "--innodb-log-file-size=64M"
 
 #: Options of the running server. Without a character set it would use latin1; with a case-insensitive collation the
