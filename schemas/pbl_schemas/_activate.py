@@ -22,7 +22,8 @@ def activate(
     """Bind all tables to the database; safe to call again.
 
     Raises what `pbl_schemas.connection.connect` raises; DB_MIGRATION for tables of another version, older or
-    newer; USAGE for a prefix or linking module that cannot be used; DB_NOT_FOUND without a schema.
+    newer; USAGE for a prefix or linking module that cannot be used; DB_NOT_FOUND without a schema; on a new database
+    STORE_UNAVAILABLE.
 
     Parameters
     ----------
