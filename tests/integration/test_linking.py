@@ -80,7 +80,8 @@ def mylab(folder: Path, module_patch: pytest.MonkeyPatch) -> Iterator[Any]:
     new_visit("2019", "P009")
     pbl_schemas.activate(linking_module=mylab)
     yield mylab
-    for table in (lab.Subject, session.Session):
+    for table in (lab.Subject, session.Session):  # other files of this process have the same database
+        table.Link().drop_quick()
         del table.Link
     linking._linked = None
 
