@@ -83,6 +83,7 @@ def mylab(folder: Path, module_patch: pytest.MonkeyPatch) -> Iterator[Any]:
     for table in (lab.Subject, session.Session):  # other files of this process have the same database
         table.Link().drop_quick()
         del table.Link
+    connection.connect().dependencies.clear()
     linking._linked = None
 
 
