@@ -254,7 +254,7 @@ def _bridge_values(name: str, keep: Path) -> pd.DataFrame:
     "--reference",
     type=click.Path(path_type=Path, readable=False),
     metavar="FILE",
-    help="Reference movement: .npz, fit.npz, truth.npz, .json.gz or .mot.",
+    help="Reference movement: .npz, fit.npz, truth.npz, .json.gz, .mot or .sto.",
 )
 @click.option(
     "--of-trial",
