@@ -44,7 +44,7 @@ def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], titl
             axes = {"force": "v", "point": "p", "torque": ""}[what]
             names += [f"ground_{'torque' if what == 'torque' else 'force'}_{side}_{axes}{x}" for x in "xyz"]
     table = np.column_stack(columns)[known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes", ""]
+    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
     head += [f"{name}={text}" for name, text in origin.items()]
     head += ["units: N, m, Nm; ground with y up; r is the right foot, l the left", "endheader", "\t".join(names)]
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
@@ -89,7 +89,7 @@ def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: 
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes", ""]
+    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
     head += [f"{name}={text}" for name, text in origin.items()]
     head += ["units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up", "endheader"]
     head.append("\t".join(["time", *names]))
