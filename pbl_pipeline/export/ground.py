@@ -14,6 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.problem import SOLES
 from pbl_pipeline.gait.ground import is_metric
 from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.sampling import interval_of
 
 from .columns import lines, number_cells
 from .osim import pelvis_rest_m
@@ -122,7 +123,7 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
         soles.append(poses.position_m[known, at] + poses.rotation[known, at] @ local)
     lowest = np.stack(soles)[..., 2].min(axis=0)
     times = np.asarray(trial.fit.time_s, float)[known]
-    size = 1 + 2 * round(0.5 * _WINDOW_S / np.median(np.diff(times))) if len(times) > 1 else 1
+    size = 1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)) if len(times) > 1 else 1
     followed = ndimage.uniform_filter1d(ndimage.median_filter(lowest, size, mode="nearest"), size, mode="nearest")
     pelvis = poses.position_m[known, poses.index("pelvis"), :2]
     path = float(np.linalg.norm(np.ptp(pelvis, axis=0)))

@@ -25,6 +25,7 @@ from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
 from pbl_pipeline.qc import FAIL, PASS, Check
 from pbl_pipeline.runs import runs
+from pbl_pipeline.sampling import interval_of
 
 from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
@@ -348,14 +349,14 @@ def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tuple[float, bool]:
-    """Median interval (s), and True if intervals vary by more than a tenth of it and more than rounding explains."""
+    """Sampling interval (s), and True if intervals vary by more than a tenth and more than rounding explains."""
     if len(time_s) < 2:
         return (1.0 / announced_fps if announced_fps else float("nan")), False
     steps = np.diff(time_s)
     median = float(np.median(steps))
     # Stamps rounded to whole ticks put up to one tick between equal intervals (MKV: 1 ms).
     tolerance = max(0.1 * median, 1.001 * tick_s)
-    return median, bool(np.abs(steps - median).max() > tolerance)
+    return interval_of(time_s), bool(np.abs(steps - median).max() > tolerance)
 
 
 def _picture_notes(turn: Orientation, pixel_aspect: object) -> list[str]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import os_errors_as
+from pbl_pipeline.sampling import interval_of
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
@@ -63,8 +64,8 @@ class PhoneLog:
 
     @property
     def rate_hz(self) -> float:
-        """Samples of the orientation per second, by the median interval."""
-        return float(1.0 / np.median(np.diff(self.time_s)))
+        """Samples of the orientation per second (`sampling.interval_of`)."""
+        return 1.0 / interval_of(self.time_s)
 
 
 def read_own_form(path: Path) -> PhoneLog:

@@ -111,6 +111,13 @@ def test_the_trc_is_in_opensims_ground_and_in_millimetres(fit, tmp_path):
     assert all(len(line.split("\t")) == 2 + 3 * 33 for line in lines[6:])
 
 
+def test_the_rate_of_stamps_that_a_webm_rounded(fit, tmp_path):
+    rounded = dataclasses.replace(fit, time_s=np.round(fit.time_s, 3))
+    path = written(Recording.of("walk", rounded), tmp_path / "a", "trc", body_points=False) / "walk.trc"
+    rate = float(path.read_text().splitlines()[2].split("\t")[0])
+    assert rate == pytest.approx(30, abs=0.01)  # the median interval is 33 ms: 30.303
+
+
 def test_frames_without_a_pose_are_left_out_and_a_missing_marker_is_an_empty_cell(fit, tmp_path):
     qpos = fit.qpos.copy()
     qpos[50:53] = np.nan
