@@ -2,8 +2,8 @@
 
 Slow motion is stored in two ways. The phone's original has stamps of real time and some hundred frames a second. An
 exported or edited copy plays 30 of these frames a second, so every duration comes out too long. Android states the
-original rate (`com.android.capture.fps`); an edit list may (its speed, which no decoder applies); in a copy that an
-iPhone exported nothing shows it.
+rate to which the camera was set (`com.android.capture.fps`), also of a time lapse and in low light; an edit list may
+state a speed, which no decoder applies; in a copy that an iPhone exported nothing shows it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
-from pbl_pipeline.qc import FAIL, PASS, Check
+from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 from pbl_pipeline.runs import runs
 from pbl_pipeline.sampling import interval_of
 
@@ -33,8 +33,13 @@ from .frames import Orientation, orientation_of
 from .kept import keeping
 from .types import FirstPicture, VideoInfo
 
-#: A recorded rate that lies above the stored one by less than this fraction is rounding or a dropped frame.
+#: A recorded rate that differs from the stored one by less than this factor is rounding or a dropped frame.
 _MOST_RATIO = 1.1
+#: Slow motion is recorded at more than 60 frames a second and plays at half the speed or less. A phone that lowers its
+#: rate in low light states the one that it was set to (30 of 24): below this factor its stamps are real time.
+_LEAST_SLOW_RATIO, _LEAST_SLOW_FPS = 1.5, 60.0
+#: Time lapses are recorded at 15 frames a second or less.
+_MOST_LAPSE_FPS = 15.0
 #: From this many frames a second on, a phone calls it slow motion.
 _SLOW_MOTION_FPS = 100.0
 
@@ -42,12 +47,14 @@ _SLOW_MOTION_FPS = 100.0
 def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) -> list[str]:
     """Notes on the playing speed of a video of `fps` frames a second; `speeds` are those of its edit list."""
     notes = []
-    ratio = stretch(fps, capture_fps)
-    if ratio > _MOST_RATIO:
-        notes.append(
-            f"recorded at {capture_fps:g} and stored at {fps:.4g} frames a second: its time runs {ratio:.2g} times "
-            "too slow, and so does all that is computed from it"
-        )
+    ratio, known = stretch(fps, capture_fps)
+    rates = f"recorded at {capture_fps or 0:g} and stored at {fps:.4g} frames a second"
+    if not known:
+        notes.append(f"{rates}, as its phone states: whether its time is real cannot be told from the stamps")
+    elif ratio > 1:
+        notes.append(f"{rates}: its time runs {ratio:.2g} times too slow, and so does all that is computed from it")
+    elif ratio < 1:
+        notes.append(f"{rates} (time lapse): its time runs {1 / ratio:.2g} times too fast, and so does all of it")
     elif fps >= _SLOW_MOTION_FPS:
         notes.append(f"slow motion of {fps:.4g} frames a second; the stamps are taken as real time")
     odd = sorted({s for s in speeds if s not in (0.0, 1.0)})
@@ -57,23 +64,34 @@ def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) 
     return notes
 
 
-def stretch(fps: float, capture_fps: float | None) -> float:
-    """Factor by which the stamps lengthen the movement; 1 if not known."""
+def stretch(fps: float, capture_fps: float | None) -> tuple[float, bool]:
+    """Factor by which the stamps lengthen the movement, 1 for real time, and False if it cannot be told whether they
+    do: then the factor if they did."""
     if capture_fps is None or not math.isfinite(fps) or fps <= 0:
-        return 1.0
-    return max(1.0, capture_fps / fps)
+        return 1.0, True
+    ratio = capture_fps / fps
+    if 1 / _MOST_RATIO <= ratio <= _LEAST_SLOW_RATIO:
+        return 1.0, True
+    if ratio > 1:
+        return ratio, capture_fps > _LEAST_SLOW_FPS
+    return ratio, capture_fps <= _MOST_LAPSE_FPS and ratio < 1 / _LEAST_SLOW_RATIO
 
 
 def check_timing(video: VideoInfo) -> tuple[Check, ...]:
     """Check `time_stretch` of a video whose phone states the rate of recording; no check of others."""
     if video.capture_fps is None:
         return ()
-    ratio = stretch(video.fps, video.capture_fps)
-    if ratio <= _MOST_RATIO:
+    ratio, known = stretch(video.fps, video.capture_fps)
+    rates = f"recorded at {video.capture_fps:g} and stored at {video.fps:.4g} frames a second"
+    if ratio == 1.0:
         return (Check("time_stretch", PASS, ratio, _MOST_RATIO),)
+    if not known:
+        advice = f"{rates}: slow motion, a time lapse and a rate lowered in low light cannot be told apart here"
+        return (Check("time_stretch", WARN, ratio, _MOST_RATIO, f"{advice}; compare the cadence with the person's"),)
+    what = "slow motion" if ratio > 1 else "time lapse"
     advice = (
-        f"slow motion: recorded at {video.capture_fps:g} and stored at {video.fps:.4g} frames a second, so every time, "
-        "cadence and speed is wrong; copy the original from the phone, or film at normal speed"
+        f"{what}: {rates}, so every time, cadence and speed is wrong; copy the original from the phone, or film at "
+        "normal speed"
     )
     return (Check("time_stretch", FAIL, ratio, _MOST_RATIO, advice),)
 

@@ -96,6 +96,28 @@ def test_android_at_the_rate_it_says_passes(tmp_path):
     assert not any("slow" in n for n in info.notes)
 
 
+@pytest.mark.parametrize(
+    ("stored", "capture", "outcome", "said"),
+    [
+        (30, 10.0, "FAIL", "time lapse"),  # passed with a factor of 1
+        (24, 30.0, "PASS", ""),  # low light in real time, which failed as slow motion
+        (30, 120.0, "FAIL", "slow motion"),
+        (240, 240.0, "PASS", ""),
+        (30, 60.0, "WARN", "cannot be told"),  # half speed, or a phone of 60 frames a second in low light
+        (15, 30.0, "WARN", "cannot be told"),
+        (60, 30.0, "WARN", "cannot be told"),  # frames doubled by an editor, or played twice as fast
+    ],
+)
+def test_rates_that_android_states(tmp_path, stored, capture, outcome, said):
+    path = write_video(tmp_path / "a.mp4", numbered_frames(48), constant_rate(48, stored))
+    info = probe(insert(path, of_file=meta({"com.android.capture.fps": capture})))
+    (check,) = check_timing(info)
+    assert check.outcome == outcome
+    assert said in check.advice
+    assert not said or check.value == pytest.approx(capture / stored, rel=1e-3)
+    assert any("stored at" in n for n in info.notes) == bool(said)
+
+
 def test_slow_motion_with_an_edit_list(tmp_path):
     """240 frames a second of real time; the edit list plays the second half at an eighth and hides nothing."""
     path = write_video(
