@@ -374,8 +374,8 @@ def test_readers_find_all_events_up_to_the_limit_of_a_c3d(trial, metrics, fit, t
     file, endings = c3d_of(path), ["", *range(2, -(-n // 255) + 1)]
     group, seconds = file["parameters"]["EVENT"], np.arange(n) / 2
     assert group["USED"]["value"][0] == n
-    assert sum((group[f"LABELS{e}"]["value"] for e in endings), []) == ["Foot Strike"] * n
-    assert sum((group[f"CONTEXTS{e}"]["value"] for e in endings), []) == (["Left", "Right"] * n)[:n]
+    assert [t for e in endings for t in group[f"LABELS{e}"]["value"]] == ["Foot Strike"] * n
+    assert [t for e in endings for t in group[f"CONTEXTS{e}"]["value"]] == (["Left", "Right"] * n)[:n]
     times = np.concatenate([group[f"TIMES{e}"]["value"] for e in endings], axis=1)
     np.testing.assert_allclose([60, 1] @ times, seconds, atol=1e-4)
     with path.open("rb") as opened, warnings.catch_warnings():
