@@ -12,6 +12,7 @@ import datetime
 import math
 import re
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -245,7 +246,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     counts may differ. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED,
-    VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN.
+    VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN, VIDEO_PIXELS.
     """
     path = check_file(path)
     sha256 = sha256_of(path)
@@ -254,6 +255,8 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     turn, pixel_format, width, height = Orientation(), "", 0, 0
     with Decoder(path, threads, exact=True) as decoder:
         stream, container = decoder.stream, decoder.container
+        _check_square(path, stream.sample_aspect_ratio)
+        n_interlaced = 0
         for pts, frame in progress.track(keeping(decoder), "reading video", total=decoder.n_announced or None):
             if not stamps:
                 turn = orientation_of(frame)
@@ -262,6 +265,15 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
             if len(stamps) % EVERY == 0:
                 borders.add(frame)
             stamps.append(pts)
+            n_interlaced += bool(frame.interlaced_frame)
+        if n_interlaced > 0.5 * len(stamps):
+            raise PblError(
+                "VIDEO_PIXELS",
+                found=f"{n_interlaced} of {len(stamps)} pictures are interlaced: each shows two moments, line by line",
+                expected="pictures of one moment each",
+                next_step='film progressively, or separate the moments ("ffmpeg -i in.mp4 -vf bwdif out.mp4")',
+                key=path,
+            )
         widths = borders.widths()
         n_lines = borders.lines() if widths is None else 0
         if widths is not None or n_lines:
@@ -282,7 +294,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         tags = read_tags(path)
         metadata = _metadata(decoder, tags)
         capture_fps = _number(metadata, "com.android.capture.fps", "com.apple.quicktime.capture.fps")
-        notes = decoder.notes + _picture_notes(turn, stream.sample_aspect_ratio)
+        notes = decoder.notes + _picture_notes(turn)
         notes += speed_notes(1.0 / interval_s, capture_fps, tags.speeds)
         return VideoInfo(
             path=str(path),
@@ -377,14 +389,28 @@ def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tup
     return interval_of(time_s), bool(np.abs(steps - median).max() > tolerance)
 
 
-def _picture_notes(turn: Orientation, pixel_aspect: object) -> list[str]:
+#: Largest deviation of the pixels' sides from each other: rounded sizes of converted copies are below.
+_SQUARE_WITHIN = 0.01
+
+
+def _check_square(path: Path, pixel_aspect: Fraction | None) -> None:
+    """Raise `PblError` VIDEO_PIXELS for pixels that are not square, whose camera has two focal lengths."""
+    if pixel_aspect and abs(float(pixel_aspect) - 1) > _SQUARE_WITHIN:
+        raise PblError(
+            "VIDEO_PIXELS",
+            found=f"pixels of {pixel_aspect.numerator}:{pixel_aspect.denominator}, as the file states",
+            expected="square pixels",
+            next_step='resample the pictures ("ffmpeg -i in.mp4 -vf scale=iw*sar:ih,setsar=1 out.mp4")',
+            key=path,
+        )
+
+
+def _picture_notes(turn: Orientation) -> list[str]:
     notes = []
     if turn.mirrored:
         notes.append("the file asks for a mirrored picture: left and right are swapped as a player shows it")
     if not turn.exact:
         notes.append(f"the rotation is not a multiple of 90 degrees: {turn.rotation_deg} is used")
-    if pixel_aspect not in (None, 0, 1):
-        notes.append(f"pixels are not square ({pixel_aspect}): the picture is used as stored")
     return notes
 
 
