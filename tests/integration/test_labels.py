@@ -103,6 +103,11 @@ def test_a_visit_of_before_keeps_its_label_and_is_found(tables, tmp_path, stored
     assert labels() == sorted((stored, "other"))
 
 
+def test_a_label_of_spaces_is_refused(tmp_path):
+    with pytest.raises(PblError, match="visit of 0 characters"):
+        ingest([tmp_path / "any.mp4"], VisitRecord("P001", "\u00a0 "))
+
+
 def test_what_is_kept():
     assert normalised_label(" a  b\u00a0c ") == "a b c"
     assert normalised_label("a\n") == "a\n"  # `check_label` refuses it

@@ -111,7 +111,7 @@ class VisitRecord:
             ("pace", self.pace, 32),
             ("population", self.population, 32),
         ):
-            check_label(what, text or "", longest)
+            check_label(what, text or "", longest, least=int(what == "visit"))
         check_height(self.height_m)
         check_mass(self.mass_kg)
 
