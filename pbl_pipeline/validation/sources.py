@@ -128,7 +128,7 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
 
     Signs differ between models and the file does not state them. The larger excursion over both knees is taken as
     flexion. The ankle counts the way in which the foot is level while it stands, from the foot's right angle to the
-    shank. `notes` lists what was turned or shifted for it.
+    shank; so does the pelvis' tilt where that shows it. `notes` lists what was turned or shifted for it.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (also a column that occurs twice), ANGLE_UNITS.
     """
@@ -163,7 +163,7 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
     pelvis = None
     if all(n in column for n in _PELVIS_PATH):
         pelvis = np.column_stack([column[n] for n in _PELVIS_PATH]) @ Y_UP_TO_Z_UP.T
-    notes += _turn_ankles(angles)
+    notes += _to_our_signs(angles)
     return Reference(path.stem, source, convention, time, angles, pelvis, tuple(notes))
 
 
@@ -204,8 +204,8 @@ def _check_unit(path: Path, turns: Mapping[str, np.ndarray], in_degrees: bool) -
     )
 
 
-def _turn_ankles(angles: dict[str, np.ndarray]) -> list[str]:
-    """Bring the ankles to the body's zero and sign (dorsiflexion positive); return what was done.
+def _to_our_signs(angles: dict[str, np.ndarray]) -> list[str]:
+    """Bring ankles and pelvis to the body's zero and signs (dorsiflexion and posterior tilt positive); return notes.
 
     In the sagittal plane the foot stands level where pelvis tilt + hip - knee + ankle = 0.
     """
@@ -216,19 +216,25 @@ def _turn_ankles(angles: dict[str, np.ndarray]) -> list[str]:
         for name in ankles:
             angles[name] = angles[name] - np.copysign(_ANKLE_FROM_SHANK_DEG, middle)
         notes.append("the ankle counts from the line of the shank: 90 deg taken off")
-    level = {1: 0.0, -1: 0.0}
+    level = dict.fromkeys(((1, 1), (1, -1), (-1, 1), (-1, -1)), 0.0)  # by the signs of tilt and ankle
     for name in ankles:
-        leg = [angles.get(n) for n in ("pelvis_tilt", f"hip_flexion{name[-2:]}", f"knee_flexion{name[-2:]}")]
-        if all(v is not None for v in leg):
-            tilt, hip, knee = leg
-            for sign in level:
-                pitch = tilt + hip - knee + sign * angles[name]
-                near = np.abs(pitch[:, None] - np.arange(-_LEVEL_DEG, _LEVEL_DEG + 1)) < _FLAT
-                level[sign] += float(near.mean(axis=0).max()) / len(ankles)
-    if level[-1] >= _STANDS and level[-1] > _CLEARLY * level[1]:
+        side = name[-2:]
+        if not {"pelvis_tilt", f"hip_flexion{side}", f"knee_flexion{side}"} <= angles.keys():
+            continue
+        leg = angles[f"hip_flexion{side}"] - angles[f"knee_flexion{side}"]
+        for tilted, ankle in level:
+            pitch = tilted * angles["pelvis_tilt"] + leg + ankle * angles[name]
+            near = np.abs(pitch[:, None] - np.arange(-_LEVEL_DEG, _LEVEL_DEG + 1)) < _FLAT
+            level[tilted, ankle] += float(near.mean(axis=0).max()) / len(ankles)
+    best = {sign: max(level[1, sign], level[-1, sign]) for sign in (1, -1)}
+    ankle = -1 if best[-1] >= _STANDS and best[-1] > _CLEARLY * best[1] else 1
+    if ankle < 0:
         for name in ankles:
             angles[name] = -angles[name]
         notes.append("the ankle is positive in plantarflexion and was turned: only so is the standing foot level")
+    if level[-1, ankle] >= _STANDS and level[-1, ankle] > _CLEARLY * level[1, ankle]:
+        angles["pelvis_tilt"] = -angles["pelvis_tilt"]
+        notes.append("the tilt of the pelvis is positive forwards and was turned: only so is the standing foot level")
     return notes
 
 

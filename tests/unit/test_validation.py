@@ -371,6 +371,17 @@ def test_signs_and_zeros_of_other_models_are_brought_to_ours_and_said(tmp_path: 
         assert f"{'positive' if knee > 0 else 'negative'} in flexion" in said
 
 
+def test_a_pelvis_that_counts_its_tilt_forwards(tmp_path: Path):
+    leg = _leg()
+    swaying = 15 * np.sin(0.7 * np.pi * leg["time"])
+    leg |= {"pelvis_tilt": swaying, "ankle_angle_r": leg["ankle_angle_r"] + 3 - swaying}
+    for tilted, ankle in ((1, 1), (-1, 1), (-1, -1)):
+        other = leg | {"pelvis_tilt": tilted * swaying, "ankle_angle_r": ankle * leg["ankle_angle_r"]}
+        read = reference_of_mot(_motion(tmp_path / "a.mot", "yes", other))
+        np.testing.assert_allclose(read.angles_deg["pelvis_tilt"], swaying, atol=1e-5)
+        assert any("positive forwards" in n for n in read.notes) == (tilted < 0)
+
+
 # --- fits
 
 

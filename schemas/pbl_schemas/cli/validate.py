@@ -321,10 +321,13 @@ def _of_files(
     for path, truth in zip(fits, of_each, strict=True):
         try:
             fit = TrialFit.load(path)
-            errors = compare(fit, read_reference(truth, source, shift_s))
+            reference = read_reference(truth, source, shift_s)
+            errors = compare(fit, reference)
         except PblError as error:
             refused.append(error)
             continue
+        for note in reference.notes:
+            click.echo(f"{truth}: {note}", err=True)
         rows.append(
             TrialErrors(
                 errors=errors,
