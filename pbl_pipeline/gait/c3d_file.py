@@ -44,7 +44,7 @@ class C3dFile:
         import c3d
 
         self.notes: list[str] = []
-        #: Whose points were taken, where their names say so.
+        #: The person of the points that were taken, if their names state it.
         self.person = ""
         self._data = data
         start = _BLOCK * (data[0] - 1)
@@ -67,25 +67,22 @@ class C3dFile:
         end = end if end > start else start + _BLOCK * self._data[start + 2]
         groups: dict[int, str] = {}
         found: list[tuple[int, str, bytes]] = []
-        at = start + 4
-        while at < min(end, len(self._data) - 4):
+        at, step = start + 4, 1
+        while step and at < min(end, len(self._data) - 4):
             length, group = struct.unpack_from("bb", self._data, at)
             if group == 0 or length == 0:
                 break
             at += 2 + abs(length)
             name = self._types.decode_string(self._data[at - abs(length) : at]).strip().upper()
             (step,) = struct.unpack_from(f"{order}H", self._data, at)
-            record = self._data[at + 2 : at + step if step else end]
             if group < 0:
                 groups[-group] = name
             else:
-                found.append((group, name, record))
-            if not step:
-                break
+                found.append((group, name, self._data[at + 2 : at + step if step else end]))
             at += step
         table: dict[str, list[bytes]] = {}
         for group, name, record in found:
-            table.setdefault(f"{groups.get(group, group)}:{name}", []).append(record)
+            table.setdefault(f"{groups.get(group)}:{name}", []).append(record)
         return table
 
     def _get(self, key: str) -> Any:
@@ -99,11 +96,8 @@ class C3dFile:
 
     def _pieces(self, key: str) -> Iterator[Any]:
         """A parameter and its continuations: one holds 255 values, the next are in KEY2, KEY3 ..."""
-        for k in itertools.count(1):
-            piece = self._get(key if k == 1 else f"{key}{k}")
-            if piece is None:
-                return
-            yield piece
+        names = itertools.chain([key], (f"{key}{k}" for k in itertools.count(2)))
+        return itertools.takewhile(lambda piece: piece is not None, map(self._get, names))
 
     def _floats(self, data: bytes) -> np.ndarray:
         if not self._types.is_dec:
@@ -142,12 +136,7 @@ class C3dFile:
         analogs = [used * n for n in (ratio, per_frame) if 0 <= used * n < _WORD] + [analog]
         analogs += [0] if math.isnan(used) else []
         begin, end = self.number("TRIAL:ACTUAL_START_FIELD"), self.number("TRIAL:ACTUAL_END_FIELD")
-        stated = [
-            end - begin + 1,
-            self.number("POINT:LONG_FRAMES"),
-            self.number("POINT:FRAMES"),
-            (last - first + 1) % _WORD,
-        ]
+        stated = (end - begin + 1, *map(self.number, ("POINT:LONG_FRAMES", "POINT:FRAMES")), (last - first + 1) % _WORD)
         counts = [int(n) for n in stated if n >= 0]
         options = itertools.product(
             [int(n) for n in dict.fromkeys((self.number("POINT:USED"), points)) if n > 0],
@@ -164,7 +153,7 @@ class C3dFile:
             raise ValueError("no points")
         n, self._points, self._size, self._bytes, at, held = next((f for f in fits if f[0]), fits[0])
         self._start = _BLOCK * (at - 1)
-        if not n and len(fits) > 1 and _WORD - 1 not in counts:
+        if not n and len({f[2:4] for f in fits}) > 1 and _WORD - 1 not in counts:
             raise ValueError("header and parameters state frames of different sizes, and neither fills the file")
         if n in (0, _WORD - 1) and _WORD - 1 in (*counts, last):
             stop = self._start + held * self._size
@@ -184,13 +173,9 @@ class C3dFile:
         """Coordinates (T, P, 3) in the file's unit. NaN where a point is missing: its residual is negative, a number is
         not finite, or all four are 0."""
         formats = {2: self._types.int16, 4: "<u4" if self._types.is_dec else self._types.float32}
-        words = np.ndarray(
-            (self.n_frames, self._points, 4),
-            formats[self._bytes],
-            self._data,
-            self._start,
-            (self._size, 4 * self._bytes, self._bytes),
-        )[:, list(columns)]
+        steps = (self._size, 4 * self._bytes, self._bytes)
+        shape = (self.n_frames, self._points, 4)
+        words = np.ndarray(shape, formats[self._bytes], self._data, self._start, steps)[:, list(columns)]
         if self._types.is_dec and self._bytes == 4:
             words = self._floats(words.tobytes()).reshape(words.shape)
         values = words.astype(float)
@@ -222,9 +207,8 @@ class C3dFile:
             self.notes.append(f"events beyond EVENT:USED ({n}) are deleted ones and not used")
         contexts, subjects = (self.texts(f"EVENT:{key}") for key in ("CONTEXTS", "SUBJECTS"))
         found, ignored = [], []
-        for label, time, context, subject in zip(
-            labels[:n], times, _filled(contexts, n), _filled(subjects, n), strict=False
-        ):
+        rows = itertools.zip_longest(labels[:n], times[:n], contexts[:n], subjects[:n], fillvalue="")
+        for label, time, context, subject in rows:
             known = _LABEL.fullmatch(re.sub(r"[^a-z]", "", label.lower()))
             words = (*(known.group(1, 3) if known else ()), re.sub("[^a-z]|foot|leg|side", "", context.lower()))
             sides = {_SIDES[word] for word in words if word in _SIDES}
@@ -253,7 +237,3 @@ def _cut(n: int, held: int) -> Iterator[int]:
     yield n
     if n < _WORD:
         yield from range(n + _WORD, held + 1, _WORD)
-
-
-def _filled(values: list[str], n: int) -> list[str]:
-    return values + [""] * (n - len(values))

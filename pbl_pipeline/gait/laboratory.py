@@ -179,11 +179,7 @@ def _metres(file: C3dFile, path: Path) -> float:
 
 
 def _events(
-    path: Path,
-    file: C3dFile,
-    feet: FootTrajectories | None,
-    events_csv: str | Path | None,
-    method: Any,
+    path: Path, file: C3dFile, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
 ) -> GaitEvents:
     if feet is not None:
         try:
@@ -197,9 +193,8 @@ def _events(
     with _reading(path):
         labelled = file.events()
     found = sorted(_of_person(path, file, labelled), key=lambda e: e.time_s)
-    if outside := sum(
-        not file.first_frame - 2 <= e.time_s * file.rate_hz <= file.first_frame + file.n_frames for e in found
-    ):
+    frames = [e.time_s * file.rate_hz + 1 - file.first_frame for e in found]
+    if outside := sum(not -1 <= frame <= file.n_frames for frame in frames):
         file.notes.append(f"{outside} of {len(found)} events are outside of the recording, whose frame 1 is at 0 s")
     if found:
         return _given(tuple(found), "labels", "labels of the recording")
