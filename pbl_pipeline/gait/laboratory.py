@@ -159,7 +159,11 @@ def _read(
         kept = [p for p in there if not p[0] or person is None or _key(p[0]) == _key(person)]
         names = [name for _, name, _ in kept]
         if twice := [n for n in dict.fromkeys(names) if names.count(n) > 1]:
-            raise _format_error(f"more than one point named {', '.join(twice)}", "each point once", key=path)
+            found, advice = (
+                f"more than one point named {', '.join(twice)}",
+                "rename or remove all but one, and export again",
+            )
+            raise PblError("FILE_FORMAT", found, "each point once", advice, key=path)
         xyz = file.points([i for _, _, i in kept])
     if not len(xyz):
         raise _damaged("no frames", "points over time", key=path)
@@ -206,6 +210,8 @@ def _events(
             next_step="pass events with --events",
             key=str(path),
         )
+    if labelled or file.texts("EVENT:LABELS"):
+        file.notes.append("no event label is used: events are found from the markers")
     return detect_events(feet, method)
 
 
