@@ -256,8 +256,10 @@ def _vertical(session: Session) -> list[Check]:
     """Report trials whose vertical axis was wrong and that were turned; empty if there are none."""
     if not session.turned:
         return []
-    worst = max(session.turned, key=lambda t: t.off_deg)
-    return [Check("vertical_from_body", WARN, worst.off_deg, WRONG_DEG, worst.note)]
+    names = ", ".join(t.name for t in session.turned)
+    axes = ", ".join(sorted({t.axis for t in session.turned}))
+    advice = f"trial {names}: the body stands along {axes} of the world as read, not along z: turned by right angles"
+    return [Check("vertical_from_body", WARN, max(t.off_deg for t in session.turned), WRONG_DEG, advice)]
 
 
 def _observed(trials: Sequence[TrialFit]) -> Check:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
+from pbl_pipeline.body import MARKER_SETS, Body, MarkerSet, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     SEEN_SHARE,
@@ -95,6 +96,7 @@ def make_session(
     checked = [check_trial(t, n, params.view, table) for t, n in zip(trials, names, strict=True)]
     worlds = [in_upright_world(t, n, table) for t, n in zip(trials, names, strict=True) if not isinstance(t, Keypoints)]
     trials = [w.trial for w in worlds] or trials
+    table = _measured(table) if isinstance(trials[0], WorldMarkers) else table
     arrays, orientation = [], []
     for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
         packed, source = _arrays(trial, name, motion, used, cost.pixel)
@@ -114,8 +116,15 @@ def make_session(
         orientation=tuple(orientation),
         problem=pack(arrays, body, table),
         metre=metre,
-        turned=tuple(w for w in worlds if w.note),
+        turned=tuple(w for w in worlds if w.axis),
     )
+
+
+@functools.cache
+def _measured(markers: MarkerSet) -> MarkerSet:
+    """Return an included set for markers in the world: its `weight_3d` is of a detector's depth, which has no part."""
+    included = markers.name in MARKER_SETS and markers is marker_set(markers.name)
+    return dataclasses.replace(markers, weight_3d=np.ones(len(markers))) if included else markers
 
 
 def check_trial(

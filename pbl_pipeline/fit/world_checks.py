@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -32,16 +33,20 @@ _UNITS = {"metres": 1.0, "feet": 0.3048, "inches": 0.0254, "centimetres": 0.01, 
 _LEGS = ("tibia", "talus", "calcn", "toes")
 
 
+World = TypeVar("World", bound=MultiView | WorldMarkers)
+
+
 @dataclasses.dataclass(frozen=True)
-class Turned:
-    """A trial in the world whose z is up by the body, with what was done."""
+class Turned(Generic[World]):
+    """A trial in a world whose z is up by the body."""
 
-    trial: MultiView | WorldMarkers
-    off_deg: float  # between the body and the vertical axis as read
-    note: str = ""  # empty where nothing was turned
+    trial: World
+    name: str
+    off_deg: float  # between the body and z as read
+    axis: str = ""  # that was up instead of z, such as "-y"; empty where nothing was turned
 
 
-def in_upright_world(trial: MultiView | WorldMarkers, name: str, markers: MarkerSet) -> Turned:
+def in_upright_world(trial: World, name: str, markers: MarkerSet) -> Turned[World]:
     """Return the trial with z up; turned by right angles where the body clearly stands along another axis.
 
     Raises `PblError` FIT_INPUT: times, size or strides that no person has, or a vertical that is wrong and unclear.
@@ -50,7 +55,7 @@ def in_upright_world(trial: MultiView | WorldMarkers, name: str, markers: Marker
     _check_steps(np.asarray(trial.time_s), name)
     check_size(points, name, markers)
     up, steady = body_axis(points, markers)
-    off, turn, note = float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))), np.eye(3), ""
+    off, turn, label = float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))), np.eye(3), ""
     if off > WRONG_DEG:
         number = int(np.argmax(np.abs(up)))
         axis = np.sign(up[number]) * np.eye(3)[number]
@@ -64,10 +69,9 @@ def in_upright_world(trial: MultiView | WorldMarkers, name: str, markers: Marker
                 "pass --up y or --up z for a .trc; else turn the markers, or the calibration, so that z is up",
             )
         turn = _to_z(axis)
-        note = f"trial {name}: the body stands along {label} of the world as read, not along z: turned by right angles"
     points = points @ turn.T
     _check_strides(points, np.asarray(trial.time_s), name, markers)
-    return Turned(_turned(trial, turn) if note else trial, off, note)
+    return Turned(_turned(trial, turn) if label else trial, name, off, label)
 
 
 def check_size(points: np.ndarray, name: str, markers: MarkerSet) -> None:
@@ -145,7 +149,7 @@ def _points(trial: MultiView | WorldMarkers) -> np.ndarray:
 
 
 def _size(points: np.ndarray, markers: MarkerSet) -> float:
-    seen = np.isfinite(points).all(axis=2)
+    seen = np.asarray(np.isfinite(points).all(axis=2))
     known = np.where(seen[..., None], points, 0.0)[:, None]
     return 1 / body_metres(load_body(), markers, [known], [seen[:, None]])
 
@@ -165,9 +169,9 @@ def _check_steps(time_s: np.ndarray, name: str) -> None:
 
 def _check_strides(points: np.ndarray, time_s: np.ndarray, name: str, markers: MarkerSet) -> None:
     """The distance between the legs along the way changes its sign twice a stride."""
-    legs = [[b.endswith(end) and b.startswith(_LEGS) for b in markers.body_names] for end in ("_r", "_l")]
-    seen = [np.isfinite(points).all(axis=2) & np.array(leg) for leg in legs]
-    known = seen[0].any(axis=1) & seen[1].any(axis=1)
+    legs = [np.array([b.endswith(end) and b.startswith(_LEGS) for b in markers.body_names]) for end in ("_r", "_l")]
+    seen = np.isfinite(points).all(axis=2) & np.stack(legs)[:, None]
+    known = np.all([s.any(axis=1) for s in seen], axis=0)
     if known.sum() < 3:
         return
     both = [
@@ -199,7 +203,7 @@ def _to_z(axis: np.ndarray) -> np.ndarray:
     return np.diag([1.0, -1.0, -1.0]) if axis[2] else np.eye(3) + cross + cross @ cross
 
 
-def _turned(trial: MultiView | WorldMarkers, turn: np.ndarray) -> MultiView | WorldMarkers:
+def _turned(trial: World, turn: np.ndarray) -> World:
     if isinstance(trial, WorldMarkers):
         return dataclasses.replace(trial, xyz_world_m=trial.xyz_world_m @ turn.T)
     poses = tuple(CameraPose(turn @ p.R_nc, turn @ p.p_nc) for p in trial.poses)

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import MARKER_SETS, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, check_trial, read_markers
-from pbl_pipeline.fit.checks import check_fit
+from pbl_pipeline.fit.checks import _vertical
+from pbl_pipeline.fit.lever_arms import OPEN_RAD, PLACED_M, lever_arms_m
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.world_checks import in_upright_world
 from pbl_pipeline.keypoints import MultiView, WorldMarkers
@@ -68,9 +69,9 @@ def refused(trial: WorldMarkers | MultiView, code: str = "FIT_INPUT") -> str:
 @pytest.mark.parametrize("axis", WORLDS)
 def test_a_world_with_another_vertical_is_turned(axis: str, name: str):
     right, table = markers(name), marker_set(name)
-    assert in_upright_world(right, "walk", table).note == ""
+    assert in_upright_world(right, "walk", table).axis == ""
     found = in_upright_world(moved(right, WORLDS[axis]), "walk", table)
-    assert f"stands along {axis} of the world" in found.note
+    assert found.axis == axis
     up = found.trial.xyz_world_m
     np.testing.assert_allclose(up[..., 2], right.xyz_world_m[..., 2], atol=1e-9)
     assert found.off_deg > 80
@@ -80,10 +81,11 @@ def test_the_fit_gets_the_turned_world_and_reports_it():
     good, wrong = markers(), moved(markers(), WORLDS["-z"])
     session = make_session([good, wrong], ["good", "wrong"], PARAMS)
     z = [np.where(a.c_world > 0, a.x_world[..., 2], 0) for a in session.arrays]
-    np.testing.assert_allclose(*z, atol=1e-9)
-    assert [t.note[:11] for t in session.turned] == ["trial wrong"]
-    assert make_session([good], ["good"], PARAMS).turned == ()
-    assert "_vertical" in check_fit.__code__.co_names
+    np.testing.assert_allclose(z[0], z[1], atol=1e-9)
+    (check,) = _vertical(session)
+    assert (check.check, check.outcome) == ("vertical_from_body", "WARN")
+    assert check.advice.startswith("trial wrong: the body stands along -z of the world as read")
+    assert _vertical(make_session([good], ["good"], PARAMS)) == []
 
 
 @pytest.mark.parametrize(("knee", "hip", "lean"), [(90, 90, 0), (130, 110, 30), (0, 60, 60)])
@@ -91,7 +93,7 @@ def test_the_fit_gets_the_turned_world_and_reports_it():
 def test_people_who_sit_squat_and_stoop_are_upright(name: str, knee: float, hip: float, lean: float):
     lean_forward = Rotation.from_rotvec([-np.radians(lean), 0, 0]).as_matrix()
     trial = moved(markers(name, folded(knee, hip)), lean_forward)
-    assert in_upright_world(trial, "chair", marker_set(name)).note == ""
+    assert in_upright_world(trial, "chair", marker_set(name)).axis == ""
 
 
 def test_a_vertical_between_axes_is_refused():
@@ -151,8 +153,10 @@ def test_a_rig_with_another_vertical_is_turned(axis: str):
     check_trial(rig(), "walk")
     wrong = rig_with(lambda R, t: (R @ WORLDS[axis].T, t))
     session = make_session([wrong], ["walk"], PARAMS)
-    assert f"along {axis} of" in session.turned[0].note
-    at = np.array([p.p_nc for p in session.trials[0].poses])
+    assert [t.axis for t in session.turned] == [axis]
+    turned = session.trials[0]
+    assert isinstance(turned, MultiView)
+    at = np.array([p.p_nc for p in turned.poses])
     np.testing.assert_allclose(at[:, 2], [p.p_nc[2] for p in rig().poses], atol=1e-9)
 
 
@@ -192,7 +196,7 @@ def test_a_trc_with_z_up_is_turned_back(tmp_path: Path):
     trial, table = markers(), marker_set(NAME)
     read = read_markers(trc(tmp_path / "w.trc", trial, up="z"), table).trial
     found = in_upright_world(read, "w", table)
-    assert "-y of the world as read" in found.note
+    assert found.axis == "-y"
     np.testing.assert_allclose(found.trial.xyz_world_m, trial.xyz_world_m, atol=1e-5)
 
 
@@ -231,3 +235,14 @@ def test_names_as_their_programs_write_them(tmp_path: Path, name: str):
     # A file that has both has its own.
     both = read_markers(trc(tmp_path / "b.trc", trial, names=[table.names[0], names[0], *names[2:]]), table)
     assert both.unused == (names[0],)
+
+
+@pytest.mark.parametrize(("name", "is_open"), [("mpi_inf_3dhp_17", True), ("blazepose_33", False), ("halpe_26", False)])
+def test_ankles_without_a_marker_on_the_foot_are_left_open(name: str, is_open: bool):
+    session = make_session([markers(name)], ["walk"], PARAMS)
+    lever = lever_arms_m(session, walk()[0][::10])
+    joints = list(session.body.joint_names)
+    sd = PLACED_M / np.maximum(lever, 1e-9)
+    assert (sd[joints.index("ankle_angle_r")] > OPEN_RAD) == is_open
+    assert sd[[joints.index(n) for n in ("hip_flexion_r", "hip_rotation_l", "knee_angle_l")]].max() < OPEN_RAD
+    assert np.all(session.markers.weight_3d == 1)
