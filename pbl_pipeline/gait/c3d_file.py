@@ -2,7 +2,7 @@
 
 `c3d` (py-c3d) decodes single parameters and the number formats of Intel, DEC and MIPS. Its reader is not used: it
 refuses numbers of the header that repeat a parameter, returns no frame of 65,535 or more, and counts the high word of
-the first frame as 65,535. ezc3d hides frames after the 65,535th and does not read all of these formats.
+the first frame as 65,535. ezc3d hides frames after the 65,535th and cannot read back more than 255 events (findings/).
 """
 
 from __future__ import annotations
