@@ -21,6 +21,7 @@ CODES: dict[str, str] = {
     "VIDEO_TIMESTAMPS": "the frames carry no usable time stamps",
     "VIDEO_TOO_LARGE": "the pictures of the video are larger than are decoded here",
     "VIDEO_SCREEN": "the video is the recording of a screen, or a copy with borders around the picture",
+    "VIDEO_PIXELS": "the pixels of the video are not square, or its pictures are interlaced",
     "VIDEO_UPSIDE_DOWN": "the people in the video are upside down",
     "VIDEO_CHANGED": "the file's bytes are no longer those that were registered",
     "VIDEO_DUPLICATE": "the same bytes are registered for another person, or, from a phone, in another visit",

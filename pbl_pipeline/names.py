@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from unicodedata import category
+from unicodedata import category, normalize
 
 from pbl_pipeline.errors import PblError
 
@@ -17,12 +17,22 @@ _ODD = ("Cc", "Cf", "Cs", "Zl", "Zp")
 _JOINERS = "\u200c\u200d"
 #: Letters and marks that are invisible.
 _BLANK = "\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0"
+#: Space characters, which are written as one space each.
+_SPACES = re.compile("[ \u00a0\u1680\u2000-\u200a\u202f\u205f\u3000]+")
 _NUMBER = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 def is_plain(text: str) -> bool:
     """Return whether a text is one line, can be stored, and reads as it is printed."""
     return not any(c in _BLANK or (category(c) in _ODD and c not in _JOINERS) for c in text)
+
+
+def normalised_label(text: str) -> str:
+    """Return a label as it is stored and compared: NFC, no spaces at its ends, one space for several within it.
+
+    Case and accents stay; control characters stay too, for `check_label` to refuse.
+    """
+    return normalize("NFC", _SPACES.sub(" ", text).strip(" "))
 
 
 def check_label(what: str, text: str, longest: int, least: int = 0) -> None:

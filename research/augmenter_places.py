@@ -38,7 +38,8 @@ _HEAD = """\
 # this body, its 15 points given to the network, the answers in the frames of the bones; left and right are mirror
 # images (z). Positions as the network defines them, not palpated ones. No detector sees these points
 # metres, in the body's frame (x forward, y up, z right); sd_mm: between the persons, along x, y and z
-name,body,x,y,z,sd_mm
+# also: the name that OpenCap and Pose2Sim write
+name,body,x,y,z,sd_mm,also
 """
 
 
@@ -46,6 +47,15 @@ def bone_of(marker: str) -> str:
     """ "l_knee" -> "femur_l"."""
     bone = "torso" if "shoulder" in marker else next(b for part, b in _BONES.items() if part in marker)
     return bone if bone in ("pelvis", "torso") else f"{bone}_{marker[0]}"
+
+
+def written(marker: str) -> str:
+    """ "l_knee" -> "L_knee_study", as OpenCap and Pose2Sim spell it."""
+    side, _, part = marker.rpartition("_")
+    if part == "HJC":
+        return f"{side.upper()}HJC_study"
+    joint = "." if "SIS" in part else "_"
+    return f"{side.replace('l', 'L')}{joint if side else ''}{part}_study"
 
 
 def mirrored(marker: str) -> str:
@@ -81,7 +91,7 @@ def table(found: dict[str, np.ndarray]) -> str:
         side = [1, 1, -1] if left else [1, 1, 1]
         place, sd = both.mean(axis=0) * side, 1000 * both.std(axis=0, ddof=1)
         numbers = ",".join(f"{v + 0.0:.3f}" for v in np.round(place, 3))
-        lines.append(f"{name},{bone_of(name)},{numbers},{' '.join(f'{s:.0f}' for s in sd)}\n")
+        lines.append(f"{name},{bone_of(name)},{numbers},{' '.join(f'{s:.0f}' for s in sd)},{written(name)}\n")
     return "".join(lines)
 
 

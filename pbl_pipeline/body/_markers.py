@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +44,8 @@ class MarkerSet:
     #: (J,) weight of the point's 3D position, 0 (only its pixels count) to 1, a property of the detector;
     #: 1 unless the table has a column `weight_3d`.
     weight_3d: np.ndarray
+    #: Other name -> name: how programs spell it that write such markers.
+    also: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,8 +83,8 @@ def marker_set(name: str) -> MarkerSet:
 def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     """Read a table of markers: CSV with the columns name, body, x, y, z in metres in the body's frame.
 
-    The column `weight_3d` is optional (`MarkerSet`); an empty cell means 1. Lines that start with `#` are comments,
-    other columns are ignored. `name` is the file's stem unless given.
+    The columns `weight_3d` (an empty cell means 1) and `also` (another name) are optional (`MarkerSet`). Lines that
+    start with `#` are comments, other columns are ignored. `name` is the file's stem unless given.
 
     Raises `PblError` FILE_FORMAT: unreadable, a column missing, an invalid number, a name twice, a body the model
     lacks, no rows.
@@ -102,6 +104,7 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
     bodies: list[str] = []
     positions: list[list[float]] = []
     weights: list[float] = []
+    also: dict[str, str] = {}
     for (number, _), row in zip(numbered[1:], table, strict=False):
         where = f"line {number}"
         marker, body = (row["name"] or "").strip(), (row["body"] or "").strip()
@@ -125,10 +128,12 @@ def load_marker_set(path: str | Path, name: str | None = None) -> MarkerSet:
         bodies.append(body)
         positions.append(position)
         weights.append(weight)
+        if other := (row.get("also") or "").strip():
+            also[other] = marker
     if not names:
         raise _format_error("no markers", key=path)
     index = np.array([known.index(b) for b in bodies], np.int32)
     position_m, weight_3d = np.array(positions, np.float64), np.array(weights, np.float64)
     for array in (index, position_m, weight_3d):
         array.setflags(write=False)
-    return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m, weight_3d)
+    return MarkerSet(name or path.stem, tuple(names), tuple(bodies), index, position_m, weight_3d, also)

@@ -9,7 +9,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from .gait import METHOD_HELP, is_c3d
+from .gait import METHOD_HELP, PERSON_HELP, is_c3d
 
 _EPILOG = """\b
 Example: pbl events walk.fit.npz --out walk.events.csv
@@ -26,7 +26,8 @@ _format_error = functools.partial(
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="events.csv to write.")
 @click.option("--method", default="phase-transformer", show_default=True, help=METHOD_HELP)
-def events(file: Path, out: Path, method: str) -> None:
+@click.option("--person", metavar="NAME", help=PERSON_HELP)
+def events(file: Path, out: Path, method: str, person: str | None) -> None:
     """Find initial contacts and toe-offs in FILE and write them as CSV.
 
     FILE is a fit.npz, a keypoints.npz with 3D markers (its fields decide), or a laboratory's C3D, whose markers are
@@ -36,7 +37,7 @@ def events(file: Path, out: Path, method: str) -> None:
     from pbl_pipeline.gait import detect_events
 
     check_out_file(out)
-    found = detect_events(_feet(file), method)
+    found = detect_events(_feet(file, person), method)
     found.save(out)
     if found.status == "EMPTY":
         click.echo(f"{out}: no events: {found.reason}")
@@ -49,13 +50,13 @@ def events(file: Path, out: Path, method: str) -> None:
             click.echo(f"  {check.outcome} {check.check}: {check.advice}")
 
 
-def _feet(path: Path):
+def _feet(path: Path, person: str | None):
     from pbl_pipeline.files import fields_of
     from pbl_pipeline.gait import feet_from_fit, feet_from_keypoints, feet_from_markers, read_lab_feet
     from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 
     if is_c3d(path):
-        return read_lab_feet(path)
+        return read_lab_feet(path, person)
     fields = fields_of(path)
     if "qpos" in fields:
         from pbl_pipeline.fit import TrialFit  # loads the fit's libraries

@@ -12,6 +12,7 @@ from pbl_pipeline.errors import PblError
 from .options import MASS
 
 METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-2007."
+PERSON_HELP = "Person to measure of C3D files with several: the prefix of the points, the subject of the events."
 _EPILOG = """\b
 Example: pbl gait out/walk1.fit.npz out/walk2.fit.npz --out out/metrics.json
 Example: pbl gait lab/walk1.c3d lab/walk2.c3d --out lab/metrics.json"""
@@ -35,6 +36,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl gait --help`")
     help="events.csv of `pbl events` for C3D files, once for each in their order (default: the labels in the file, "
     "else by --method).",
 )
+@click.option("--person", metavar="NAME", help=PERSON_HELP)
 @click.option(
     "--accept-cadence",
     is_flag=True,
@@ -48,6 +50,7 @@ def gait(
     norm: str | None,
     method: str,
     event_files: tuple[Path, ...],
+    person: str | None,
     accept_cadence: bool,
     mass_kg: float | None,
 ) -> None:
@@ -73,6 +76,8 @@ def gait(
         raise _usage("fits and C3D files together", "one kind of file in a session")
     if event_files and (not all(laboratory) or len(event_files) != len(files)):
         raise _usage(f"{len(event_files)} --events for {len(files)} files", "C3D files, and one --events for each")
+    if person is not None and not all(laboratory):
+        raise _usage("--person for fits", "C3D files")
     if index is None:
         index = GILLETTE_MODEL if all(laboratory) else None
     params = GaitParams(events=EVENT_METHODS.find(method).paramset, gdi=GDI_METHODS.find(index).params)
@@ -80,7 +85,7 @@ def gait(
         given = event_files or (None,) * len(files)
         pairs = progress.track(list(zip(files, given, strict=True)), "read files", unit="trial")
         metrics = gait_metrics(
-            [read_lab_trial(path, events, method) for path, events in pairs], norm, params, model=index
+            [read_lab_trial(path, events, method, person) for path, events in pairs], norm, params, model=index
         )
     else:
         visit = visit_of_fits(files, measures=False)

@@ -18,6 +18,7 @@ from pbl_pipeline import assets, progress
 from pbl_pipeline.keypoints import Keypoints, detect_keypoints
 from pbl_pipeline.models import SsdLayout, SsdModel, box_iou, suppress
 from pbl_pipeline.prefetch import prefetched
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.tracking import PersonTrack, tiles, track_people
 from pbl_pipeline.video import VideoInfo, find_camera, probe, read_frames
 
@@ -126,7 +127,7 @@ def held(head: Head, time_s: np.ndarray, size_px: tuple[int, int], params: HeadP
     the picture, through which a head comes and goes. It grows meanwhile.
     """
     n_seen = int((head.source != NONE).sum())
-    seen_s = n_seen * float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    seen_s = n_seen * interval_of(time_s) if len(time_s) > 1 else 0.0
     hold_s = params.leave_s if head.body_px is None else params.hold_s
     params = dataclasses.replace(params, hold_s=min(hold_s, max(seen_s, params.leave_s)))
     sure = (head.source == KEYPOINTS) | (head.source == FACE)
@@ -266,7 +267,7 @@ def _sightings(video_path: str | Path, info: VideoInfo, params: HeadParams) -> l
     sizes = [tiles(info.width_px, info.height_px, f, params.face_overlap) for f in params.face_tiles]
     turns = itertools.cycle(sizes)
     found, next_s = [], -np.inf
-    slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
+    slack = 0.5 * interval_of(info.time_s) if info.n_frames > 1 else 0.0
     frames = prefetched(read_frames(video_path), _FRAMES_AHEAD)
     for frame in progress.track(frames, "faces", total=info.n_frames):
         if frame.time_s + slack < next_s and frame.index != info.n_frames - 1:

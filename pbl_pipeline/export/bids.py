@@ -15,6 +15,7 @@ from pbl_pipeline.bounded import read_text
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.angles_file import angles_table
+from pbl_pipeline.sampling import interval_of
 
 from .columns import lines, number_cells
 from .trial import ExportTrial
@@ -191,7 +192,7 @@ def _about(trial: ExportTrial, task: str, channels: Sequence[_Channel], origin: 
     counts = {f"{k}ChannelCount": kinds.count(k) for k in ("POS", "JNTANG", "LATENCY", "MISC")}
     return {
         "TaskName": task,
-        "SamplingFrequency": round(float(1.0 / np.median(step)), 6),
+        "SamplingFrequency": round(1.0 / interval_of(trial.fit.time_s), 6),
         "SamplingFrequencyEffective": round(float(1.0 / np.mean(step)), 6),
         "TrackingSystemName": TRACKSYS,
         "SoftwareVersions": origin["software"],

@@ -17,8 +17,16 @@ from .trial import EvenTrial, ExportTrial
 
 #: Labels and icon numbers of the events, as Vicon and Mokka write them.
 _EVENTS = {"foot_down": ("Foot Strike", 1), "foot_up": ("Foot Off", 2)}
-#: The frame numbers of a C3D have 16 bits.
-_LAST_FRAME = 65535
+#: The frame numbers of a C3D have 16 bits, and c3d reads no frame of a file whose last one is 65535.
+_LAST_FRAME = 65534
+#: Most values of a parameter, whose sizes have 8 bits: further ones go into LABELS2 and so on, as Vicon writes them.
+_MOST_VALUES = 255
+#: Longest name of a marker: 255 of them fill a parameter, whose length has 15 bits.
+_LONGEST_NAME = 127
+#: Bytes for events and names of markers: all parameters have 255 blocks of 512 bytes.
+_MOST_BYTES = 120_000
+#: Bytes of an event without its subject.
+_EVENT_BYTES = 43
 #: Most analog samples per frame: enough for a phone's sensors at 25 frames a second.
 _MOST_PER_FRAME = 20
 #: Longest gap between samples of a sensor that is interpolated (s).
@@ -29,7 +37,7 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     """Write points (mm), 4x4 poses of the bodies, events, and the phone's sensors if the trial has its log.
 
     The axes are those of our world: z up. A C3D has one rate: frames at uneven times are interpolated to their median
-    rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN. `check_frames` is
+    rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN. `check_c3d` is
     called before.
 
     Raises `PblError` PACKAGE_MISSING without ezc3d.
@@ -79,18 +87,34 @@ class _Parameters:
         self.low.parameter(group, made)
 
 
-def check_frames(trial: ExportTrial) -> None:
-    """Raise `PblError` EXPORT_INPUT if a C3D cannot number the trial's frames."""
-    even = trial.even
-    n, first = len(even.markers_m), even.first
-    if first < 0 or first + n > _LAST_FRAME:
-        raise PblError(
-            "EXPORT_INPUT",
-            found=f"frames {first + 1} to {first + n} at {even.rate_hz:.3g} Hz",
-            expected=f"frames 1 to {_LAST_FRAME}: a C3D counts them in 16 bits",
-            next_step="cut the recording, or export the other formats",
-            key=trial.name,
-        )
+def check_c3d(trial: ExportTrial, name: str = "") -> None:
+    """Raise `PblError` EXPORT_INPUT if frames, events or names of markers do not fit into the fields of a C3D."""
+    even, markers = trial.even, trial.fit.marker_names
+    n, first, longest = len(even.markers_m), even.first, max(map(len, markers))
+    events = 0 if trial.measured is None else len(trial.measured.events.events)
+    most = max(0, _MOST_BYTES - len(markers) * longest) // (_EVENT_BYTES + len(name))
+    for wrong, found, expected, next_step in (
+        (
+            first < 0 or first + n > _LAST_FRAME,
+            f"frames {first + 1} to {first + n} at {even.rate_hz:.3g} Hz",
+            f"frames 1 to {_LAST_FRAME}: a C3D counts them in 16 bits",
+            "cut the recording, or export the other formats",
+        ),
+        (
+            longest > _LONGEST_NAME or len(markers) * longest > _MOST_BYTES,
+            f"{len(markers)} markers with names of up to {longest} characters",
+            f"at most {_LONGEST_NAME} characters each, {_MOST_BYTES} in all: the parameters of a C3D hold no more",
+            "shorten the names in the table and fit again, or export the other formats",
+        ),
+        (
+            events > most,
+            f"{events} events",
+            f"at most {most}: the parameters of a C3D hold no more",
+            "cut the recording, or export its events with --to csv",
+        ),
+    ):
+        if wrong:
+            raise PblError("EXPORT_INPUT", found=found, expected=expected, next_step=next_step, key=trial.name)
 
 
 def _points(file: _Parameters, even: EvenTrial) -> tuple[np.ndarray, np.ndarray]:
@@ -124,19 +148,21 @@ def _events(file: _Parameters, trial: ExportTrial, name: str) -> None:
     if not found:
         file.add("EVENT", "USED", [0])
         return
-    # Minutes and seconds, from frame 1.
-    times = np.array(np.divmod([e.time_s for e in found], 60.0))
-    for key, values in (
-        ("USED", [len(found)]),
-        ("CONTEXTS", [e.side.capitalize() for e in found]),
-        ("LABELS", [_EVENTS[e.event][0] for e in found]),
-        ("DESCRIPTIONS", ["initial contact" if e.event == "foot_down" else "toe-off" for e in found]),
-        ("SUBJECTS", [name] * len(found)),
-        ("TIMES", times),
-        ("ICON_IDS", [_EVENTS[e.event][1] for e in found]),
-        ("GENERIC_FLAGS", [0] * len(found)),
-    ):
-        file.add("EVENT", key, values)
+    file.add("EVENT", "USED", [len(found)])
+    for part, start in enumerate(range(0, len(found), _MOST_VALUES), 1):
+        some, ending = found[start : start + _MOST_VALUES], str(part) if part > 1 else ""
+        # Minutes and seconds, from frame 1.
+        times = np.array(np.divmod([e.time_s for e in some], 60.0))
+        for key, values in (
+            ("CONTEXTS", [e.side.capitalize() for e in some]),
+            ("LABELS", [_EVENTS[e.event][0] for e in some]),
+            ("DESCRIPTIONS", ["initial contact" if e.event == "foot_down" else "toe-off" for e in some]),
+            ("SUBJECTS", [name] * len(some)),
+            ("TIMES", times),
+            ("ICON_IDS", [_EVENTS[e.event][1] for e in some]),
+            ("GENERIC_FLAGS", [0] * len(some)),
+        ):
+            file.add("EVENT", f"{key}{ending}", values)
     file.add("EVENT_CONTEXT", "USED", [2])
     file.add("EVENT_CONTEXT", "LABELS", ["Left", "Right"])
     file.add("EVENT_CONTEXT", "ICON_IDS", [0, 0])

@@ -14,6 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.problem import SOLES
 from pbl_pipeline.gait.ground import is_metric
 from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.sampling import interval_of
 
 from .columns import lines, number_cells
 from .osim import pelvis_rest_m
@@ -44,7 +45,7 @@ def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], titl
             axes = {"force": "v", "point": "p", "torque": ""}[what]
             names += [f"ground_{'torque' if what == 'torque' else 'force'}_{side}_{axes}{x}" for x in "xyz"]
     table = np.column_stack(columns)[known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes", ""]
+    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
     head += [f"{name}={text}" for name, text in origin.items()]
     head += ["units: N, m, Nm; ground with y up; r is the right foot, l the left", "endheader", "\t".join(names)]
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
@@ -89,7 +90,7 @@ def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: 
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes", ""]
+    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
     head += [f"{name}={text}" for name, text in origin.items()]
     head += ["units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up", "endheader"]
     head.append("\t".join(["time", *names]))
@@ -122,7 +123,7 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
         soles.append(poses.position_m[known, at] + poses.rotation[known, at] @ local)
     lowest = np.stack(soles)[..., 2].min(axis=0)
     times = np.asarray(trial.fit.time_s, float)[known]
-    size = 1 + 2 * round(0.5 * _WINDOW_S / np.median(np.diff(times))) if len(times) > 1 else 1
+    size = 1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)) if len(times) > 1 else 1
     followed = ndimage.uniform_filter1d(ndimage.median_filter(lowest, size, mode="nearest"), size, mode="nearest")
     pelvis = poses.position_m[known, poses.index("pelvis"), :2]
     path = float(np.linalg.norm(np.ptp(pelvis, axis=0)))

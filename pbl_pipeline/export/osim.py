@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import SLIDES, Y_UP_TO_Z_UP, Body, load_body
 from pbl_pipeline.kinetics import Inertia, segment_inertia
+from pbl_pipeline.sampling import interval_of
 
 from .columns import lines, number_cells
 from .trial import ExportTrial, site_positions, wanted_markers
@@ -33,14 +34,14 @@ def write_trc(trial: ExportTrial, path: Path, title: str) -> None:
     """Write the fitted markers in mm, in OpenSim's ground: x as ours, y up, z = -y of our world.
 
     Frames without a known marker are omitted, because OpenSim's inverse kinematics stops at them; a single unknown
-    marker is an empty cell. `Time` has the video's stamps, `DataRate` their median rate.
+    marker is an empty cell. `Time` has the video's stamps, `DataRate` their rate.
     """
     fit = trial.fit
     seen = np.isfinite(fit.markers_world_m).any(axis=(1, 2))
     time = np.asarray(fit.time_s, float)[seen]
     xyz = 1e3 * np.asarray(fit.markers_world_m, float)[seen] @ Y_UP_TO_Z_UP
     n, j = xyz.shape[:2]
-    rate = f"{1.0 / np.median(np.diff(time)) if n > 1 else 0.0:.6g}"
+    rate = f"{1.0 / interval_of(time) if n > 1 else 0.0:.6g}"
     numbers = range(1, j + 1)
     head = [
         f"PathFileType\t4\t(X/Y/Z)\t{title}.trc",

@@ -16,6 +16,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, TrialMetrics, trial_poses
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import TrialKinetics
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.video import PhoneLog
 from pbl_pipeline.visit import Recording, Visit
 
@@ -157,7 +158,7 @@ def _even(trial: ExportTrial) -> EvenTrial:
     if np.max(np.abs((first + np.arange(len(time))) / rate - time)) <= EVEN_WITHIN_S:
         markers = np.asarray(fit.markers_world_m, float)
         return EvenTrial(rate, first, False, markers, trial.poses.position_m, trial.poses.rotation)
-    rate = 1.0 / float(np.median(np.diff(time)))
+    rate = 1.0 / interval_of(time)
     first, last = int(np.ceil(time[0] * rate - 1e-6)), int(np.floor(time[-1] * rate + 1e-6))
     at = np.arange(first, last + 1) / rate
     poses = trial_poses(dataclasses.replace(fit, qpos=_interpolated(time, np.asarray(fit.qpos, float), at)))

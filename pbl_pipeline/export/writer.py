@@ -26,7 +26,7 @@ from pbl_pipeline.qc import Check, failed
 from pbl_pipeline.visit import Visit
 
 from .bids import Labels, bids_files, check_labels
-from .c3d import check_frames, write_c3d
+from .c3d import check_c3d, write_c3d
 from .columns import dictionary, write_csv, write_parquet
 from .ground import check_forces, on_floor, taken_off, write_forces, write_mot
 from .keypoints_csv import write_keypoints_csv
@@ -279,12 +279,12 @@ def _check_visit(
         )
     for trial in trials:
         try:
-            _check_trial(trial, formats, options.body_points)
+            _check_trial(trial, formats, options)
         except PblError as error:
             raise error.about(trial.name) from error.__cause__
 
 
-def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) -> None:
+def _check_trial(trial: ExportTrial, formats: Sequence[str], options: ExportOptions) -> None:
     fit, body = trial.fit, load_body()
     check_label("the name of a trial", trial.name, 255, least=1)
     if trial.name in (".", "..") or "/" in trial.name or "\\" in trial.name:
@@ -301,12 +301,12 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], body_points: bool) 
         raise _input("a fit without one pose", "a person in at least some frames", "look at the keypoints; fit again")
     if {"trc", "c3d"} & set(formats) and not np.isfinite(fit.markers_world_m).any():
         raise _input("a fit without one marker", "fitted markers in at least some frames", "fit again with pbl fit")
-    if "osim" in formats or ("trc" in formats and body_points):
+    if "osim" in formats or ("trc" in formats and options.body_points):
         wanted_markers(trial)
     if "forces" in formats:
         check_forces(trial)
     if "c3d" in formats:
-        check_frames(trial)
+        check_c3d(trial, options.name)
     if GAIT_FORMATS & set(formats) and trial.measured is not None:
         _check_gait(trial.measured, formats)
     if ascii_only := [f for f in formats if f in _OF_LABORATORIES]:

@@ -17,6 +17,7 @@ from .initial_pose import pelvis_path
 from .results import TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
 from .solution import Solution
+from .world_checks import WRONG_DEG
 
 #: Median 2D residual as a share of the person's height in the picture: 5 px of a 500 px person is the paper's level.
 RESIDUAL_2D_WARN, RESIDUAL_2D_FAIL = 0.02, 0.06
@@ -56,6 +57,7 @@ def check_fit(
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
+    checks += _vertical(session)
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]
     if solution.pelvis_told is not None:
@@ -248,6 +250,16 @@ def _orientation(trials: Sequence[TrialFit]) -> Check:
             "the trunk to a side is lost; pass the phone's log with --attitude"
         )
     return warn_if(sources & {LEVEL, GAIT}, "camera_orientation_known", None, None, advice)
+
+
+def _vertical(session: Session) -> list[Check]:
+    """Report trials whose vertical axis was wrong and that were turned; empty if there are none."""
+    if not session.turned:
+        return []
+    names = ", ".join(t.name for t in session.turned)
+    axes = ", ".join(sorted({t.axis for t in session.turned}))
+    advice = f"trial {names}: the body stands along {axes} of the world as read, not along z: turned by right angles"
+    return [Check("vertical_from_body", WARN, max(t.off_deg for t in session.turned), WRONG_DEG, advice)]
 
 
 def _observed(trials: Sequence[TrialFit]) -> Check:

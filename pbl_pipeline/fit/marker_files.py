@@ -37,7 +37,8 @@ class MarkerFile:
 def read_markers(path: Path, table: MarkerSet | None = None, up: str = "y") -> MarkerFile:
     """Read markers of a laboratory: `.trc` (vertical axis `up`), else the `.npz` of docs/files.md.
 
-    `table` says where the markers sit; None takes the shipped set that an `.npz` names. Markers are looked up by name.
+    `table` says where the markers sit; None takes the shipped set that an `.npz` names. Markers are looked up by name,
+    then by the other name that the set knows (`MarkerSet.also`).
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT; USAGE for a `.trc` without a table; MARKER_SET_UNKNOWN where no name is
     the set's.
@@ -55,4 +56,6 @@ def read_markers(path: Path, table: MarkerSet | None = None, up: str = "y") -> M
     else:
         seen = WorldMarkers.load(path)
     wanted = table or marker_set(seen.marker_set)
+    own = {n: wanted.also[n] for n in seen.names if wanted.also.get(n, n) not in seen.names}
+    seen = dataclasses.replace(seen, names=tuple(own.get(n, n) for n in seen.names))
     return MarkerFile(seen.select(wanted.names, wanted.name), wanted, seen.names)

@@ -23,6 +23,7 @@ from pbl_pipeline import progress
 from pbl_pipeline.body import Body, scale_multipliers
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.jax_setup import compile_seconds
+from pbl_pipeline.sampling import interval_of
 
 from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
@@ -205,7 +206,7 @@ def _on_floor(session: Session, found: Found) -> tuple[Problem, State]:
 
 def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> Float[np.ndarray, "T P"]:
     """Certainty (0 to 1) that each point of the soles stands: one half where it is just slow enough."""
-    smooth = gaussian_filter1d(x, STANDING_S / np.median(np.diff(time_s)), axis=0, mode="nearest")
+    smooth = gaussian_filter1d(x, STANDING_S / interval_of(time_s), axis=0, mode="nearest")
     speed = np.linalg.norm(np.gradient(smooth, time_s, axis=0), axis=-1)
     limit = np.maximum(STANDING_FRACTION * np.percentile(speed, 95, axis=0), STANDING_M_PER_S)
     return 1 / (1 + np.exp(np.minimum((speed / limit - 1) / 0.15, 50.0)))

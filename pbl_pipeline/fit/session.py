@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Body, MarkerSet, load_body, marker_set
+from pbl_pipeline.body import MARKER_SETS, Body, MarkerSet, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import (
     SEEN_SHARE,
@@ -27,6 +28,7 @@ from .params import CostParams, Params, ViewParams
 from .problem import CLOCK_RANGE_S, Problem, TrialArrays, pack
 from .rotations import rotation_matrices
 from .units import BODY, body_metres, check_units, pixel_px
+from .world_checks import Turned, explained, in_upright_world
 
 #: R_nc of a level camera that looks along world +x: columns are the camera's x (right), y (down), z (forward).
 LEVEL_CAMERA_R_NC = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -55,6 +57,7 @@ class Session:
     orientation: tuple[str, ...]
     problem: Problem
     metre: float = 1.0
+    turned: tuple[Turned, ...] = ()  # trials whose vertical was wrong (`world_checks`)
 
     def frames(self, i: int) -> slice:
         """Position of trial `i` in the packed frames."""
@@ -91,6 +94,9 @@ def make_session(
     if len(motions) != len(trials) or not set(motions) <= {"static", "handheld"}:
         raise _input_error(f"camera motions {', '.join(motions)}", "'static' or 'handheld' for each trial")
     checked = [check_trial(t, n, params.view, table) for t, n in zip(trials, names, strict=True)]
+    worlds = [in_upright_world(t, n, table) for t, n in zip(trials, names, strict=True) if not isinstance(t, Keypoints)]
+    trials = [w.trial for w in worlds] or trials
+    table = _measured(table) if isinstance(trials[0], WorldMarkers) else table
     arrays, orientation = [], []
     for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
         packed, source = _arrays(trial, name, motion, used, cost.pixel)
@@ -110,7 +116,15 @@ def make_session(
         orientation=tuple(orientation),
         problem=pack(arrays, body, table),
         metre=metre,
+        turned=tuple(w for w in worlds if w.axis),
     )
+
+
+@functools.cache
+def _measured(markers: MarkerSet) -> MarkerSet:
+    """Return an included set for markers in the world: its `weight_3d` is of a detector's depth, which has no part."""
+    included = markers.name in MARKER_SETS and markers is marker_set(markers.name)
+    return dataclasses.replace(markers, weight_3d=np.ones(len(markers))) if included else markers
 
 
 def check_trial(
@@ -120,7 +134,8 @@ def check_trial(
 
     Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN or PHONE_LOG if the trial cannot be fitted.
     """
-    (markers or marker_set(trial.marker_set)).check_names(trial.names)
+    table = markers or marker_set(trial.marker_set)
+    table.check_names(trial.names)
     step = np.diff(trial.time_s)
     if len(trial.time_s) < 2 or not np.all(np.isfinite(trial.time_s)) or np.any(step <= 0):
         bad = int(np.sum(~(step > 0)))
@@ -140,7 +155,10 @@ def check_trial(
     if isinstance(trial, MultiView):
         for k in trial.views:
             _check_finite(name, k.confidence, k.xy_px)
-        check_views_agree(trial, name)
+        try:
+            check_views_agree(trial, name)
+        except PblError as error:
+            raise explained(error, trial, name, table) from error
         confidence = np.max([k.confidence for k in trial.views], axis=0)
     else:
         _check_finite(name, trial.confidence, trial.xyz_world_m)
@@ -148,6 +166,7 @@ def check_trial(
     enough = np.mean(confidence > 0, axis=1) >= SEEN_SHARE
     in_view = enough & (_mean_seen(confidence) >= view.min_confidence)
     used = bridge_gaps(in_view, trial.time_s, view.max_gap_s) & ~blind_runs(enough, trial.time_s, view.max_blind_s)
+    in_upright_world(trial, name, table)  # raises
     return _long_enough(used, trial.time_s, name, view), float(np.mean(in_view))
 
 

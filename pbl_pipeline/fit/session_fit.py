@@ -19,6 +19,7 @@ from pbl_pipeline.video import Camera
 
 from .checks import check_fit
 from .known_height import in_metres
+from .lever_arms import with_open_joints
 from .many_sessions import Packed, Work
 from .methods import METHODS
 from .params import Params
@@ -147,6 +148,7 @@ def _session_fit(packed: Packed, solution: Solution, paramset: Paramset, given: 
         )
     solution, sources = upright(session, solution)
     solution, taller = in_metres(session, solution, given.height_m)
+    solution = with_open_joints(session, solution)
     seconds = packed.seconds + solution.seconds + time.perf_counter() - begin
     fits = tuple(
         _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds, given.height_m)

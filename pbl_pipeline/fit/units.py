@@ -21,6 +21,7 @@ from scipy.ndimage import median_filter
 from pbl_pipeline.body import Body, MarkerSet
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.sampling import interval_of
 
 from .params import CostParams
 from .standing import standing_markers, trunk_of
@@ -84,7 +85,7 @@ def box_side_px(view: Keypoints) -> Float[np.ndarray, " T"]:
     if not len(enough):
         return side
     low, high = _percentiles(np.ascontiguousarray(np.moveaxis(view.xy_px[enough], -1, 0)), seen[enough], BOX_PERCENT)
-    step = float(np.median(np.diff(view.time_s))) if len(view.time_s) > 1 else BOX_S
+    step = interval_of(view.time_s) if len(view.time_s) > 1 else BOX_S
     side[enough] = median_filter(np.max(high - low, axis=1), max(1, round(BOX_S / step)), mode="nearest")
     return np.where(side > 0, side, np.nan)
 

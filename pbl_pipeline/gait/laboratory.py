@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import io
-import itertools
-import math
-import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pbl_pipeline.bounded import MIB, count_rows, read_bytes
+from pbl_pipeline.bounded import MIB, read_bytes
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import EMPTY, PASS
+from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
 
 from ._angles import AngleSeries
+from .c3d_file import C3dFile
 from .events import (
-    FOOT_DOWN,
-    FOOT_UP,
-    SIDES,
     GaitEvent,
     GaitEvents,
     check_preconditions,
@@ -51,12 +46,12 @@ PLUG_IN_GAIT_POINTS: dict[str, tuple[str, int]] = {
 _FOOT_MARKERS = ("LASI", "RASI", "LHEE", "RHEE", "LTOE", "RTOE")
 #: Markers that the event model knows the legs by as well, where they are there.
 _LEG_MARKERS = ("LPSI", "RPSI", "SACR", "LKNE", "RKNE", "LANK", "RANK")
-_LABELS = {"Foot Strike": FOOT_DOWN, "Foot Off": FOOT_UP}
 _format_error = functools.partial(
     PblError,
     "FILE_FORMAT",
     next_step="export the recording with the angles of the laboratory's model, see docs/files.md",
 )
+_damaged = functools.partial(PblError, "FILE_FORMAT", next_step="export the recording again, see docs/files.md")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,20 +65,24 @@ class LabTrial:
     feet: FootTrajectories | None
 
 
-def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, method: Any = None) -> LabTrial:
+def read_lab_trial(
+    path: str | Path, events_csv: str | Path | None = None, method: Any = None, person: str | None = None
+) -> LabTrial:
     """Angles, events and feet of a C3D file (also gzipped) with the outputs of Plug-in Gait or a model of its kind.
 
     The angles are the points LHipAngles and so on (`PLUG_IN_GAIT_POINTS`). Events: those of `events_csv`
-    (`pbl events`), else the recording's labels Foot Strike and Foot Off, else found from the markers of the legs by
+    (`pbl events`), else the recording's labels (`C3dFile.events`), else found from the markers of the legs by
     `method` (`detect_events`). Whatever their source, there are none if the markers show a person who lies or walks
-    backwards, or a world whose vertical is not z. A sample that the file marks as invalid is NaN.
+    backwards, or a world whose vertical is not z. A missing sample is NaN (`C3dFile.points`). `person`: whose points
+    (their prefix) and events (their subject) are read, where the file has several persons. The check `c3d_assumptions`
+    lists what was assumed and left out.
 
-    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing), ANGLE_UNITS (not degrees), GAIT_INPUT
-    (neither labels nor foot markers; markers upside down or mirrored).
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing or there twice), ANGLE_UNITS (not
+    degrees), GAIT_INPUT (neither labels nor foot markers; markers upside down or mirrored; several persons).
     """
     path = Path(path)
     angle_points = [s + p for p, _ in PLUG_IN_GAIT_POINTS.values() for s in "LR"]
-    points, labels, time, table = _read(path, [*angle_points, *_FOOT_MARKERS, *_LEG_MARKERS])
+    points, labels, time, table = _read(path, [*angle_points, *_FOOT_MARKERS, *_LEG_MARKERS], person)
     column = {name: i for i, name in enumerate(labels)}
     missing = [p for p in angle_points if p not in column]
     if missing:
@@ -97,16 +96,20 @@ def read_lab_trial(path: str | Path, events_csv: str | Path | None = None, metho
     feet = _feet(path, points, labels, time, table) if all(m in column for m in _FOOT_MARKERS) else None
     series = AngleSeries(time, angles["L"], angles["R"], PLUG_IN_GAIT)
     name = path.name.removesuffix(".gz").removesuffix(".c3d")
-    return LabTrial(name, series, _events(path, table, feet, events_csv, method), feet)
+    events = _events(path, table, feet, events_csv, method)
+    if table.notes:
+        check = Check("c3d_assumptions", WARN, float(len(table.notes)), 0.0, f"{path.name}: {'; '.join(table.notes)}")
+        events = dataclasses.replace(events, qc=(*events.qc, check))
+    return LabTrial(name, series, events, feet)
 
 
-def read_lab_feet(path: str | Path) -> FootTrajectories:
+def read_lab_feet(path: str | Path, person: str | None = None) -> FootTrajectories:
     """Feet and legs from the markers of a C3D file (also gzipped), metres; needs neither angles nor labels.
 
-    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing).
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D), GAIT_INPUT (a foot marker is missing, several persons).
     """
     path = Path(path)
-    points, labels, time, table = _read(path, [*_FOOT_MARKERS, *_LEG_MARKERS])
+    points, labels, time, table = _read(path, [*_FOOT_MARKERS, *_LEG_MARKERS], person)
     if missing := [m for m in _FOOT_MARKERS if m not in labels]:
         raise PblError(
             "GAIT_INPUT",
@@ -118,70 +121,69 @@ def read_lab_feet(path: str | Path) -> FootTrajectories:
     return _feet(path, points, labels, time, table)
 
 
-def _feet(path: Path, points: np.ndarray, labels: list[str], time: np.ndarray, table: Any) -> FootTrajectories:
+def _feet(path: Path, points: np.ndarray, labels: list[str], time: np.ndarray, table: C3dFile) -> FootTrajectories:
     there = [*_FOOT_MARKERS, *(m for m in _LEG_MARKERS if m in labels)]
     xyz = points[:, [labels.index(m) for m in there]] * _metres(table, path)
     return feet_from_markers(time, there, "plug_in_gait", xyz)
 
 
-def _read(path: Path, wanted: Collection[str]) -> tuple[np.ndarray, list[str], np.ndarray, Any]:
-    """Those of the `wanted` points that are there (T, P, 3), their names, time stamps (T,) in s from frame 1, and the
-    reader with the parameters."""
-    import c3d
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Make any error of a damaged or ambiguous file one of this path."""
+    try:
+        yield
+    except PblError:
+        raise
+    except Exception as error:  # packages raise anything for a damaged file
+        found = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+        raise _damaged(found, "a C3D file whose parts agree", key=path) from error
 
+
+def _read(
+    path: Path, wanted: Collection[str], person: str | None = None
+) -> tuple[np.ndarray, list[str], np.ndarray, C3dFile]:
+    """Those of the `wanted` points of `person` that are there (T, P, 3), their names without prefix, time stamps (T,)
+    in s from frame 1, and the file."""
     if not path.is_file():
         raise PblError(
             "FILE_MISSING", found="no such file", expected="a C3D file", next_step="check the path", key=str(path)
         )
-    try:
-        data = read_bytes(path, _LARGEST)
-        reader = c3d.Reader(io.BytesIO(data))
-        names: list[str] = []
-        # A parameter holds 255 names at most.
-        for key in ("POINT:LABELS", "POINT:LABELS2", "POINT:LABELS3"):
-            if (values := reader.get(key)) is not None:
-                names += [str(s).strip() for s in np.ravel(values.string_array)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without analog channels
-            column = {name: i for i, name in enumerate(names[: reader.point_used]) if name in wanted}
-            frames = _frames(reader, len(data))
-            rows = np.full((frames, len(column), 4), np.nan, np.float32)
-            kept = list(column.values())
-            read = reader.read_frames(copy=False)
-            got = 0
-            for got, (_, points, _) in enumerate(itertools.islice(read, frames), 1):
-                rows[got - 1] = points[kept, :4]
-            rows = rows[:got].astype(float)
-        rate = float(reader.point_rate)
-    except Exception as error:  # the package raises anything for a damaged file
-        raise _format_error(f"{type(error).__name__}: {error}", "a C3D file", key=path) from error
-    if not len(rows) or not 0 < rate < math.inf:
-        raise _format_error("no frames", "points over time", key=path)
-    xyz = np.where(rows[..., 3:4] < 0, np.nan, rows[..., :3])
-    return xyz, list(column), (reader.first_frame - 1 + np.arange(len(xyz))) / rate, reader
+    with _reading(path):
+        file = C3dFile(read_bytes(path, _LARGEST))
+        parts = [(i, *label.rpartition(":")) for i, label in enumerate(file.labels)]
+        there = [(prefix, name, i) for i, prefix, _, name in parts if name in wanted]
+        prefixes = _distinct(prefix for prefix, _, _ in there)
+        known = prefixes or _distinct([*file.texts("SUBJECTS:NAMES"), *file.texts("EVENT:SUBJECTS")])
+        if (len(prefixes) > 1) if person is None else (_key(person) not in known):
+            raise _several_persons(known, "points" if prefixes else "events", path)
+        kept = [p for p in there if not p[0] or person is None or _key(p[0]) == _key(person)]
+        names = [name for _, name, _ in kept]
+        if twice := [n for n in dict.fromkeys(names) if names.count(n) > 1]:
+            found, advice = (
+                f"more than one point named {', '.join(twice)}",
+                "rename or remove all but one, and export again",
+            )
+            raise PblError("FILE_FORMAT", found, "each point once", advice, key=path)
+        xyz = file.points([i for _, _, i in kept])
+    if not len(xyz):
+        raise _damaged("no frames", "points over time", key=path)
+    file.person = person or next(iter(prefixes.values()), "")
+    return xyz, names, (file.first_frame - 1 + np.arange(len(xyz))) / file.rate_hz, file
 
 
-def _frames(reader: Any, n_bytes: int) -> int:
-    """Number of frames to read: those that the header counts, as far as the file has them."""
-    words = 4 * int(reader.point_used) + int(reader.analog_used) * reader.analog_per_frame
-    if reader.point_used < 1 or reader.analog_per_frame < 0:
-        raise ValueError("no points")
-    frames = min(reader.frame_count, n_bytes // (words * (4 if reader.point_scale < 0 else 2)))
-    count_rows(frames)
-    return max(frames, 0)
-
-
-def _metres(reader: Any, path: Path) -> float:
-    unit = reader.get("POINT:UNITS")
-    text = str(np.ravel(unit.string_array)[0]).strip().lower() if unit is not None else "mm"
+def _metres(file: C3dFile, path: Path) -> float:
+    with _reading(path):
+        text = next(iter(file.texts("POINT:UNITS")), "").lower()
+    if not text:
+        file.notes.append("no unit of points: mm is assumed")
     factors = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-    if text not in factors:
+    if (text or "mm") not in factors:
         raise _format_error(f"points in {text!r}", "mm, cm or m", key=path)
-    return factors[text]
+    return factors[text or "mm"]
 
 
 def _events(
-    path: Path, reader: Any, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
+    path: Path, file: C3dFile, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
 ) -> GaitEvents:
     if feet is not None:
         try:
@@ -192,26 +194,60 @@ def _events(
             return no_events("none", "", feet.source, reason, advice)
     if events_csv is not None:
         return _given(load_events(events_csv), "given", Path(events_csv).name)
-    table = reader.get("EVENT")
-    if table is not None and table.get("LABELS") is not None and table.get("TIMES") is not None:
-        found = []
-        words = (np.ravel(table.get(k).string_array) for k in ("CONTEXTS", "LABELS"))
-        for context, label, time in zip(*words, table.get("TIMES").float_array, strict=False):
-            side, event = str(context).strip().lower(), _LABELS.get(str(label).strip())
-            if side in SIDES and event:
-                # Minutes and seconds.
-                found.append(GaitEvent(float(time[0] * 60 + time[1]), side, event, 1.0))
-        if found:
-            return _given(tuple(sorted(found, key=lambda e: e.time_s)), "labels", "labels of the recording")
+    with _reading(path):
+        labelled = file.events()
+    found = sorted(_of_person(path, file, labelled), key=lambda e: e.time_s)
+    frames = [e.time_s * file.rate_hz + 1 - file.first_frame for e in found]
+    if outside := sum(not -1 <= frame <= file.n_frames for frame in frames):
+        file.notes.append(f"{outside} of {len(found)} events are outside of the recording, whose frame 1 is at 0 s")
+    if found:
+        return _given(tuple(found), "labels", "labels of the recording")
     if feet is None:
         raise PblError(
             "GAIT_INPUT",
             found="neither event labels nor the markers " + ", ".join(_FOOT_MARKERS),
-            expected="labels Foot Strike and Foot Off, or foot markers",
+            expected="labels Foot Strike and Foot Off with their sides, or foot markers",
             next_step="pass events with --events",
             key=str(path),
         )
+    if labelled or file.texts("EVENT:LABELS"):
+        file.notes.append("no event label is used: events are found from the markers")
     return detect_events(feet, method)
+
+
+def _of_person(path: Path, file: C3dFile, events: list[tuple[str, GaitEvent]]) -> list[GaitEvent]:
+    """The events of the person whose points were read. A single subject that names no one else is that person."""
+    subjects = _distinct(subject for subject, _ in events)
+    named = _distinct(file.texts("SUBJECTS:NAMES"))
+    person = _key(file.person) or (next(iter(named)) if len(named) == 1 else "")
+    persons = {person, *named, *_distinct(label.rpartition(":")[0] for label in file.labels)}
+    if not person or not subjects.keys() & persons:
+        if len(subjects) > 1:
+            raise _several_persons(subjects, "events", path)
+        return [event for _, event in events]
+    if others := [name for key, name in subjects.items() if key != person]:
+        file.notes.append(f"events of other persons are left out: {', '.join(others)}")
+    return [event for subject, event in events if _key(subject) in (person, "")]
+
+
+def _key(name: str) -> str:
+    """The name of a person without case."""
+    return name.strip().casefold()
+
+
+def _distinct(names: Iterable[str]) -> dict[str, str]:
+    """The names that differ by more than case, by their key."""
+    return {_key(name): name.strip() for name in names if _key(name)}
+
+
+def _several_persons(names: dict[str, str], what: str, path: Path) -> PblError:
+    return PblError(
+        "GAIT_INPUT",
+        found=f"{what} of {', '.join(names.values()) or 'no named person'}",
+        expected="one person, whose points and events can be told",
+        next_step="name the person with --person",
+        key=path,
+    )
 
 
 def _given(events: tuple[GaitEvent, ...], method: str, source: str) -> GaitEvents:

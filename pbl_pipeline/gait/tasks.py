@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pbl_pipeline import words
 from pbl_pipeline.qc import Check, failed
+from pbl_pipeline.sampling import interval_of
 
 from .cycle_measures import MEASURES, Measure, measure_of
 from .motion import BodyPoses, trial_poses
@@ -282,7 +283,7 @@ def _smooth(time_s: np.ndarray, values: np.ndarray, sd_s: float) -> np.ndarray:
     if len(seen) < 2:
         return values
     filled = np.interp(time_s, time_s[seen], values[seen])
-    smooth = gaussian_filter1d(filled, sd_s / float(np.median(np.diff(time_s))), mode="nearest")
+    smooth = gaussian_filter1d(filled, sd_s / interval_of(time_s), mode="nearest")
     after = np.clip(np.searchsorted(time_s[seen], time_s), 0, len(seen) - 1)
     gap = time_s[seen][after] - time_s[seen][np.maximum(after - 1, 0)]
     inside = (time_s >= time_s[seen[0]]) & (time_s <= time_s[seen[-1]])

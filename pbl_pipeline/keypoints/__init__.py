@@ -9,6 +9,7 @@ from .in_view import (
     blind_runs,
     bridge_gaps,
     longest_run_s,
+    unoriented_frames,
     visibility,
     whole_person_in_view,
 )

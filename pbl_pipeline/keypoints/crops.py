@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pbl_pipeline.sampling import interval_of
+
 from .protocol import KeypointParams
 from .types import PersonKeypoints
 
@@ -74,7 +76,7 @@ def first_pass_rows(rows: np.ndarray, time_s: np.ndarray, interval_s: float) -> 
     if interval_s <= 0 or len(rows) < 2:
         return rows
     time = time_s[rows]
-    slack = 0.5 * float(np.median(np.diff(time)))
+    slack = 0.5 * interval_of(time)
     breaks = np.diff(time) > interval_s + slack
     ends = np.concatenate([[True], breaks]) | np.concatenate([breaks, [True]])
     keep, next_s = [], -np.inf

@@ -18,6 +18,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.resources import cores
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.tracking import Tracking, time_in_view_s
 from pbl_pipeline.video import Camera, Frame, read_frames
 
@@ -138,8 +139,8 @@ def _detect_all(
 
 
 def _close(time_s: np.ndarray, most_s: float) -> bool:
-    """True if the median interval of these frames is at most `most_s`."""
-    return len(time_s) > 1 and float(np.median(np.diff(time_s))) <= most_s
+    """True if the interval of these frames is at most `most_s`."""
+    return len(time_s) > 1 and interval_of(time_s) <= most_s
 
 
 def _in_view(video_path: str | Path, rows: np.ndarray) -> Iterator[Frame]:

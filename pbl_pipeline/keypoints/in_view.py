@@ -11,6 +11,7 @@ import numpy as np
 
 from pbl_pipeline.runs import runs
 from pbl_pipeline.tracking import step_s
+from pbl_pipeline.video import unknown_at
 
 from .types import Keypoints
 
@@ -44,13 +45,14 @@ class Visibility:
     time_s: np.ndarray  # (T,)
     seen: np.ndarray  # (T,) bool most points of the person were found
     whole: np.ndarray  # (T,) bool the whole person is in view (`whole_person_in_view`)
-    counts: np.ndarray  # (T,) bool used by a fit: whole, or in a bridged gap
+    counts: np.ndarray  # (T,) bool used by a fit: whole, or in a bridged gap; orientation of the phone known
+    unoriented: np.ndarray  # (T,) bool in a hole of the phone's log
 
     @property
     def gaps(self) -> tuple[Gap, ...]:
-        """Gaps between the first and the last frame with the whole person."""
+        """Gaps between the first and the last frame with the whole person, also those of the phone's orientation."""
         time, counts = self.time_s, self.counts
-        around = _around_gaps(self.whole)
+        around = _around_gaps(self.whole & ~self.unoriented)
         return tuple(Gap(float(time[a]), float(time[b]), bool(counts[a : b + 1].all())) for a, b in around)
 
     @property
@@ -100,7 +102,16 @@ def visibility(
     whole = whole_person_in_view(keypoints, min_confidence)
     seen = np.mean(keypoints.confidence > 0, axis=1) >= SEEN_SHARE
     counts = bridge_gaps(whole, time, max_gap_s) & ~blind_runs(seen, time, max_blind_s)
-    return Visibility(time, seen, whole, counts)
+    unoriented = unoriented_frames(keypoints)
+    return Visibility(time, seen, whole, counts & ~unoriented, unoriented)
+
+
+def unoriented_frames(keypoints: Keypoints) -> np.ndarray:
+    """(T,) bool: frames in a hole of the phone's log that is too long to interpolate (`video.unknown_at`)."""
+    time = np.asarray(keypoints.time_s, float)
+    if keypoints.phone_time_s is None or keypoints.phone_quat_wxyz is None:
+        return np.zeros(len(time), bool)
+    return unknown_at(time, keypoints.phone_time_s, keypoints.phone_quat_wxyz)
 
 
 def whole_person_in_view(keypoints: Keypoints, min_confidence: float) -> np.ndarray:

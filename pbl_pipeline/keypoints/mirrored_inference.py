@@ -16,6 +16,8 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import expit
 
+from pbl_pipeline.sampling import interval_of
+
 from .flips import leg_points, mirror_of
 from .types import PersonKeypoints
 
@@ -127,7 +129,7 @@ class MirroredInference:
         stated = np.array([(p.confidence + m.confidence) / 2 for p, m in pairs])
         confidence = np.clip(stated, 0.0, 1.0) * agree * np.where(crossed, UNDECIDED, 1.0)
         weight = both[:, None, None] * np.maximum(agree, _LEAST_WEIGHT)[..., None]
-        sd_frames = _SMOOTH_S / float(np.median(np.diff(time_s)))
+        sd_frames = _SMOOTH_S / interval_of(time_s)
 
         def half(name: str) -> np.ndarray:
             apart = np.array([getattr(m, name) - getattr(p, name) for p, m in pairs]) / 2

@@ -153,6 +153,11 @@ def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
     rays, each weighted with its confidence (Hartley & Zisserman 2004, chapter 12; the midpoint method for two views).
     If two cameras of one height see two different people, only the heights of the points differ.
     """
+    return meeting_points(trial)[0]
+
+
+def meeting_points(trial: MultiView) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, "T J 3"]]:
+    """`ray_miss_m`, and the triangulated points (m), NaN where fewer than two cameras see one."""
     origin = np.stack([p.p_nc for p in trial.poses])
     seen = np.stack([v.confidence > 0 for v in trial.views], axis=2)  # (T, J, V)
     weight = np.where(seen, np.stack([v.confidence for v in trial.views], axis=2), 0.0)
@@ -172,7 +177,8 @@ def ray_miss_m(trial: MultiView) -> Float[np.ndarray, " V"]:
     n = counted.sum(axis=1)  # (T, V)
     mean = np.where(counted, miss, 0.0).sum(axis=1) / np.maximum(n, 1)
     compared = n >= _COMPARED_SHARE * len(trial.names)
-    return np.array([np.median(mean[c, i]) if (c := compared[:, i]).any() else np.nan for i in range(n.shape[1])])
+    misses = [np.median(mean[c, i]) if (c := compared[:, i]).any() else np.nan for i in range(n.shape[1])]
+    return np.array(misses), np.where(twice[..., None], place, np.nan)
 
 
 def check_views_agree(trial: MultiView, name: str) -> float:

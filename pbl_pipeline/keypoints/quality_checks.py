@@ -25,6 +25,7 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, FAIL, PASS, WARN, Check
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.tracking import step_s
 
@@ -220,7 +221,7 @@ def _picture(keypoints: Keypoints) -> list[Check | None]:
 
 
 def _rate(time_s: np.ndarray) -> Check | None:
-    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    interval_s = interval_of(time_s) if len(time_s) > 1 else 0.0
     return _limit_check("frame_rate_hz", 1.0 / interval_s) if interval_s > 0 else None
 
 

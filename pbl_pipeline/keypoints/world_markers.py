@@ -19,7 +19,11 @@ from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
 
+_SPELLED = ("er", "ers", "re", "res")
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_METRES |= {f"{p}met{end}": _METRES[u] for p, u in (("milli", "mm"), ("centi", "cm"), ("", "m")) for end in _SPELLED}
+#: Largest relative difference between `DataRate` and the times, which some programs round to milliseconds.
+_SAME_RATE = 0.05
 _HEADER_LINES = 5
 #: Spread of the markers of a frame beyond that of a room, or below that of a body: the stated unit is wrong.
 _WIDEST_M, _NARROWEST_M = 50.0, 0.01
@@ -45,8 +49,9 @@ def read_trc(path: str | Path) -> Trc:
     """Read a TRC file.
 
     Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: not a TRC, other numbers of frames or markers than in its
-    header, a row with too few or too many cells, a cell that is not a finite number, times that do not increase, a unit
-    other than mm, cm, m, or one by which the markers lie further apart than 50 m or closer than 1 cm.
+    header, a row with too few or too many cells, a cell that is not a finite number, times that do not increase or
+    contradict DataRate, a unit other than mm, cm, m, or one by which the markers lie further apart than 50 m or closer
+    than 1 cm.
     """
     with os_errors_as("FILE_MISSING", "a TRC file", "check the path, and that you may read the file", path):
         try:
@@ -75,6 +80,7 @@ def read_trc(path: str | Path) -> Trc:
         raise _damaged("times that are missing, repeat or run backwards", "strictly increasing seconds", key=path)
     xyz[np.all(xyz == 0, axis=2)] = np.nan
     _check_unit(path, xyz, header["Units"])
+    _check_rate(path, time_s, header.get("DataRate", ""))
     return Trc(time_s, names, xyz)
 
 
@@ -112,6 +118,24 @@ def _check_unit(path: str | Path, xyz_m: np.ndarray, unit: str) -> None:
     if not _NARROWEST_M < size < _WIDEST_M:
         raise _damaged(
             f"markers that lie {size:.3g} m apart if Units {unit} is right", "the unit the numbers are in", key=path
+        )
+
+
+def _check_rate(path: str | Path, time_s: np.ndarray, stated: str) -> None:
+    try:
+        rate = float(stated)
+    except ValueError:
+        return
+    if len(time_s) < 2 or not np.isfinite(rate) or rate <= 0:
+        return
+    step = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
+    ratio = rate * min(step, float(np.median(np.diff(time_s))), key=lambda s: abs(rate * s - 1))
+    if abs(ratio - 1) > _SAME_RATE:
+        guess = {1000: ": milliseconds", round(rate): ": frame numbers"}.get(round(ratio), "")
+        raise _damaged(
+            f"DataRate {stated}, but frames {step:.4g} s apart by the column Time{guess}",
+            f"times in seconds, {1 / rate:.4g} s apart",
+            key=path,
         )
 
 

@@ -16,6 +16,7 @@ from pbl_pipeline.gait import GaitEvent
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
 from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
 
 from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
@@ -227,7 +228,7 @@ def _noise(fit: TrialFit, params: KineticsParams) -> list[np.ndarray]:
     slides = np.isin(fit.joint_names, PLACE)
     sd = np.nan_to_num(sd) * np.sqrt(np.where(slides, params.varying_slides, params.varying_turns))
     rng = np.random.default_rng(39)
-    width = params.memory_s / max(float(np.median(np.diff(fit.time_s))), 1e-3)
+    width = params.memory_s / max(interval_of(fit.time_s), 1e-3)
     gain = np.sqrt(2.0 * np.sqrt(np.pi) * width)
     drawn = (rng.standard_normal(sd.shape) for _ in range(params.samples))
     return [gain * sd * gaussian_filter1d(white, width, axis=0, mode="wrap") for white in drawn]

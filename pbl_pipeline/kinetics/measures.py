@@ -8,6 +8,7 @@ import numpy as np
 
 from pbl_pipeline.gait import REPORT_PERCENT, GaitCycle
 from pbl_pipeline.gait.events import LEFT
+from pbl_pipeline.sampling import interval_of
 
 from .joints import MOMENTS
 from .types import CURVES, MEASURES, Series
@@ -43,7 +44,7 @@ def _curves(series: Series, cycle: GaitCycle) -> np.ndarray:
     legs = np.hstack([series.moment_nm_per_kg[:, k], series.power_w_per_kg[:, k][:, [_HIP, _KNEE, _ANKLE]]])
     table = np.hstack([_sided(series, k), legs])
     at = cycle.start_s + REPORT_PERCENT / 100.0 * (cycle.end_s - cycle.start_s)
-    step = 1.5 * float(np.median(np.diff(series.time_s)))
+    step = 1.5 * interval_of(series.time_s)
     inside = slice(*np.searchsorted(series.time_s, [at[0] - step, at[-1] + step]))
     time = series.time_s[inside]
     if len(time) < _MIN_FRAMES or time[0] > at[0] + step or time[-1] < at[-1] - step or np.diff(time).max() > step:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +52,9 @@ class OnnxModel:
             self._session = onnxruntime.InferenceSession(data, options, providers=providers)
         except Exception as error:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
-                raise unavailable(_first_line(error)) from error
+                raise unavailable(_reason(error)) from error
             raise model_invalid(
-                _first_line(error), "a graph that the installed onnxruntime loads", key=self._path
+                _reason(error), "a graph that the installed onnxruntime loads", key=self._path
             ) from error
         self.device = device_of(self._session.get_providers())
         self.note = ""
@@ -68,7 +69,7 @@ class OnnxModel:
             got = self(black)
         except Exception as error:
             raise model_invalid(
-                f"it does not run: {_first_line(error)}", "a graph that computes", key=self._path
+                f"it does not run: {_reason(error)}", "a graph that computes", key=self._path
             ) from error
         self._check_shapes(got)
 
@@ -176,5 +177,11 @@ def check_graph_file(folder: str | Path, spec: ModelSpec) -> bytes:
     return data
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
+#: Place in the source of onnxruntime, with the function's types, before its reason.
+_PLACE = re.compile(r"/\S+:\d+ .*?\) (?=[A-Z])")
+
+
+def _reason(error: Exception) -> str:
+    """Return an error of onnxruntime in one line of bounded length. Its reason is at the end."""
+    text = _PLACE.sub("", " ".join(str(error).split()), count=1) or type(error).__name__
+    return text if len(text) <= 500 else f"... {text[-500:]}"

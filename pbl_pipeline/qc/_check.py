@@ -66,6 +66,7 @@ ORDER = (
     "body_height_stated",
     "camera_intrinsics_measured",
     "camera_orientation_known",
+    "vertical_from_body",
     "facing_without_3d_deg",
     "keypoints_fields_assumed",
     "joints_not_observed",

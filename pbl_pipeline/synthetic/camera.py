@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.video import Camera
 
 from .plan import GRID_STEP_S, Plan, wander, within
@@ -189,7 +190,7 @@ def orientation(
         fixed = camera_turn(np.zeros(1), np.zeros(1), np.zeros(1))[0]
         return lambda t: np.tile(fixed, (len(t), 1, 1))
     azimuth = np.unwrap(np.arctan2(pelvis_m[:, 1], pelvis_m[:, 0]))
-    spline = CubicSpline(time_s, gaussian_filter1d(azimuth, 0.5 / np.median(np.diff(time_s)), mode="nearest"))
+    spline = CubicSpline(time_s, gaussian_filter1d(azimuth, 0.5 / interval_of(time_s), mode="nearest"))
 
     def gimbal(t: np.ndarray) -> np.ndarray:
         yaw = spline(np.clip(t, time_s[0], time_s[-1]))

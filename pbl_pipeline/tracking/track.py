@@ -15,6 +15,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
 from .appearance import with_appearance
@@ -87,7 +88,7 @@ def _check_upright(persons: Sequence[PersonTrack], video_path: str | Path) -> No
 def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDetector, info: VideoInfo) -> list[Trail]:
     """Return all trails of one pass over the frames, including false ones."""
     associator = Associator(params.association)
-    slack = 0.5 * float(np.median(np.diff(info.time_s))) if info.n_frames > 1 else 0.0
+    slack = 0.5 * interval_of(info.time_s) if info.n_frames > 1 else 0.0
     watch = Watch((info.width_px, info.height_px), params.watch, slack)
     # The frames of the last searches, to follow new people backwards: as long as a turn of all windows takes.
     kept: deque[tuple[int, float, Scene]] = deque(maxlen=watch.n_turn)

@@ -155,6 +155,7 @@ class Reference:
     #: are not known are absent; NaN where a joint is not known at that time.
     angles_deg: Mapping[str, np.ndarray]
     pelvis_m: np.ndarray | None = None  # (T, 3) origin of the pelvis in the reference's own z-up world, or None
+    notes: tuple[str, ...] = ()  # what a reader found out about the file's signs; not saved
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time_s, float)

@@ -1,6 +1,6 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
-from .attitude import Attitude, camera_in_device, check_attitude
+from .attitude import Attitude, camera_in_device, check_attitude, unknown_at
 from .boards import Board
 from .calibrate import Calibration, calibrate_video, draw_calibration
 from .camera import (

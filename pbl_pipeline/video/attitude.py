@@ -31,6 +31,9 @@ _SHORTEST_NORM = 1e-3
 _MOST_ROLL_DEG = 60.0
 #: Closer to the vertical than this, a viewing direction has no roll to judge.
 _VERTICAL_DEG = 30.0
+#: Longest time (s) between samples over which the orientation is interpolated, and largest turn (deg) about the mean of
+#: a phone that stands still.
+MAX_HOLE_S, _STILL_DEG = 0.3, 0.5
 log_error = functools.partial(
     PblError, "PHONE_LOG", next_step="see docs/phone_capture.md; without --attitude the camera is taken as still"
 )
@@ -89,6 +92,19 @@ def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tup
     turned = np.cumsum(np.sum(quat[1:] * quat[:-1], axis=1) < 0) % 2 == 1
     quat[1:][turned] *= -1
     return time, quat
+
+
+def unknown_at(at_s: np.ndarray, time_s: np.ndarray, quat_wxyz: np.ndarray) -> np.ndarray:
+    """(T,) bool: times inside a hole of a log (P,), (P, 4) longer than `MAX_HOLE_S`; none of a phone that stood still.
+
+    A hand's tremor and a pan turn the phone on the way between two samples.
+    """
+    wide = np.flatnonzero(np.diff(time_s) > MAX_HOLE_S)
+    turns = Rotation.from_quat(quat_wxyz, scalar_first=True)
+    if not len(wide) or np.degrees((turns.mean().inv() * turns).magnitude().max()) < _STILL_DEG:
+        return np.zeros(np.shape(at_s), bool)
+    after = np.searchsorted(time_s, at_s)  # at a sample it is known
+    return np.isin(after - 1, wide) & (np.take(time_s, after, mode="clip") != at_s)
 
 
 def camera_in_device(rotation_deg: float = 0.0) -> Rotation:

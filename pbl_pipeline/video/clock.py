@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 
-from .attitude import DEVICE, Attitude, camera_in_device, check_roll, held_deg, log_error
+from .attitude import DEVICE, MAX_HOLE_S, Attitude, camera_in_device, check_roll, held_deg, log_error, unknown_at
 from .frames import read_frames
 from .phone_log import PICTURES_CLOCK, UTC_CLOCK, VIDEO_CLOCK, PhoneLog
 from .sensor_logger import read_phone_log
@@ -210,7 +210,7 @@ def match_pictures(
 
     def correlation(shift: float) -> float:
         t = at - shift
-        inside = (t[:-1] >= grid[0]) & (t[1:] <= grid[-1])
+        inside = (t[:-1] >= grid[0]) & (t[1:] <= grid[-1]) & ~unknown_at(t, time_s, quat_wxyz)[1:]
         if inside.sum() < max(10, 0.5 * len(inside)):
             return -1.0
         place = np.stack([np.interp(t, grid, path[:, k]) for k in (0, 1)], axis=1)
@@ -299,4 +299,7 @@ def attitude_of(log: PhoneLog, path: Path, video: VideoInfo | None = None) -> At
     check_roll(path, quat, log.frame)
     clock = Aligned(0.0, "") if video is None else align_clock(log, np.asarray(quat), video, path)
     source = f"{path.name} ({log.form})" + (f": {clock.how}" if clock.how else "")
+    hole = float(np.diff(log.time_s).max())
+    if hole > MAX_HOLE_S and not _still(quat):
+        source += f"; without samples for up to {hole:.1f} s, where the orientation is unknown"
     return Attitude(log.time_s + clock.shift_s, quat, source, clock.sd_s)

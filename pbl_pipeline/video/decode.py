@@ -27,6 +27,8 @@ from .container_tags import family, missing_end, photo_format
 #: Containers that phones, cameras and converters write. Pictures, texts and playlists (which could name other files)
 #: are not videos even where FFmpeg would open them.
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
+#: FFmpeg's names of the containers whose length counts from 0, wherever the first stamp is: fragments of MP4, Matroska.
+_FROM_ZERO = ("mov", "matroska")
 #: Errors that reading a file can raise. Memory: a header with wrong sizes asks for more than there is.
 FFMPEG_ERRORS = (FFmpegError, MemoryError)
 #: Largest decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 reference pictures, and one for
@@ -277,6 +279,8 @@ class Decoder:
         if not self.n_announced and self.container.duration is not None:
             # Only without an announced count: the length may be rounded, or that of another stream.
             start_s = (self.container.start_time or 0) / av.time_base
+            if self.container.format.name.startswith(_FROM_ZERO):
+                start_s = min(start_s, 0.0)
             missing_s = self.container.duration / av.time_base - (self._end_s - start_s)
             if missing_s > 0.5:
                 return f"the container announces {missing_s:.2f} s more"

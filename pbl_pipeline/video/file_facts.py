@@ -2,8 +2,8 @@
 
 Slow motion is stored in two ways. The phone's original has stamps of real time and some hundred frames a second. An
 exported or edited copy plays 30 of these frames a second, so every duration comes out too long. Android states the
-original rate (`com.android.capture.fps`); an edit list may (its speed, which no decoder applies); in a copy that an
-iPhone exported nothing shows it.
+rate to which the camera was set (`com.android.capture.fps`), also of a time lapse and in low light; an edit list may
+state a speed, which no decoder applies; in a copy that an iPhone exported nothing shows it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import datetime
 import math
 import re
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
-from pbl_pipeline.qc import FAIL, PASS, Check
+from pbl_pipeline.qc import FAIL, PASS, WARN, Check
 from pbl_pipeline.runs import runs
+from pbl_pipeline.sampling import interval_of
 
 from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
@@ -32,8 +34,13 @@ from .frames import Orientation, orientation_of
 from .kept import keeping
 from .types import FirstPicture, VideoInfo
 
-#: A recorded rate that lies above the stored one by less than this fraction is rounding or a dropped frame.
+#: A recorded rate that differs from the stored one by less than this factor is rounding or a dropped frame.
 _MOST_RATIO = 1.1
+#: Slow motion is recorded at more than 60 frames a second and plays at half the speed or less. A phone that lowers its
+#: rate in low light states the one that it was set to (30 of 24): below this factor its stamps are real time.
+_LEAST_SLOW_RATIO, _LEAST_SLOW_FPS = 1.5, 60.0
+#: Time lapses are recorded at 15 frames a second or less.
+_MOST_LAPSE_FPS = 15.0
 #: From this many frames a second on, a phone calls it slow motion.
 _SLOW_MOTION_FPS = 100.0
 
@@ -41,12 +48,14 @@ _SLOW_MOTION_FPS = 100.0
 def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) -> list[str]:
     """Notes on the playing speed of a video of `fps` frames a second; `speeds` are those of its edit list."""
     notes = []
-    ratio = stretch(fps, capture_fps)
-    if ratio > _MOST_RATIO:
-        notes.append(
-            f"recorded at {capture_fps:g} and stored at {fps:.4g} frames a second: its time runs {ratio:.2g} times "
-            "too slow, and so does all that is computed from it"
-        )
+    ratio, known = stretch(fps, capture_fps)
+    rates = f"recorded at {capture_fps or 0:g} and stored at {fps:.4g} frames a second"
+    if not known:
+        notes.append(f"{rates}, as its phone states: whether its time is real cannot be told from the stamps")
+    elif ratio > 1:
+        notes.append(f"{rates}: its time runs {ratio:.2g} times too slow, and so does all that is computed from it")
+    elif ratio < 1:
+        notes.append(f"{rates} (time lapse): its time runs {1 / ratio:.2g} times too fast, and so does all of it")
     elif fps >= _SLOW_MOTION_FPS:
         notes.append(f"slow motion of {fps:.4g} frames a second; the stamps are taken as real time")
     odd = sorted({s for s in speeds if s not in (0.0, 1.0)})
@@ -56,23 +65,34 @@ def speed_notes(fps: float, capture_fps: float | None, speeds: Sequence[float]) 
     return notes
 
 
-def stretch(fps: float, capture_fps: float | None) -> float:
-    """Factor by which the stamps lengthen the movement; 1 if not known."""
+def stretch(fps: float, capture_fps: float | None) -> tuple[float, bool]:
+    """Factor by which the stamps lengthen the movement, 1 for real time, and False if it cannot be told whether they
+    do: then the factor if they did."""
     if capture_fps is None or not math.isfinite(fps) or fps <= 0:
-        return 1.0
-    return max(1.0, capture_fps / fps)
+        return 1.0, True
+    ratio = capture_fps / fps
+    if 1 / _MOST_RATIO <= ratio <= _LEAST_SLOW_RATIO:
+        return 1.0, True
+    if ratio > 1:
+        return ratio, capture_fps > _LEAST_SLOW_FPS
+    return ratio, capture_fps <= _MOST_LAPSE_FPS and ratio < 1 / _LEAST_SLOW_RATIO
 
 
 def check_timing(video: VideoInfo) -> tuple[Check, ...]:
     """Check `time_stretch` of a video whose phone states the rate of recording; no check of others."""
     if video.capture_fps is None:
         return ()
-    ratio = stretch(video.fps, video.capture_fps)
-    if ratio <= _MOST_RATIO:
+    ratio, known = stretch(video.fps, video.capture_fps)
+    rates = f"recorded at {video.capture_fps:g} and stored at {video.fps:.4g} frames a second"
+    if ratio == 1.0:
         return (Check("time_stretch", PASS, ratio, _MOST_RATIO),)
+    if not known:
+        advice = f"{rates}: slow motion, a time lapse and a rate lowered in low light cannot be told apart here"
+        return (Check("time_stretch", WARN, ratio, _MOST_RATIO, f"{advice}; compare the cadence with the person's"),)
+    what = "slow motion" if ratio > 1 else "time lapse"
     advice = (
-        f"slow motion: recorded at {video.capture_fps:g} and stored at {video.fps:.4g} frames a second, so every time, "
-        "cadence and speed is wrong; copy the original from the phone, or film at normal speed"
+        f"{what}: {rates}, so every time, cadence and speed is wrong; copy the original from the phone, or film at "
+        "normal speed"
     )
     return (Check("time_stretch", FAIL, ratio, _MOST_RATIO, advice),)
 
@@ -226,7 +246,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     counts may differ. The frames and stamps are those of `read_frames`. Memory does not grow with the length.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY, VIDEO_NOT_A_VIDEO, VIDEO_TOO_LARGE, VIDEO_NO_FRAMES, VIDEO_TRUNCATED,
-    VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN.
+    VIDEO_DAMAGED, VIDEO_TIMESTAMPS, VIDEO_SCREEN, VIDEO_PIXELS.
     """
     path = check_file(path)
     sha256 = sha256_of(path)
@@ -235,6 +255,8 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
     turn, pixel_format, width, height = Orientation(), "", 0, 0
     with Decoder(path, threads, exact=True) as decoder:
         stream, container = decoder.stream, decoder.container
+        _check_square(path, stream.sample_aspect_ratio)
+        n_interlaced = 0
         for pts, frame in progress.track(keeping(decoder), "reading video", total=decoder.n_announced or None):
             if not stamps:
                 turn = orientation_of(frame)
@@ -243,6 +265,15 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
             if len(stamps) % EVERY == 0:
                 borders.add(frame)
             stamps.append(pts)
+            n_interlaced += bool(frame.interlaced_frame)
+        if n_interlaced > 0.5 * len(stamps):
+            raise PblError(
+                "VIDEO_PIXELS",
+                found=f"{n_interlaced} of {len(stamps)} pictures are interlaced: each shows two moments, line by line",
+                expected="pictures of one moment each",
+                next_step='film progressively, or separate the moments ("ffmpeg -i in.mp4 -vf bwdif out.mp4")',
+                key=path,
+            )
         widths = borders.widths()
         n_lines = borders.lines() if widths is None else 0
         if widths is not None or n_lines:
@@ -263,7 +294,7 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         tags = read_tags(path)
         metadata = _metadata(decoder, tags)
         capture_fps = _number(metadata, "com.android.capture.fps", "com.apple.quicktime.capture.fps")
-        notes = decoder.notes + _picture_notes(turn, stream.sample_aspect_ratio)
+        notes = decoder.notes + _picture_notes(turn)
         notes += speed_notes(1.0 / interval_s, capture_fps, tags.speeds)
         return VideoInfo(
             path=str(path),
@@ -348,24 +379,38 @@ def _phone(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _rate(time_s: np.ndarray, tick_s: float, announced_fps: float | None) -> tuple[float, bool]:
-    """Median interval (s), and True if intervals vary by more than a tenth of it and more than rounding explains."""
+    """Sampling interval (s), and True if intervals vary by more than a tenth and more than rounding explains."""
     if len(time_s) < 2:
         return (1.0 / announced_fps if announced_fps else float("nan")), False
     steps = np.diff(time_s)
     median = float(np.median(steps))
     # Stamps rounded to whole ticks put up to one tick between equal intervals (MKV: 1 ms).
     tolerance = max(0.1 * median, 1.001 * tick_s)
-    return median, bool(np.abs(steps - median).max() > tolerance)
+    return interval_of(time_s), bool(np.abs(steps - median).max() > tolerance)
 
 
-def _picture_notes(turn: Orientation, pixel_aspect: object) -> list[str]:
+#: Largest deviation of the pixels' sides from each other: rounded sizes of converted copies are below.
+_SQUARE_WITHIN = 0.01
+
+
+def _check_square(path: Path, pixel_aspect: Fraction | None) -> None:
+    """Raise `PblError` VIDEO_PIXELS for pixels that are not square, whose camera has two focal lengths."""
+    if pixel_aspect and abs(float(pixel_aspect) - 1) > _SQUARE_WITHIN:
+        raise PblError(
+            "VIDEO_PIXELS",
+            found=f"pixels of {pixel_aspect.numerator}:{pixel_aspect.denominator}, as the file states",
+            expected="square pixels",
+            next_step='resample the pictures ("ffmpeg -i in.mp4 -vf scale=iw*sar:ih,setsar=1 out.mp4")',
+            key=path,
+        )
+
+
+def _picture_notes(turn: Orientation) -> list[str]:
     notes = []
     if turn.mirrored:
         notes.append("the file asks for a mirrored picture: left and right are swapped as a player shows it")
     if not turn.exact:
         notes.append(f"the rotation is not a multiple of 90 degrees: {turn.rotation_deg} is used")
-    if pixel_aspect not in (None, 0, 1):
-        notes.append(f"pixels are not square ({pixel_aspect}): the picture is used as stored")
     return notes
 
 

@@ -10,6 +10,8 @@ import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 
+from pbl_pipeline.sampling import interval_of
+
 _TICKS_PER_S = 90_000  # time base of the output: every common frame rate is a whole number of ticks
 
 
@@ -38,7 +40,7 @@ def write_h264(
         Metadata of the file, by name; the only other one is the name of the encoding library.
     """
     ticks = np.rint(np.asarray(time_s, float) * _TICKS_PER_S).astype(np.int64)
-    step = int(np.median(np.diff(ticks))) if len(ticks) > 1 else _TICKS_PER_S // 30
+    step = round(interval_of(ticks)) if len(ticks) > 1 else _TICKS_PER_S // 30
     last = {int(a): int(b - a) for a, b in zip(ticks, np.append(ticks[1:], ticks[-1] + step), strict=True)}
     flags = "+faststart+use_metadata_tags" if tags else "+faststart"
     layout = "yuv420p" if size[0] % 2 == size[1] % 2 == 0 else "yuv444p"

@@ -10,6 +10,7 @@ import csv
 import dataclasses
 import datetime
 import io
+import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import os_errors_as
+from pbl_pipeline.sampling import interval_of
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
 
@@ -63,8 +65,8 @@ class PhoneLog:
 
     @property
     def rate_hz(self) -> float:
-        """Samples of the orientation per second, by the median interval."""
-        return float(1.0 / np.median(np.diff(self.time_s)))
+        """Samples of the orientation per second (`sampling.interval_of`)."""
+        return 1.0 / interval_of(self.time_s)
 
 
 def read_own_form(path: Path) -> PhoneLog:
@@ -89,8 +91,13 @@ def read_text(path: Path) -> str:
 
 def read_table(path: Path, text: str, wanted: Collection[str]) -> tuple[list[str], list[dict[str, str | None]]]:
     """Column names of a CSV text and the `wanted` columns of its rows, without empty lines and lines that start with #.
-    Raises `PblError` PHONE_LOG."""
-    rows = csv.reader((t for t in io.StringIO(text, newline=None) if t.strip() and t[0] != "#"), skipinitialspace=True)
+    Cells that `;` separates may have decimal commas. Raises `PblError` PHONE_LOG."""
+    full = (t for t in io.StringIO(text, newline=None) if t.strip() and t[0] != "#")
+    first = next(full, "")
+    if ";" in first and "," not in first:
+        full = (t.replace(",", ".").replace(";", ",") for t in full)
+        first = first.replace(";", ",")
+    rows = csv.reader(itertools.chain([first], full), skipinitialspace=True)
     try:
         bounded.count_rows(max(text.count("\n"), text.count("\r")))
         names = [n.strip() for n in next(rows, ())]

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline import bounded
 from pbl_pipeline.names import is_plain
 
-from .attitude import DEVICE, check_attitude, log_error
+from .attitude import DEVICE, MAX_HOLE_S, check_attitude, log_error
 from .phone_log import OWN_CLOCK, QUATERNION, UTC_CLOCK, PhoneLog, Sensor, numbers, read_own_form, read_table, read_text
 
 _ORIENTATION = "Orientation"
@@ -112,10 +112,16 @@ def _unzipped(path: Path, name: str) -> str | None:
     try:
         with bounded.opened_zip(path) as archive:
             wanted = f"{name}.csv".lower()
-            member = next((m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted), None)
-            return (
-                None if member is None else bounded.read_member(archive, member, bounded.MAX_TEXT).decode("utf-8-sig")
-            )
+            members = [m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted]
+            if len(members) > 1:
+                found = ", ".join(m.filename for m in members[:4])
+                raise log_error(
+                    f"{len(members)} recordings in one archive: {found}"[:300],
+                    "the zip of one recording",
+                    next_step="pass the log of this video alone: its zip, or its Orientation.csv",
+                    key=path,
+                )
+            return bounded.read_member(archive, members[0], bounded.MAX_TEXT).decode("utf-8-sig") if members else None
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
             read_text(path)  # raises the error
@@ -171,6 +177,9 @@ def read_phone_log(path: str | Path) -> PhoneLog:
     if np.abs(log.time_s).max() > _LATEST_S or bounded.span_s(log.time_s) > bounded.MAX_SECONDS:
         found = f"times from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s"
         raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", key=path)
+    if log.rate_hz < 1 / MAX_HOLE_S:
+        found = f"{log.rate_hz:.3g} orientations a second"
+        raise log_error(found, f"{1 / MAX_HOLE_S:.2g} at least, and 50 for a phone in the hand", key=path)
     _check_gravity(path, log)
     return log
 

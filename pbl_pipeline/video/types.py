@@ -96,11 +96,11 @@ class VideoInfo(FirstPicture):
     time_s : (T,) float64
         Presentation time of each frame that decodes, from the container's own stamps, first frame at 0.
     fps
-        1 / median frame interval; for display only: computations use `time_s`.
+        1 / frame interval (`sampling.interval_of`); for display only: computations use `time_s`.
     n_frames_announced
         Number of frames in the container's header (0 if not stated). Only decoded frames count.
     duration_s
-        From the first frame to the end of the last (its length taken as the median interval); NaN for a single frame
+        From the first frame to the end of the last (its length taken as that interval); NaN for a single frame
         whose container announces no rate, as is `fps`.
     variable_frame_rate
         True if an interval differs from the median by more than a tenth and more than the rounding of the stamps.

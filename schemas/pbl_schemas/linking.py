@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import normalised_label
 
 from . import connection, lab, session
 from .datajoint_setup import MySQLOrMariaDB, dj
@@ -58,7 +59,7 @@ class Linked:
 
     def people(self) -> dict[str, dict[str, Any]]:
         """Return the key of each person by our code. Raises `PblError` USAGE for a code of two."""
-        return self._named((str(self.subject_code(key)), key) for key in self.subject.keys())  # noqa: SIM118
+        return self._named((normalised_label(str(self.subject_code(key))), key) for key in self.subject.keys())  # noqa: SIM118
 
     def visits(self, people: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return the key of each visit of these people by `code/label`. Raises `PblError` USAGE for a name of two."""
@@ -67,7 +68,8 @@ class Linked:
         found = []
         for row in rows.proj(*self.owner).to_dicts():
             key = {name: row[name] for name in self.session.primary_key}
-            found.append((f"{codes[tuple(row[name] for name in self.owner)]}/{self.session_label(key)}", key))
+            label = normalised_label(str(self.session_label(key)))
+            found.append((f"{codes[tuple(row[name] for name in self.owner)]}/{label}", key))
         return self._named(found)
 
     def _named(self, pairs: Iterable[tuple[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
@@ -179,7 +181,8 @@ def link_people(codes: Iterable[str], only_known: bool = False) -> None:
 def link_visits(numbers: Mapping[tuple[str, str], int], only_known: bool = False) -> None:
     """Link registered visits (code and label -> session_id) with the laboratory's, as `link_people` does people."""
     lacking = set(_without_link(session.Session, numbers.values()))
-    if wanted := {f"{code}/{label}": number for (code, label), number in numbers.items() if number in lacking}:
+    names = {number: f"{code}/{normalised_label(label)}" for (code, label), number in numbers.items()}
+    if wanted := {name: number for number, name in names.items() if number in lacking}:
         linked, codes = _required(), {code for code, _ in numbers}
         visits = linked.visits({code: key for code, key in linked.people().items() if code in codes})
         _insert(session.Session, linked.session, wanted, visits, only_known)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_label
+from pbl_pipeline.names import check_label, normalised_label
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, gait, gdi, lab, session, video
@@ -86,6 +86,7 @@ def build_norm(
         raise _usage("neither populations nor subjects", "whose cycles make the norm")
     if isinstance(restriction, Mapping):
         restriction = with_keys(restriction)
+    subjects = [normalised_label(code) for code in subjects]
     _must_exist(lab.Population, "population", [*populations, *pooled_populations])
     _must_exist(lab.Subject, "subject", subjects)
     chosen = [{"population": p} for p in populations] + [{"subject": s} for s in subjects]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import normalised_label
 
 from . import lab  # noqa: F401  the definition refers to it
 from .datajoint_setup import dj
@@ -37,6 +39,25 @@ class BodyMass(dj.Manual):
     ---
     body_mass           : float64              # (kg)
     """
+
+
+def by_label(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Mapping[str, Any]]:
+    """Return rows of Session by subject and label: as it is stored and, where no other row has it, normalised."""
+    out = {(r["subject"], r["session_label"]): r for r in rows}
+    for (subject, label), row in tuple(out.items()):
+        out.setdefault((subject, normalised_label(label)), row)
+    return out
+
+
+def as_registered(restriction: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a restriction with its `subject` normalised, and its `session_label` as it is stored."""
+    out = {k: normalised_label(v) if k == "subject" and isinstance(v, str) else v for k, v in restriction.items()}
+    if isinstance(given := out.get("session_label"), str):
+        label = normalised_label(given)
+        of_person = Session & {k: v for k, v in out.items() if k == "subject"}
+        same = [stored for stored in of_person.to_arrays("session_label") if normalised_label(stored) == label]
+        out["session_label"] = next((one for one in (given, label) if one in same), min(same, default=label))
+    return out
 
 
 def lock(session_id: int) -> None:

@@ -149,8 +149,8 @@ def test_events_of_a_recording_by_command(walk, tmp_path):
 def test_labels_do_not_make_up_for_odd_markers(walk, tmp_path, monkeypatch, axes, signs, words):
     """The labels and angles of the recording are right, its markers are turned: no lengths, no cycles by them."""
 
-    def turned(path, wanted):
-        points, names, time, table = _read(path, wanted)
+    def turned(path, wanted, person):
+        points, names, time, table = _read(path, wanted, person)
         at = [i for i, n in enumerate(names) if not n.endswith(("Angles", "Angle"))]
         points[:, at] = points[:, at][..., axes] * signs
         return points, names, time, table

@@ -4,7 +4,9 @@ import dataclasses
 import functools
 import json
 import re
+from fractions import Fraction
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from pbl_pipeline.video.camera import reaches_corners
 from pbl_pipeline.video.container_tags import read_tags
 from pbl_pipeline.video.lens_calibration import preset_camera, presets, quarter_turn
 from research.phone_cameras import build
-from tests import not_none
+from tests import not_none, refused
 from tests.inputs import keypoints, video_info
 from tests.quicktime import MILLISECONDS, edit_list, insert, meta
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -94,6 +96,58 @@ def test_android_at_the_rate_it_says_passes(tmp_path):
     info = probe(insert(small(tmp_path / "a.mp4"), of_file=meta({"com.android.capture.fps": 30.0})))
     assert [c.outcome for c in check_timing(info)] == ["PASS"]
     assert not any("slow" in n for n in info.notes)
+
+
+def _filtered(path, codec_options=None, **set_on):
+    """A video whose encoder states the shape of its pixels or fields."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options=codec_options or {})
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for name, value in set_on.items():
+            setattr(stream.codec_context, name, value)
+        for image in numbered_frames(12):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def test_pixels_that_are_not_square_are_refused_with_the_remedy(tmp_path):
+    """At 4:3 the speed was 0.90 instead of 1.17 m/s, with a note."""
+    wide = _filtered(tmp_path / "a.mp4", sample_aspect_ratio=Fraction(4, 3))
+    error = refused("VIDEO_PIXELS", probe, wide)
+    assert "4:3" in error.found
+    assert "scale=iw*sar:ih,setsar=1" in error.next_step
+    assert probe(_filtered(tmp_path / "b.mp4", sample_aspect_ratio=Fraction(1280, 1281))).n_frames == 12
+
+
+def test_interlaced_pictures_are_refused_with_the_remedy(tmp_path):
+    fields = _filtered(tmp_path / "a.mp4", {"flags": "+ilme+ildct", "x264-params": "tff=1"})
+    error = refused("VIDEO_PIXELS", probe, fields)
+    assert "12 of 12 pictures are interlaced" in error.found
+    assert "bwdif" in error.next_step
+
+
+@pytest.mark.parametrize(
+    ("stored", "capture", "outcome", "said"),
+    [
+        (30, 10.0, "FAIL", "time lapse"),  # passed with a factor of 1
+        (24, 30.0, "PASS", ""),  # low light in real time, which failed as slow motion
+        (30, 120.0, "FAIL", "slow motion"),
+        (240, 240.0, "PASS", ""),
+        (30, 60.0, "WARN", "cannot be told"),  # half speed, or a phone of 60 frames a second in low light
+        (15, 30.0, "WARN", "cannot be told"),
+        (60, 30.0, "WARN", "cannot be told"),  # frames doubled by an editor, or played twice as fast
+    ],
+)
+def test_rates_that_android_states(tmp_path, stored, capture, outcome, said):
+    path = write_video(tmp_path / "a.mp4", numbered_frames(48), constant_rate(48, stored))
+    info = probe(insert(path, of_file=meta({"com.android.capture.fps": capture})))
+    (check,) = check_timing(info)
+    assert check.outcome == outcome
+    assert said in check.advice
+    assert not said or check.value == pytest.approx(capture / stored, rel=1e-3)
+    assert any("stored at" in n for n in info.notes) == bool(said)
 
 
 def test_slow_motion_with_an_edit_list(tmp_path):

@@ -111,6 +111,13 @@ def test_the_trc_is_in_opensims_ground_and_in_millimetres(fit, tmp_path):
     assert all(len(line.split("\t")) == 2 + 3 * 33 for line in lines[6:])
 
 
+def test_the_rate_of_stamps_that_a_webm_rounded(fit, tmp_path):
+    rounded = dataclasses.replace(fit, time_s=np.round(fit.time_s, 3))
+    path = written(Recording.of("walk", rounded), tmp_path / "a", "trc", body_points=False) / "walk.trc"
+    rate = float(path.read_text().splitlines()[2].split("\t")[0])
+    assert rate == pytest.approx(30, abs=0.01)  # the median interval is 33 ms: 30.303
+
+
 def test_frames_without_a_pose_are_left_out_and_a_missing_marker_is_an_empty_cell(fit, tmp_path):
     qpos = fit.qpos.copy()
     qpos[50:53] = np.nan
@@ -167,6 +174,7 @@ def opensim_kinematics(osim: Path, mot: Path) -> tuple[list[str], np.ndarray]:
     parent's offset frame, the translations, then the three rotations one in the frame of the other."""
     lines = mot.read_text().splitlines()
     head = lines.index("endheader") + 1
+    assert all(lines)  # pyomeca reads no empty line
     table = dict(
         zip(lines[head].split("\t"), np.array([r.split("\t") for r in lines[head + 1 :]], float).T, strict=True)
     )
@@ -346,6 +354,74 @@ def test_py_c3d_reads_the_same(out, fit, metrics):
     xyz = np.array([f[:, :3] for f in frames])
     np.testing.assert_allclose(xyz[10:175], 1e3 * fit.markers_world_m[10:175], atol=2e-3)
     assert np.all(np.array([f[:, 3] for f in frames])[:10] < 0)  # not seen: invalid
+
+
+def with_events(trial: Recording, metrics: GaitMetrics, n: int) -> Recording:
+    """The trial with so many events, two a second."""
+    one = metrics.trials[0]
+    first = one.events.events[0]
+    many = tuple(dataclasses.replace(first, time_s=i / 2, side=("left", "right")[i % 2]) for i in range(n))
+    return trial.with_measured(dataclasses.replace(one, events=dataclasses.replace(one.events, events=many)))
+
+
+@pytest.mark.parametrize(("n", "name"), [(255, ""), (256, ""), (0, ""), (0, "x" * 64)])
+def test_readers_find_all_events_up_to_the_limit_of_a_c3d(trial, metrics, fit, tmp_path, n, name):
+    import c3d
+
+    most = (120_000 - len(fit.marker_names) * max(map(len, fit.marker_names))) // (43 + len(name))
+    n = n or most
+    path = written(with_events(trial, metrics, n), tmp_path / "a", "c3d", name=name) / "walk.c3d"
+    file, endings = c3d_of(path), ["", *range(2, -(-n // 255) + 1)]
+    group, seconds = file["parameters"]["EVENT"], np.arange(n) / 2
+    assert group["USED"]["value"][0] == n
+    assert [t for e in endings for t in group[f"LABELS{e}"]["value"]] == ["Foot Strike"] * n
+    assert [t for e in endings for t in group[f"CONTEXTS{e}"]["value"]] == (["Left", "Right"] * n)[:n]
+    times = np.concatenate([group[f"TIMES{e}"]["value"] for e in endings], axis=1)
+    np.testing.assert_allclose([60, 1] @ times, seconds, atol=1e-4)
+    with path.open("rb") as opened, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        reader: Any = c3d.Reader(opened)
+        times = np.concatenate([reader.get(f"EVENT:TIMES{e}").float_array for e in endings])
+        xyz = np.array([points[:, :3] for _, points, _ in reader.read_frames()])
+    np.testing.assert_allclose(times @ [60, 1], seconds, atol=1e-4)
+    np.testing.assert_allclose(file["data"]["points"][:3].transpose(2, 1, 0)[10:175], xyz[10:175], atol=1e-3)
+    if n == most:
+        over = with_events(trial, metrics, n + 1)
+        assert f"at most {n}" in refused("EXPORT_INPUT", over, tmp_path / "b", "c3d", name=name)
+
+
+def test_many_long_names_of_markers_in_a_c3d(fit, tmp_path):
+    import c3d
+
+    names = tuple(f"{i:0127d}" for i in range(900))
+    many = dataclasses.replace(fit, marker_names=names, markers_world_m=np.resize(fit.markers_world_m, (180, 900, 3)))
+    path = written(Recording.of("w", many), tmp_path / "a", "c3d") / "w.c3d"
+    group = c3d_of(path)["parameters"]["POINT"]
+    assert (*group["LABELS"]["value"], *group["LABELS2"]["value"]) == names[:510]
+    with path.open("rb") as opened, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        reader: Any = c3d.Reader(opened)
+        assert sum(1 for _ in reader.read_frames()) == 180
+        assert [str(s) for s in np.ravel(reader.get("POINT:LABELS4").string_array)] == list(names[765:])
+    for wrong in (names * 2, ("x" * 128, *fit.marker_names[1:])):
+        points = np.zeros((180, len(wrong), 3))
+        long = dataclasses.replace(fit, marker_names=wrong, markers_world_m=points)
+        assert "127" in refused("EXPORT_INPUT", Recording.of("w", long), tmp_path / "b", "c3d")
+
+
+def test_both_readers_find_the_last_frame_of_the_longest_c3d(fit, tmp_path):
+    import c3d
+
+    for shift, fits in ((65354, True), (65355, False)):  # 180 frames, the last has the number 65534 or 65535
+        late = Recording.of("w", dataclasses.replace(fit, time_s=fit.time_s + shift / 30))
+        if not fits:
+            assert "65534" in refused("EXPORT_INPUT", late, tmp_path / "b", "c3d")
+            continue
+        path = written(late, tmp_path / "a", "c3d") / "w.c3d"
+        assert c3d_of(path)["data"]["points"].shape[2] == 180
+        with path.open("rb") as opened, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            assert [n for n, *_ in c3d.Reader(opened).read_frames()][-1] == 65534
 
 
 def test_uneven_frames_are_brought_to_one_rate(tmp_path):
@@ -637,7 +713,7 @@ def test_other_refusals(fit, tmp_path, monkeypatch):
     assert "svg" in refused("USAGE", Recording.of("w", fit), tmp_path / "a", "svg")
     assert "keypoints" in refused("EXPORT_INPUT", Recording.of("w", fit), tmp_path / "a", "dlc")
     long = dataclasses.replace(fit, time_s=fit.time_s + 3000.0)
-    assert "65535" in refused("EXPORT_INPUT", Recording.of("w", long), tmp_path / "a", "c3d")
+    assert "65534" in refused("EXPORT_INPUT", Recording.of("w", long), tmp_path / "a", "c3d")
     for module, form in (("ezc3d", "c3d"), ("pyarrow", "parquet")):
         monkeypatch.setitem(sys.modules, module, None)
         assert "pbl-pipeline[export]" in refused("PACKAGE_MISSING", Recording.of("w", fit), tmp_path / "a", form)

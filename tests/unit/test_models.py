@@ -222,6 +222,26 @@ def test_an_opset_the_runtime_does_not_know(tmp_path):
     assert "onnxruntime loads" in refused("MODEL_INVALID", models.OnnxModel, folder).expected
 
 
+@pytest.mark.parametrize(
+    ("changes", "reasons"),
+    [
+        ({"ir_version": 99}, ("Unsupported model IR version: 99, max supported IR version",)),
+        ({"opset": 99}, ("Opset 99 is under development", "Current official support for domain ai.onnx is till opset")),
+        ({"op_type": "Nonesuch"}, ("No Op registered for Nonesuch",)),
+    ],
+)
+def test_the_reason_of_the_runtime_is_stated_to_its_end(tmp_path, changes, reasons):
+    new = copy.deepcopy(graph())
+    new.ir_version = changes.get("ir_version", new.ir_version)
+    new.opset_import[0].version = changes.get("opset", new.opset_import[0].version)
+    new.graph.node[0].op_type = changes.get("op_type", new.graph.node[0].op_type)
+    folder = dot_models.write(tmp_path / "new", new, dot_models.spec("crop3d", (64, 64)))
+    found = refused("MODEL_INVALID", models.OnnxModel, folder).found
+    assert all(reason in found for reason in reasons), found
+    assert "onnxruntime_src" not in found
+    assert len(found) < 550
+
+
 def test_a_file_that_is_no_graph(tmp_path, folder):
     (folder / "model.onnx").write_bytes(b"not a graph")
     sha256 = hashlib.sha256(b"not a graph").hexdigest()

@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline.fit import check_trial
+from pbl_pipeline.gait import feet_from_keypoints
+from pbl_pipeline.keypoints import visibility
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import Attitude, load_attitude, probe, read_phone_log
 from pbl_pipeline.video.attitude import held_deg
@@ -213,7 +215,7 @@ def test_how_the_phone_was_held_is_seen(tmp_path, size, flag, turned):
     quat = device_quat(level, turned)
     probed = video(width_px=size[0], height_px=size[1], rotation_deg=flag)
     assert held_deg(probed, quat) == turned
-    lines = ["time_s,qw,qx,qy,qz,frame", *(f"{t},{','.join(map(str, q))},device" for t, q in enumerate(quat))]
+    lines = ["time_s,qw,qx,qy,qz,frame", *(f"{t / 10},{','.join(map(str, q))},device" for t, q in enumerate(quat))]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     found = Rotation.from_quat(load_attitude(tmp_path / "log.csv", probed).quat_wxyz, scalar_first=True)
     assert (found.inv() * level).magnitude().max() < 1e-9
@@ -301,12 +303,57 @@ def test_a_log_shorter_than_the_video(tmp_path, info):
 
 def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
     walk = observe(plain_walk(np.arange(120) / 30), np.arange(120) / 30)
-    quat = hand(np.arange(3.0)).as_quat(scalar_first=True)
-    whole = dataclasses.replace(walk, phone_time_s=np.array([0, 2.0, 4.0]), phone_quat_wxyz=quat)
+    quat = hand(np.arange(41) / 10).as_quat(scalar_first=True)
+    whole = dataclasses.replace(walk, phone_time_s=np.arange(41) / 10, phone_quat_wxyz=quat)
     used, _ = check_trial(whole, "walk")
     assert used.all()
-    half = dataclasses.replace(walk, phone_time_s=np.array([0, 1.0, 2.0]), phone_quat_wxyz=quat)
+    half = dataclasses.replace(walk, phone_time_s=np.arange(21) / 10, phone_quat_wxyz=quat[:21])
     assert "from 0.00 to 2.00 s" in refused("PHONE_LOG", check_trial, half, "walk").found
+
+
+def _pan(path, at, decimal=".", between=","):
+    """A log in the camera's frame that pans by 20 deg to and fro within 4 s."""
+    turns = Rotation.from_euler("z", 20 * np.sin(2 * np.pi * at / 4)[:, None], degrees=True)
+    quat = (turns * hand(np.zeros(1))).as_quat(scalar_first=True)
+    rows = [between.join(f"{v:.6f}".replace(".", decimal) for v in (t, *q)) for t, q in zip(at, quat, strict=True)]
+    path.write_text("\n".join([between.join(("time_s", "qw", "qx", "qy", "qz")), *rows]))
+    return path
+
+
+def test_a_hole_in_a_log_is_unknown_orientation(tmp_path):
+    """Bridged, 3 s of a pan were up to 21.6 deg of wrong direction."""
+    at = np.r_[np.arange(0, 1.5, 0.01), np.arange(2.5, 5, 0.01)]
+    attitude = load_attitude(_pan(tmp_path / "a.csv", at), video(time_s=np.arange(130) / 30))
+    assert "without samples for up to 1.0 s" in attitude.source
+    walk = observe(plain_walk(np.arange(130) / 30), np.arange(130) / 30)
+    missing = (walk.time_s > at[149]) & (walk.time_s < at[150])
+    for k, lost in ((walk, False), (walk.with_attitude(attitude), missing)):
+        used, _ = check_trial(k, "walk")
+        np.testing.assert_array_equal(used, ~(missing & lost))
+        assert ("not used: 1.5 to 2.5 s" in visibility(k).text()) == bool(np.any(lost))
+        assert np.isnan(feet_from_keypoints(k).heel_m[missing]).all() == bool(np.any(lost))
+    still = Attitude(attitude.time_s, np.tile(attitude.quat_wxyz[0], (len(at), 1)))
+    assert check_trial(walk.with_attitude(still), "walk")[0].all()  # a phone on a stand did not turn meanwhile
+
+
+def test_a_log_of_one_sample_a_second_is_refused(tmp_path):
+    slow = _pan(tmp_path / "a.csv", np.arange(8.0))
+    assert "1 orientations a second" in refused("PHONE_LOG", read_phone_log, slow).found
+
+
+def test_decimal_commas(tmp_path):
+    at = np.arange(0, 2, 0.01)
+    here, there = (read_phone_log(_pan(tmp_path / n, at, *how)) for n, how in (("a.csv", (",", ";")), ("b.csv", ())))
+    np.testing.assert_array_equal(here.time_s, there.time_s)
+    np.testing.assert_array_equal(here.quat_wxyz, there.quat_wxyz)
+
+
+def test_an_archive_of_two_recordings_names_them(tmp_path, folder):
+    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
+        for name in ("walk1", "walk2"):
+            archive.write(folder / "Orientation.csv", f"{name}/Orientation.csv")
+    found = refused("PHONE_LOG", read_phone_log, tmp_path / "two.zip").found
+    assert "walk1/Orientation.csv, walk2/Orientation.csv" in found
 
 
 def test_a_phone_on_a_stand(tmp_path):

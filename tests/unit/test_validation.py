@@ -31,7 +31,7 @@ from pbl_pipeline.validation import (
     reference_of_qpos,
     view_classes,
 )
-from tests import not_none
+from tests import not_none, refused
 from tests.walking_fit import walking_fit, with_level_pelvis
 
 TIME = np.arange(200) / 100.0
@@ -314,6 +314,72 @@ def test_an_overextended_knee_keeps_its_sign(tmp_path: Path):
     read = reference_of_mot(tmp_path / "a.mot")
     np.testing.assert_allclose(read.angles_deg[KNEE], [0, 30, 60])
     np.testing.assert_allclose(read.angles_deg["knee_flexion_l"], -8)
+
+
+def _motion(path: Path, unit: str, columns: dict[str, np.ndarray]) -> Path:
+    rows = "".join("\t".join(f"{v:.6f}" for v in row) + "\n" for row in zip(*columns.values(), strict=True))
+    path.write_text(f"Coordinates\ninDegrees={unit}\nendheader\n" + "\t".join(columns) + "\n" + rows)
+    return path
+
+
+def _leg() -> dict[str, np.ndarray]:
+    """A leg whose foot stands level for 60 % of each cycle."""
+    t = np.arange(0, 4, 0.01)
+    hip, swings = 5 + 25 * np.cos(2 * np.pi * t), t % 1 > 0.6
+    knee = 10 + np.where(swings, 50 * np.sin(np.pi * (t % 1 - 0.6) / 0.4), 0)
+    ankle = knee - hip - 3 + np.where(swings, -30 * np.sin(np.pi * (t % 1 - 0.6) / 0.4), 0)
+    tilt = np.full(len(t), 3.0)
+    return {"time": t, "pelvis_tilt": tilt, "hip_flexion_r": hip, "knee_angle_r": knee, "ankle_angle_r": ankle}
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("no", 1.0), ("yes", np.pi / 180)])
+def test_a_header_that_contradicts_the_unit_of_the_data(tmp_path: Path, unit: str, factor: float):
+    leg = {n: v * (1.0 if n == "time" else factor) for n, v in _leg().items()}
+    turning = {"pelvis_rotation": np.linspace(0, 720, len(leg["time"])) * factor}  # two turns of the body prove nothing
+    refused("ANGLE_UNITS", reference_of_mot, _motion(tmp_path / "a.mot", unit, leg | turning))
+
+
+def test_columns_twice_in_a_motion(tmp_path: Path):
+    path = tmp_path / "a.mot"
+    for names in ("hip_flexion_r hip_flexion_r", "/jointset/hip_r/hip_flexion_r/value hip_flexion_r"):
+        path.write_text(f"inDegrees=yes\nendheader\ntime {names}\n0 20 30\n1 21 31\n")
+        assert "hip_flexion_r twice" in refused("FILE_FORMAT", reference_of_mot, path).found
+
+
+def test_a_motion_with_the_paths_of_states(tmp_path: Path):
+    leg = _leg()
+    paths = {
+        (n if n == "time" else f"/jointset/joint/{n}/value"): np.radians(v) if n != "time" else v
+        for n, v in leg.items()
+    }
+    more = {"/jointset/joint/hip_flexion_r/speed": leg["time"] * 50, "/forceset/soleus_r/activation": leg["time"]}
+    read = reference_of_mot(_motion(tmp_path / "a.sto", "no", paths | more))
+    assert list(read.angles_deg) == ["pelvis_tilt", "hip_flexion_r", KNEE, "ankle_angle_r"]
+    np.testing.assert_allclose(read.angles_deg[KNEE], leg["knee_angle_r"], atol=1e-3)
+
+
+def test_signs_and_zeros_of_other_models_are_brought_to_ours_and_said(tmp_path: Path):
+    leg = _leg()
+    for sign, knee, zero in ((1, 1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 90), (-1, -1, 90)):
+        other = leg | {"knee_angle_r": knee * leg["knee_angle_r"], "ankle_angle_r": sign * leg["ankle_angle_r"] + zero}
+        read = reference_of_mot(_motion(tmp_path / "a.mot", "yes", other))
+        for name in ("knee", "ankle"):
+            ours = KNEE if name == "knee" else "ankle_angle_r"
+            np.testing.assert_allclose(read.angles_deg[ours], leg[f"{name}_angle_r"], atol=1e-5)
+        said = "; ".join(read.notes)
+        assert ("positive in plantarflexion" in said, "90 deg" in said) == (sign < 0, zero > 0)
+        assert f"{'positive' if knee > 0 else 'negative'} in flexion" in said
+
+
+def test_a_pelvis_that_counts_its_tilt_forwards(tmp_path: Path):
+    leg = _leg()
+    swaying = 15 * np.sin(0.7 * np.pi * leg["time"])
+    leg |= {"pelvis_tilt": swaying, "ankle_angle_r": leg["ankle_angle_r"] + 3 - swaying}
+    for tilted, ankle in ((1, 1), (-1, 1), (-1, -1)):
+        other = leg | {"pelvis_tilt": tilted * swaying, "ankle_angle_r": ankle * leg["ankle_angle_r"]}
+        read = reference_of_mot(_motion(tmp_path / "a.mot", "yes", other))
+        np.testing.assert_allclose(read.angles_deg["pelvis_tilt"], swaying, atol=1e-5)
+        assert any("positive forwards" in n for n in read.notes) == (tilted < 0)
 
 
 # --- fits

@@ -114,6 +114,15 @@ def test_constant_rate_is_not_called_variable(tmp_path, suffix, fps):
     assert info.fps == pytest.approx(fps, rel=0.05)
 
 
+@pytest.mark.parametrize("fps", [24.0, 29.97, 30.0, 60.0, 240.0])
+def test_rates_of_stamps_that_are_rounded_to_milliseconds(tmp_path, fps):
+    """The median interval makes 30.30 of 30, 23.81 of 24 and 250 of 240; a dropped frame changes nothing."""
+    for stamps in (constant_rate(120, fps), np.delete(constant_rate(120, fps), [40, 71])):
+        info = probe(write_video(tmp_path / "v.mkv", numbered_frames(len(stamps)), stamps, ticks_per_s=1000))
+        assert info.fps == pytest.approx(fps, rel=1e-3)
+        assert info.duration_s == pytest.approx(120 / fps, abs=2e-3)
+
+
 def test_one_missing_frame_makes_the_rate_variable(tmp_path):
     info = probe(write_video(tmp_path / "v.mp4", numbered_frames(29), np.delete(constant_rate(30), 12)))
     assert info.variable_frame_rate
@@ -458,6 +467,28 @@ def test_a_file_whose_end_is_zeros_is_truncated(whole, tmp_path, name):
     path = tmp_path / f"v{whole[name].suffix}"
     path.write_bytes(data[: int(0.6 * len(data))] + bytes(len(data) - int(0.6 * len(data))))
     assert code_of(path) == "VIDEO_TRUNCATED"
+
+
+def test_a_whole_recording_whose_first_stamp_is_not_0(tmp_path):
+    """Recorders in a browser and cuts of a stream begin anywhere; FFmpeg counts the length from 0."""
+    later = write_video(
+        tmp_path / "a.mkv",
+        numbered_frames(30),
+        5 + constant_rate(30),
+        ticks_per_s=1000,
+        container_options={"avoid_negative_ts": "disabled"},
+    )
+    flags = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}
+    cut = write_video(tmp_path / "a.mp4", numbered_frames(30), constant_rate(30), container_options=flags)
+    data, at = bytearray(cut.read_bytes()), 0
+    while (at := data.find(b"tfdt", at + 1)) > 0:
+        (begins,) = struct.unpack_from(">Q", data, at + 8)
+        struct.pack_into(">Q", data, at + 8, begins + 5 * 90_000)
+    cut.write_bytes(data)
+    for path in (later, cut):
+        info = probe(path)
+        assert (info.n_frames, info.time_s[0]) == (30, 0.0)
+        assert info.duration_s == pytest.approx(1.0, abs=2e-3)
 
 
 def test_truncation_says_what_is_left_and_what_to_do(whole, tmp_path):

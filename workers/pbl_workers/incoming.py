@@ -27,6 +27,7 @@ import pymysql
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
+from pbl_pipeline.names import normalised_label
 from pbl_pipeline.video import read_first, read_phone_log
 from pbl_schemas import video, worker
 from pbl_schemas.connection import dj
@@ -177,7 +178,7 @@ def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload],
             for upload in given:
                 copies.append(_copy(drop, upload, archive, end))
             subject, session, file = recording.name.parts
-            check_subject(subject, "rename the folder and upload again", recording.name)
+            check_subject(normalised_label(subject), "rename the folder and upload again", recording.name)
             registered = register_copies(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
@@ -209,7 +210,7 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> C
     """Copy into the archive under a new name, on disk when this returns. Raises `PblError` UPLOAD_REFUSED; OSError and
     StillChanging: nothing is left behind."""
     digest, n = hashlib.sha256(), 0
-    folder = folder_of(archive, COPIES, upload.name.parts[0])
+    folder = folder_of(archive, COPIES, normalised_label(upload.name.parts[0]))
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
     if not has_room(folder, upload.size):
         raise OSError(f"{upload.size / 1e9:.1f} GB do not fit beside {KEPT_FREE / 1e9:.0f} GB that are kept free")
@@ -306,7 +307,7 @@ def _set_aside(
     """Move a refused upload into the archive's folder for it, the reason first. A copy is moved instead of the
     original. Raises OSError if it cannot be moved: it stays in the drop folder."""
     name = given[0].name
-    folder = folder_of(archive, REFUSED, name.parts[0])
+    folder = folder_of(archive, REFUSED, normalised_label(name.parts[0]))
     mark = copies[0].sha256 if copies else hashlib.sha256(os.fsencode(str(name))).hexdigest()
     aside = folder / f"{mark[:12]}-{plain_name(name.name)}"
     reason = os.open(aside.with_name(aside.name + ".txt"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)

@@ -11,6 +11,7 @@ from jaxtyping import Bool
 from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
+from pbl_pipeline.sampling import interval_of
 
 from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
 from .types import SIDES
@@ -51,7 +52,7 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
     time = np.asarray(feet.time_s, float)
     if len(time) < 4 or time[-1] - time[0] < least_s:
         return None, f"the person is in view for less than {least_s:g} s", "film at least three steps"
-    step_s = float(np.median(np.diff(time)))
+    step_s = interval_of(time)
     if span_s(time) > MAX_SECONDS:
         said = f"{span_s(time):.3g} s from the first to the last time stamp"
         raise input_error(said, f"at most {MAX_SECONDS:g} s of one recording: are the time stamps in seconds?")

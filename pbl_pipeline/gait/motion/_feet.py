@@ -198,12 +198,16 @@ def feet_from_keypoints(keypoints: Keypoints) -> FootTrajectories:
         at = Slerp(phone, turns)(np.clip(keypoints.time_s, phone[0], phone[-1]))
         xyz = np.einsum("tij,tkj->tki", at.as_matrix(), xyz)
         up = _WORLD_UP
+    from pbl_pipeline.keypoints import unoriented_frames
+
+    known = ~unoriented_frames(keypoints)[:, None]
+    xyz = np.where(known[..., None], xyz, np.nan)
     return _from_points(
         np.asarray(keypoints.time_s, float),
         keypoints.names,
         keypoints.marker_set,
         xyz,
-        np.asarray(keypoints.confidence, float),
+        np.asarray(keypoints.confidence, float) * known,
         up,
         f"keypoints {keypoints.marker_set}",
         travels=not keypoints.root_relative,

@@ -28,9 +28,11 @@ def forget(subject: str, yes: bool, videos: bool) -> None:
     Example: pbl forget P017 --yes --videos
     """
     import pbl_schemas
+    from pbl_pipeline.names import normalised_label
     from pbl_schemas.operations import archive
     from pbl_schemas.operations import forget as lib
 
+    subject = normalised_label(subject)
     pbl_schemas.activate(methods=False)
     if not yes:
         _, found = lib.find(subject)

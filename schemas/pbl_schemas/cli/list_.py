@@ -97,11 +97,12 @@ def methods(as_json: bool, as_csv: bool, stage: str | None) -> None:
 
 
 def _print(what: str, restriction: dict[str, str | None], as_json: bool, as_csv: bool) -> None:
-    from pbl_schemas import activate
+    from pbl_schemas import activate, session
     from pbl_schemas.reading import registered
 
     activate(methods=False)
-    _show(getattr(registered, what)({k: v for k, v in restriction.items() if v is not None}), as_json, as_csv)
+    given = session.as_registered({k: v for k, v in restriction.items() if v is not None})
+    _show(getattr(registered, what)(given), as_json, as_csv)
 
 
 def _show(rows: pd.DataFrame, as_json: bool, as_csv: bool) -> None:

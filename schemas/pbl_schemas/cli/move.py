@@ -29,7 +29,7 @@ def move(video_id: int, target: str, yes: bool) -> None:
     pbl_schemas.activate(methods=False)
     plan = plan_move(video_id, subject, label)
     new = " (a new person)" if plan.new_subject else " (a new visit)" if plan.new_session else ""
-    click.echo(f"video_id {video_id}: from {'/'.join(plan.before)} to {target}{new}")
+    click.echo(f"video_id {video_id}: from {'/'.join(plan.before)} to {'/'.join(plan.after)}{new}")
     for number, path in plan.files.items():
         click.echo(f"  video_id {number}, {path.name}")
     for table, n in plan.deleted.items():

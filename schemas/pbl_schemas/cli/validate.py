@@ -254,7 +254,7 @@ def _bridge_values(name: str, keep: Path) -> pd.DataFrame:
     "--reference",
     type=click.Path(path_type=Path, readable=False),
     metavar="FILE",
-    help="Reference movement: .npz, fit.npz, truth.npz, .json.gz or .mot.",
+    help="Reference movement: .npz, fit.npz, truth.npz, .json.gz, .mot or .sto.",
 )
 @click.option(
     "--of-trial",
@@ -321,10 +321,13 @@ def _of_files(
     for path, truth in zip(fits, of_each, strict=True):
         try:
             fit = TrialFit.load(path)
-            errors = compare(fit, read_reference(truth, source, shift_s))
+            reference = read_reference(truth, source, shift_s)
+            errors = compare(fit, reference)
         except PblError as error:
             refused.append(error)
             continue
+        for note in reference.notes:
+            click.echo(f"{truth}: {note}", err=True)
         rows.append(
             TrialErrors(
                 errors=errors,

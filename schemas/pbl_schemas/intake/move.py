@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_label
+from pbl_pipeline.names import check_label, normalised_label
 
 from .. import fit, gait, gdi, keypoints, kinetics, lab, session, video, worker
 from ..datajoint_setup import dj
@@ -49,8 +49,11 @@ class Move:
 def plan_move(video_id: int, subject: str, session_label: str) -> Move:
     """Return what `carry_out` would do; change nothing. Raises `PblError` DB_NOT_FOUND for a number that no video has;
     USAGE for a subject code that could be a name, a label too long, or the visit that the video is in already."""
+    subject, session_label = normalised_label(subject), normalised_label(session_label)
     check_subject(subject, "pass --to SUBJECT/SESSION with such a code")
     check_label("session", session_label, 64, 1)
+    there = session.as_registered({"subject": subject, "session_label": session_label})
+    session_label = there["session_label"]
     rows = (video.Video * session.Session.proj("subject", "session_label") & {"video_id": video_id}).to_dicts()
     if not rows:
         raise unknown_video(video_id)
@@ -66,7 +69,6 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()
     counts = dj.Diagram.cascade(fit.FitSet & list(sets), part_integrity="cascade").counts() if sets else {}
-    there = {"subject": subject, "session_label": session_label}
     if fit.trials_of([video_id]):
         for found in (session.Session & there).to_dicts():
             check_same_number(int(found["session_id"]), len(numbers), Path(row["video_path"]))

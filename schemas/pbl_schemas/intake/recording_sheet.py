@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import whole_number
+from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.progress import track
 from pbl_pipeline.video import recorded_utc
 
@@ -170,7 +170,7 @@ def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -
     """Refuse rows that cannot all be true: one label for two days, one person in two groups or under two codes."""
     codes = {visit.subject for visit in visits if visit is not None}
     stored = (session.Session & inside("subject", codes)).to_dicts()
-    dates = {(r["subject"], r["session_label"]): r["session_date"] for r in stored}
+    dates = {key: r["session_date"] for key, r in session.by_label(stored).items()}
     similar = similar_codes(codes, map(str, lab.Subject().to_arrays("subject")))
     first: dict[tuple[str, ...], object] = {}
     for visit, line in zip(visits, lines, strict=True):
@@ -208,7 +208,7 @@ def _check_place(one: OneCamera, known: Mapping[str, Mapping]) -> None:
     """Raise `PblError` where a video is registered for another person or visit."""
     check_owner(one, known)
     row, visit = known[one.files[0].sha256], one.visit
-    if row["session_label"] != visit.session_label:
+    if normalised_label(row["session_label"]) != visit.session_label:
         raise conflict(
             f"video_id {row['video_id']} of visit {row['session_label']} has these bytes",
             f"a recording of visit {visit.session_label}",

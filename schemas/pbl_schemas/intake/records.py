@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from pbl_pipeline.names import check_height, check_label, check_mass, is_plain
+from pbl_pipeline.names import check_height, check_label, check_mass, is_plain, normalised_label
 
 from .. import fit, gait, gdi, kinetics, lab, linking, session, video
 from ..rows import counted, delete_below, inside, number, utc_now
@@ -95,6 +95,12 @@ class VisitRecord:
     date: datetime.date | None = None  # None: the day that the label names
     mass_kg: float | None = None  # of the person at the visit
 
+    def __post_init__(self) -> None:
+        """Normalise the labels, so that all ways into the tables agree."""
+        for name in ("subject", "session_label", "project", "activity", "pace", "population"):
+            if isinstance(text := getattr(self, name), str):
+                object.__setattr__(self, name, normalised_label(text))
+
     def check(self, key: object = None) -> None:
         """Raise `PblError` USAGE for a code that could be a name or a label too long; FIT_INPUT for height or mass."""
         check_subject(self.subject, "pass such a code with --subject", key)
@@ -105,7 +111,7 @@ class VisitRecord:
             ("pace", self.pace, 32),
             ("population", self.population, 32),
         ):
-            check_label(what, text or "", longest)
+            check_label(what, text or "", longest, least=int(what == "visit"))
         check_height(self.height_m)
         check_mass(self.mass_kg)
 
@@ -242,7 +248,7 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     add_people(visits)
     keys = list(dict.fromkeys((v.subject, v.session_label) for v in visits))
     rows = (session.Session & inside("subject", {v.subject for v in visits})).to_dicts()
-    stored = {(r["subject"], r["session_label"]): r for r in rows}
+    stored = session.by_label(rows)
     missing = [key for key in keys if key not in stored]
     numbers = {key: int(r["session_id"]) for key, r in stored.items()}
     if missing:

@@ -44,7 +44,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
     """Return the library's `Reference` from a file of one of several formats.
 
     Accepted: the library's own npz, a `fit.npz` of ours (from markers or several cameras), the `truth.npz` of
-    `pbl synth`, rotations of bodies (`.json.gz`), OpenSim `.mot`.
+    `pbl synth`, rotations of bodies (`.json.gz`), OpenSim `.mot` and `.sto`.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (also what the readers raise).
 
@@ -61,6 +61,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
         ".json": lib.reference_of_bodies,
         ".json.gz": lib.reference_of_bodies,
         ".mot": lib.reference_of_mot,
+        ".sto": lib.reference_of_mot,
     }
     reader = next((read for ending, read in readers.items() if path.name.lower().endswith(ending)), None)
     if reader is None:
@@ -80,7 +81,7 @@ def read_reference(path: str | Path, source: str | None = None, shift_s: float =
 
 
 def _no_reference(code: str, found: str, next_step: str, path: Path) -> PblError:
-    expected = "a reference: .npz, fit.npz, truth.npz, .json.gz or .mot"
+    expected = "a reference: .npz, fit.npz, truth.npz, .json.gz, .mot or .sto"
     return PblError(code, found=found, expected=expected, next_step=next_step, key=str(path))
 
 
@@ -154,6 +155,7 @@ def add_reference(
         row = {**key, **of_source, "dataset": dataset or kept, "reference_shift": shift_s}
         _insert(row, truth, path, sha256, origin)
     note = f"{len(truth.time_s)} samples, {len(truth.angles_deg)} angles, source {truth.source}"
+    note = "; ".join([note, *truth.notes])
     if older:
         note += f"; the older reference {', '.join(r['reference'] for r in older)} is no longer current"
     return Added(video_id, key["reference"], "replaced" if older else "registered", note)

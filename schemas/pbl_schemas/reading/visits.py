@@ -58,7 +58,7 @@ def find_visit(restriction: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     `restriction` and errors are those of `load_visit`.
     """
     if isinstance(restriction, Mapping):
-        restriction = with_keys(restriction)
+        restriction = session.as_registered(with_keys(restriction))
     found = (session.Session & restriction).to_dicts()
     if not found:
         raise PblError(
@@ -130,7 +130,7 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     this slice alone, with the sets and methods that it was frozen with.
     """
     sets: Any = fit.current()
-    restriction = with_keys(restriction)
+    restriction = session.as_registered(with_keys(restriction))
     if slice_name is not None:
         chain, counted = chain_of(slice_name)
         restriction, sets = {**restriction, **chain}, fit.FitSelection & inside("fit_set", counted)

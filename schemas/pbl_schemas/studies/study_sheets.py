@@ -13,7 +13,7 @@ from typing import Any
 
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_label
+from pbl_pipeline.names import check_label, normalised_label
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
@@ -267,7 +267,7 @@ class _Plan:
             check_same(stated.values.setdefault(name, value), value, what, whose)
 
     def _session(self, row: Row, code: str) -> tuple[str, str]:
-        label = needed(row, "visit")
+        label = normalised_label(needed(row, "visit"))
         stated = self.sessions.setdefault((code, label), _Stated(row, {}))
         day = day_of(label)
         if "date" in row.cells:
@@ -366,7 +366,7 @@ class _Plan:
         of_people = inside("subject", {*self.people, *(c for _, c in self.members)})
         self.known = {r["subject"]: r for r in lab.Subject.proj("population").to_dicts()}
         sessions = session.Session & of_people
-        self.registered = {(r["subject"], r["session_label"]): r for r in sessions.to_dicts()}
+        self.registered = session.by_label(sessions.to_dicts())
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
         self.stored_visits = {labels[int(r["session_id"])]: r for r in (study.Visit & sessions.proj()).to_dicts()}
         scores = (study.ClinicalScore & sessions.proj()).to_dicts()
@@ -615,6 +615,7 @@ def _visit_value(row: Row, column: str) -> Any:
 def _video(row: Row) -> int:
     name = needed(row, "video")
     where = {k: v for k, v in (("subject", row.cells.get("subject")), ("session_label", row.cells.get("visit"))) if v}
+    where = session.as_registered(where)
     of = {"video_id": int(name)} if re.fullmatch(r"\d{1,9}", name) else {"video_name": name}
     named = video.Video.proj("video_name") & (video.Video & (session.Session & where).proj()).proj() & of
     found = named.to_arrays("video_id")

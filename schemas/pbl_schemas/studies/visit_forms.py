@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_height, check_label, check_mass
+from pbl_pipeline.names import check_height, check_label, check_mass, normalised_label
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import decisions, record
@@ -88,7 +88,7 @@ def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict
 
     `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
-    given = {name: text for name, text in _stripped(values).items() if text}
+    given = {name: normalised_label(text) for name, text in _stripped(values).items() if text}
     return in_transaction(lambda: _register(given, by))
 
 
@@ -106,7 +106,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
         "height_m": functools.partial(_number, "height_m"),
     }
     _check({name: given[name] for name in checks if name in given}, checks, errors)
-    of_visit = {"subject": given.get("subject", ""), "session_label": given.get("visit", "")}
+    of_visit = session.as_registered({"subject": given.get("subject", ""), "session_label": given.get("visit", "")})
     if session.Session & of_visit:
         found = f"visit {of_visit['session_label']} of {of_visit['subject']}, which is registered"
         errors["visit"] = conflict(found, "a visit that is not registered yet", "open it from the list of visits")

@@ -26,7 +26,7 @@ from pbl_pipeline.gait import (
     normal_bands,
 )
 from pbl_pipeline.kinetics import GRAVITY
-from pbl_pipeline.names import whole_number
+from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.report.curves import CycleCurve, Ranges, cycle_curves
 from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
@@ -170,7 +170,7 @@ def list_routes(pages: Pages, tables: Tables) -> list[Address]:
 def _address(session: Session, fields: Mapping[str, str]) -> str:
     """The list's address for a filled-in form. The search text is a number in it, so that no code is part of an
     address."""
-    search = fields.get("search", "").strip()[:100]
+    search = normalised_label(fields.get("search", ""))[:100]
     asked: dict[str, Any] = {"q": session.search_number(search)} if search else {}
     asked |= {name: fields[name][:64] for name in _FIELDS if fields.get(name)}
     return "/visits" + (f"?{urlencode(asked)}" if asked else "")

@@ -13,6 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
+from pbl_pipeline.sampling import interval_of
 
 from .features import GRID_HZ, features, heading, leg_length
 
@@ -54,7 +55,7 @@ def on_grid(time_s: np.ndarray, legs_m: Float[np.ndarray, "T 5 2 3"], up: np.nda
     n = int(np.floor((time_s[-1] - time_s[0]) * GRID_HZ + 1e-6)) + 1
     grid = time_s[0] + np.arange(n) / GRID_HZ
     joints, known = np.zeros((n, *legs_m.shape[1:])), np.zeros((n, *legs_m.shape[1:3]), bool)
-    fast = len(time_s) > 2 and 1 / np.median(np.diff(time_s)) > _AVERAGE_ABOVE_HZ
+    fast = len(time_s) > 2 and 1 / interval_of(time_s) > _AVERAGE_ABOVE_HZ
     for j in range(legs_m.shape[1]):
         for s in range(2):
             own = np.flatnonzero(np.isfinite(legs_m[:, j, s]).all(axis=1))
