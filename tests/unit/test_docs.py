@@ -125,7 +125,9 @@ def test_no_link_of_a_page_is_dead(page: str):
 def test_the_page_of_licences_names_every_direct_dependency():
     project = tomllib.loads(pages.text("pyproject.toml"))["project"]
     extras = project["optional-dependencies"]
-    wanted = {Requirement(r).name for r in [*project["dependencies"], *extras["s3"], *extras["export"], *extras["figures"]]}
+    wanted = {
+        Requirement(r).name for r in [*project["dependencies"], *extras["s3"], *extras["export"], *extras["figures"]]
+    }
     table = pages.text("docs/licences.md").partition("## Direct dependencies")[2]
     _, *rows = re.findall(r"^\| [^|]* \| (.*) \|$", table, re.MULTILINE)
     listed = [name for row in rows for name in row.split(", ")]
