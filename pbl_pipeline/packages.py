@@ -115,7 +115,7 @@ class NpmPackage(Package):
         return shlex.join(["npm", *self._pack(".")])
 
     def environment(self, scratch: Path) -> dict[str, str]:
-        # Node keeps compiled modules among the temporary files as well, and nobody removes them.
+        # Node keeps compiled modules among the temporary files as well, and nothing removes them.
         return {"npm_config_cache": str(scratch), "TMPDIR": str(scratch)}
 
     def reason(self, done: subprocess.CompletedProcess[str]) -> str:

@@ -103,13 +103,13 @@ def check_c3d(trial: ExportTrial, name: str = "") -> None:
         (
             longest > _LONGEST_NAME or len(markers) * longest > _MOST_BYTES,
             f"{len(markers)} markers with names of up to {longest} characters",
-            f"at most {_LONGEST_NAME} characters each, {_MOST_BYTES} in all: the parameters of a C3D hold no more",
+            f"at most {_LONGEST_NAME} characters each, {_MOST_BYTES} in all: the limit of a C3D's parameters",
             "shorten the names in the table and fit again, or export the other formats",
         ),
         (
             events > most,
             f"{events} events",
-            f"at most {most}: the parameters of a C3D hold no more",
+            f"at most {most}: the limit of a C3D's parameters",
             "cut the recording, or export its events with --to csv",
         ),
     ):

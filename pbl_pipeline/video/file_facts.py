@@ -83,17 +83,26 @@ def check_timing(video: VideoInfo) -> tuple[Check, ...]:
     if video.capture_fps is None:
         return ()
     ratio, known = stretch(video.fps, video.capture_fps)
-    rates = f"recorded at {video.capture_fps:g} and stored at {video.fps:.4g} frames a second"
     if ratio == 1.0:
         return (Check("time_stretch", PASS, ratio, _MOST_RATIO),)
+    # Each advice is written out: the pages' German is found by the whole of it.
+    a, b = f"{video.capture_fps:g}", f"{video.fps:.4g}"
     if not known:
-        advice = f"{rates}: slow motion, a time lapse and a rate lowered in low light cannot be told apart here"
-        return (Check("time_stretch", WARN, ratio, _MOST_RATIO, f"{advice}; compare the cadence with the person's"),)
-    what = "slow motion" if ratio > 1 else "time lapse"
-    advice = (
-        f"{what}: {rates}, so every time, cadence and speed is wrong; copy the original from the phone, or film at "
-        "normal speed"
-    )
+        advice = (
+            f"recorded at {a} and stored at {b} frames a second: slow motion, a time lapse and a rate lowered in low "
+            "light cannot be told apart here; compare the cadence with the person's"
+        )
+        return (Check("time_stretch", WARN, ratio, _MOST_RATIO, advice),)
+    if ratio > 1:
+        advice = (
+            f"slow motion: recorded at {a} and stored at {b} frames a second, so every time, cadence and speed is "
+            "wrong; copy the original from the phone, or film at normal speed"
+        )
+    else:
+        advice = (
+            f"time lapse: recorded at {a} and stored at {b} frames a second, so every time, cadence and speed is "
+            "wrong; copy the original from the phone, or film at normal speed"
+        )
     return (Check("time_stretch", FAIL, ratio, _MOST_RATIO, advice),)
 
 
