@@ -158,7 +158,10 @@ def check_trial(
         try:
             check_views_agree(trial, name)
         except PblError as error:
-            raise explained(error, trial, name, table) from error
+            better = explained(error, trial, name, table)
+            if better is error:  # an error that is its own cause has no end for those who look for the first one
+                raise
+            raise better from error
         confidence = np.max([k.confidence for k in trial.views], axis=0)
     else:
         _check_finite(name, trial.confidence, trial.xyz_world_m)
