@@ -158,10 +158,9 @@ def check_trial(
         try:
             check_views_agree(trial, name)
         except PblError as error:
-            better = explained(error, trial, name, table)
-            if better is error:  # an error that is its own cause has no end for those who look for the first one
-                raise
-            raise better from error
+            if (explanation := explained(trial, name, table)) is not None:
+                raise explanation from error
+            raise
         confidence = np.max([k.confidence for k in trial.views], axis=0)
     else:
         _check_finite(name, trial.confidence, trial.xyz_world_m)

@@ -107,9 +107,9 @@ def body_axis(points: np.ndarray, markers: MarkerSet) -> tuple[np.ndarray, float
     return (mean / steady, steady) if steady > 0 else (np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-def explained(error: PblError, trial: MultiView, name: str, markers: MarkerSet) -> PblError:
-    """Return `error` (VIEWS_DISAGREE) with what is wrong with the calibration, where another reading of it makes the
-    cameras agree: poses the other way round, camera axes of computer graphics, another unit."""
+def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | None:
+    """Return VIEWS_DISAGREE with what is wrong with the calibration, where another reading of it makes the cameras
+    agree: poses the other way round, camera axes of computer graphics, another unit. None if no reading does."""
     flip = np.diag([1.0, -1.0, -1.0])
     for inverse, graphics in itertools.product((False, True), repeat=2):
         poses = []
@@ -139,7 +139,7 @@ def explained(error: PblError, trial: MultiView, name: str, markers: MarkerSet) 
             next_step="convert rotation and translation in the calibration (docs/files.md, section Several cameras)",
             key=name,
         )
-    return error
+    return None
 
 
 def _points(trial: MultiView | WorldMarkers) -> np.ndarray:

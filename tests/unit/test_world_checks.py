@@ -249,7 +249,7 @@ def test_ankles_without_a_marker_on_the_foot_are_left_open(name: str, is_open: b
 
 
 def test_a_disagreement_that_nothing_explains_is_not_its_own_cause():
-    """What looks for the first cause of an error would never end, as a worker's job did."""
+    """A search for the first cause of an error would never end, as a worker's job did."""
     poses = list(rig().poses)
     poses[0] = CameraPose(poses[0].R_nc, poses[0].p_nc + np.array([0.4, 0.7, 1.1]))
     with pytest.raises(PblError, match="VIEWS_DISAGREE") as error:
