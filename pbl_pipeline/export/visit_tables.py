@@ -11,7 +11,7 @@ import numpy as np
 
 from pbl_pipeline.body import SLIDES, angle_of
 from pbl_pipeline.fit.angles_file import angles_table
-from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
+from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, NUMBERS, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
 from pbl_pipeline.kinetics import CURVES, CycleKinetics, Kinetics
 from pbl_pipeline.shipped import shipped_text
@@ -256,7 +256,7 @@ def _values(part: _Part) -> Iterator[tuple[str, str, float, str]]:
         for statistic in _STATISTICS:
             if (value := getattr(measure, statistic)) is not None:
                 yield name, statistic, float(value), ""
-    for statistic in ("mean", "left", "right", "sd", "minimal_change", "n"):
+    for statistic in (*NUMBERS, "n"):
         value = getattr(gdi, statistic)
         if value is not None:
             yield "gdi", statistic, float(value), ""
@@ -300,7 +300,7 @@ def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
     names = dict.fromkeys((*MEASURES, *(m for part in parts for m in part[2].of_task)))
     wanted = [(m, s) for m in names for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
-    wanted += [("gdi", s) for s in ("mean", "left", "right", "sd", "minimal_change", "n")]
+    wanted += [("gdi", s) for s in (*NUMBERS, "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     wanted += [(m, s) for m in KINETICS for s in _OF_FORCES]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])

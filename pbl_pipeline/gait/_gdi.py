@@ -14,9 +14,19 @@ from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 
-from .cycle_measures import Z90
+from .cycle_measures import Z90, far_leg_of
 from .events import LEFT, RIGHT
-from .measurement import MeasurementModel, Pass, estimate, expected_index, load_model, with_one_more
+from .measurement import (
+    MOST_LONGER,
+    MeasurementModel,
+    Pass,
+    estimate,
+    expected_index,
+    load_model,
+    unshrunk_index,
+    with_doubts,
+    with_one_more,
+)
 from .normative import (
     DEFAULT_NORM,
     NINE_ANGLES,
@@ -81,9 +91,6 @@ class GdiParams:
     lengthening: float = later(0.0)
 
 
-#: Errors count as at most so many times the squared distance that was found, which makes an index 15 points higher: a
-#: larger correction would be a guess.
-MOST_LONGER = 2.0
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
 #: The index of three angles by the paper's own recipe: the mean of the indices of all steps of a session, nothing taken
@@ -97,10 +104,11 @@ MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MO
 #: to 0.4, adduction -0.9 to 0.2. `lengthening` is the one of 0, 0.05, 0.1 ... with which the index and its change
 #: between two visits err least with 33 points on these persons (the sum of both mean squares); version 4 had 0.2.
 #: Version 6 takes the measured model of the error where there is one; these constants serve where there is none.
+#: Version 7: a direction of walking is one pass, at whatever angle it is seen; passes that disagree count less.
 GDI_METHODS: Stage[GdiParams] = Stage("gdi", "family", GDI_MODEL)
 GDI_METHODS.register(
     GDI_MODEL,
-    6,
+    7,
     GdiParams(average="passes", lasting=0.5, both_sides=0.25, lengthening=0.05),
     "pbl_pipeline.gait:score_gdi",
 )
@@ -111,6 +119,10 @@ _NAMES = {
     PAPER_INDEX: "GDI of three angles, the paper's recipe",
     GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)",
 }
+
+
+#: Numbers of an index: fields of `Gdi`, statistics of files.
+NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +145,9 @@ class Gdi:
     `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
     a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
     index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
-    detectable change (90 %) between two visits filmed alike.
+    detectable change (90 %) between two visits filmed alike. `unshrunk`: the index without people's distribution as
+    prior knowledge, for correlations and means over people; `mean` where that knows nothing of them either;
+    `unshrunk_sd`: standard deviation of its error.
     """
 
     status: str
@@ -152,6 +166,8 @@ class Gdi:
     profile: MovementProfile | None = None
     sd: float | None = None
     minimal_change: float | None = None
+    unshrunk: float | None = None
+    unshrunk_sd: float | None = None
 
     @property
     def interval(self) -> tuple[float, float] | None:
@@ -165,7 +181,7 @@ class Gdi:
 
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
-        rounded = {k: _rounded(getattr(self, k)) for k in ("left", "right", "mean", "sd", "minimal_change")}
+        rounded = {k: _rounded(getattr(self, k)) for k in NUMBERS}
         interval = interval_90(rounded["mean"], rounded["sd"])  # as a reader of the file computes it
         counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
         cycles = [dataclasses.asdict(c) for c in self.cycles]
@@ -185,6 +201,7 @@ def score_gdi(
     norm: NormativeSet | str | None = None,
     params: GdiParams | None = None,
     model: Method[GdiParams] | str | None = None,
+    error_model: MeasurementModel | None = None,
 ) -> Gdi:
     """Gait Deviation Index over the used cycles of one or several trials.
 
@@ -215,6 +232,8 @@ def score_gdi(
     model
         A method of `GDI_METHODS`, or its name, which decides the angles. Without it the norm's angles decide; a norm of
         other angles than the two indices have makes an index with another name.
+    error_model
+        Model of the curves' error instead of the one that the cycles name.
     """
     method = GDI_METHODS.find(model)
     basis = norm_of(norm, params or method.params)
@@ -233,17 +252,22 @@ def score_gdi(
     enough = bool(usable) and min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
     left, right, mean, profile, sd, minimal_change = None, None, None, None, None, None
+    unshrunk, unshrunk_sd, passes = None, None, []
     if enough:
-        if (model_of_error := _model_of_error(usable, basis, params)) is not None:
-            posterior = estimate(model_of_error, _passes(usable, vectors, basis))
-            expected = expected_index(posterior, basis, model_of_error.widening)
+        error_model = error_model or _model_of_error(usable, basis, params)
+        if error_model is not None:
+            passes = with_doubts(error_model, passes_of(usable, basis))
+            expected = expected_index(estimate(error_model, passes), basis, error_model.widening)
             left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
             minimal_change = minimal_change_of(expected.sd_anew)
+            if n_left and n_right:
+                unshrunk, unshrunk_sd = unshrunk_index(error_model, passes, basis)
         else:
             parts = _parts(usable, vectors, basis, params)
             left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
             mean = _weighted(parts)
             sd, minimal_change = _errors(parts, params)
+            unshrunk, unshrunk_sd = mean, sd
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
@@ -260,10 +284,12 @@ def score_gdi(
         model=model,
         params_hash=paramset.hash,
         cycles=scored,
-        qc=_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
+        qc=(*_checks(scored, {c.angle_model for c in usable}, basis, reason, params), *_agreement(passes, basis)),
         profile=profile,
         sd=sd,
         minimal_change=minimal_change,
+        unshrunk=unshrunk,
+        unshrunk_sd=unshrunk_sd,
     )
 
 
@@ -307,7 +333,7 @@ def intervals_with_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> dict[str
     model = _model_of_error(usable, basis, method.params)
     if model is None:
         return {}
-    passes = _passes(usable, [gdi_vector(c, basis) for c in usable], basis)
+    passes = with_doubts(model, passes_of(usable, basis))
     filmed_from = {LEFT: RIGHT, RIGHT: LEFT, "": ""}  # the leg that is behind
     return {filmed_from[k]: Z90 * sd for k, sd in with_one_more(model, passes, basis).items()}
 
@@ -321,19 +347,63 @@ def _model_of_error(cycles: Sequence[GaitCycle], norm: NormativeSet, params: Gdi
     return model if model.norm == norm.name else None
 
 
-def _passes(cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet) -> list[Pass]:
-    """The cycles by trial and view, as scores of the mean curves of each side."""
-    keys = [(c.trial, c.far_leg) for c in cycles]
-    scores = norm.scores(np.array(vectors))
+def passes_of(cycles: Sequence[GaitCycle], norm: NormativeSet) -> list[Pass]:
+    """Return the passes of the cycles' trials, as scores of the mean curves of each side.
+
+    All cycles of a trial that are walked in one direction have one view, that of most of them (`far_leg_of`): the error
+    of a pass is drawn once, at whatever angle its cycles are seen. Directions that are seen from one side are one pass.
+    """
+    views = _views(cycles)
+    scores = norm.scores(np.array([gdi_vector(c, norm) for c in cycles]))
     unseen = np.full(len(norm.components), np.nan)
     out = []
-    for key in dict.fromkeys(keys):
+    for trial, far_leg in dict.fromkeys(views):
         own = [
-            np.array([k == key and c.side == side for k, c in zip(keys, cycles, strict=True)]) for side in (LEFT, RIGHT)
+            np.array([v == (trial, far_leg) and c.side == side for v, c in zip(views, cycles, strict=True)])
+            for side in (LEFT, RIGHT)
         ]
         left, right = (scores[o].mean(axis=0) if o.any() else unseen for o in own)
-        out.append(Pass((left, right), (int(own[0].sum()), int(own[1].sum())), key[1]))
+        out.append(Pass((left, right), (int(own[0].sum()), int(own[1].sum())), far_leg, trial))
     return out
+
+
+def _views(cycles: Sequence[GaitCycle]) -> list[tuple[str, str]]:
+    """Trial and view of each cycle's direction of walking, which ends where the other leg comes to be behind."""
+    directions: dict[tuple[str, int], list[int]] = {}
+    number, side = {}, {}
+    for i in sorted(range(len(cycles)), key=lambda i: cycles[i].number):
+        trial, far_leg = cycles[i].trial, cycles[i].far_leg
+        turned = far_leg and side.get(trial, far_leg) != far_leg
+        number[trial] = number.get(trial, 0) + bool(turned)
+        side[trial] = far_leg or side.get(trial, "")
+        directions.setdefault((trial, number[trial]), []).append(i)
+    of_cycle = {i: (key[0], far_leg_of([cycles[i] for i in own])) for key, own in directions.items() for i in own}
+    return [of_cycle[i] for i in range(len(cycles))]
+
+
+def _agreement(passes: Sequence[Pass], norm: NormativeSet) -> tuple[Check, ...]:
+    """Check `passes_agree` of two passes and more: the ones that were doubted, with what differs most."""
+    if len(passes) < 2:
+        return ()
+    doubted = [p for p in passes if p.doubt is not None]
+    which = "; ".join(_difference(p, norm) for p in doubted)
+    advice = ""
+    if len(doubted) == len(passes):
+        advice = (
+            f"the passes differ by more than their error, and it is not known which is right: {which}. The interval of "
+            "the index is wider. Look at each of them"
+        )
+    elif doubted:
+        advice = f"differs from the other passes and counts little in the index: {which}. Look at it"
+    return (warn_if(advice, "passes_agree", float(len(doubted)), 0.0, advice),)
+
+
+def _difference(seen: Pass, norm: NormativeSet) -> str:
+    """Name of a doubted pass, and which angle of which leg is how far from what the others let expect."""
+    away = (np.reshape(np.asarray(seen.doubt), (2, -1)) @ norm.components).reshape(2, len(norm.variables), -1)
+    size = np.sqrt(np.mean(away**2, axis=-1))
+    side, angle = np.unravel_index(np.argmax(size), size.shape)
+    return f"{seen.trial}, {(LEFT, RIGHT)[side]} {norm.variables[angle]} by {size[side, angle]:.0f} deg"
 
 
 class _Part(NamedTuple):

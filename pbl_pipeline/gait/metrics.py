@@ -245,9 +245,14 @@ def pool_trials(
     pooled = [t for t, c in zip(trials, given, strict=True) if c.pooled(params.gdi.pace)]
     cycles = [c for t in pooled for c in t.cycles]
     # Two trials may have one name, by which their cycles are distinguished.
-    distinct = [dataclasses.replace(c, trial=f"{i} {c.trial}") for i, t in enumerate(pooled) for c in t.cycles]
+    names = Counter(t.name for t in pooled)
+    distinct = [
+        dataclasses.replace(c, trial=t.name if names[t.name] == 1 else f"{t.name} ({i + 1})")
+        for i, t in enumerate(pooled)
+        for c in t.cycles
+    ]
     measures = with_errors(spatiotemporal(distinct), cycles, params.events)
-    gdi = score_gdi(cycles, norm, params.gdi, model)
+    gdi = score_gdi(distinct, norm, params.gdi, model)
     status = PASS if measures.status == PASS else EMPTY
     reason = "" if status == PASS else "; ".join(dict.fromkeys(f"{t.name}: {t.reason}" for t in pooled))
     if not pooled:

@@ -14,7 +14,7 @@ from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
 
 from ._cycles import REPORT_PERCENT, GaitCycle
-from ._gdi import Gdi, GdiCycle
+from ._gdi import NUMBERS, Gdi, GdiCycle
 from .cycle_measures import MEASURES, Measure, Spatiotemporal
 from .events import GaitEvent, GaitEvents
 from .metrics import GaitMetrics, TrialMetrics
@@ -72,7 +72,7 @@ def load_curves(path: Path) -> dict[int, Curves]:
 
 
 #: Checks of the index among the checks of a trial or session; the others are of its measures.
-INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention")
+INDEX_CHECKS = ("gdi_cycles", "gdi_explained", "norm_convention", "passes_agree")
 #: Rounding of the times in events.csv (s).
 _ROUNDED_S = 1e-3
 
@@ -173,7 +173,7 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
     told, profile = content["gdi"], content.get("profile_deg")
     own = tuple(structured(c, GdiCycle) for c in told.get("cycles", ())) if cycles is None else tuple(cycles)
     known = None if profile is None else structured(profile, MovementProfile)
-    numbers = {n: told[n] for n in ("left", "right", "mean")} | {n: told.get(n) for n in ("sd", "minimal_change")}
+    numbers = {n: told.get(n) for n in NUMBERS} | {n: told[n] for n in ("left", "right", "mean")}
     if (numbers["sd"] is None) != (numbers["minimal_change"] is None):
         raise ValueError("an index with one of sd and minimal_change")
     return Gdi(

@@ -88,6 +88,7 @@ ORDER = (
     "norm_convention",
     "gdi_cycles",
     "gdi_explained",
+    "passes_agree",
 )
 _PLACE = {name: i for i, name in enumerate(ORDER)}
 

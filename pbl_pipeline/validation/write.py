@@ -105,7 +105,7 @@ class Table:
 
 
 #: Columns of the indices: of a visit by one kind of recordings (`kind`: single, rig, markers) against a norm that was
-#: built from cycles of `norm_kind`; "" for one that ships.
+#: built from cycles of `norm_kind`; "" for one that ships. `index`: `Gdi.unshrunk`.
 INDEX_COLUMNS = ("subject", "session_label", "session_id", "kind", "method", "norm", "norm_kind", "index")
 #: Columns of the pairs: the index of one camera and of several, of one visit.
 PAIR_COLUMNS = ("subject", "session_label", "single", "rig", "single_norm", "rig_norm")
@@ -113,14 +113,16 @@ _ROW = "GDI of one camera against several"
 
 
 def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
-    """Visits that have an index of one camera and one of several, each with a norm of the same kind, as pairs.
+    """First visits of persons with an index of one camera and one of several, each with a norm of the same kind, as
+    pairs.
 
     Raises `PblError` USAGE: a visit has several such indices of one kind, by several methods or norms.
 
     Parameters
     ----------
     indices
-        Rows with `INDEX_COLUMNS`. An index with a norm of another kind, or with an included norm, does not count.
+        Rows with `INDEX_COLUMNS`, both indices by one estimator (`Gdi.unshrunk`). An index with a norm of another kind,
+        or with an included norm, does not count.
     """
     own: Any = indices[(indices["kind"] == indices["norm_kind"]) & indices["index"].notna()]
     twice = own[own.duplicated(["session_id", "kind"], keep=False)]
@@ -136,7 +138,8 @@ def index_pairs(indices: pd.DataFrame) -> pd.DataFrame:
     kinds = [
         own.loc[own["kind"] == k, columns].rename(columns={"index": k, "norm": f"{k}_norm"}) for k in ("single", "rig")
     ]
-    return kinds[0].merge(kinds[1], on=columns[:3])[list(PAIR_COLUMNS)]
+    pairs: Any = kinds[0].merge(kinds[1], on=columns[:3])
+    return pairs.sort_values("session_id").drop_duplicates("subject", ignore_index=True)[list(PAIR_COLUMNS)]
 
 
 def index_agreement(pairs: pd.DataFrame) -> Table:
@@ -158,15 +161,14 @@ def index_agreement(pairs: pd.DataFrame) -> Table:
         "sd, one camera": Cell(float(np.std(one, ddof=1)), n=n),
         "sd, several": Cell(float(np.std(several, ddof=1)), n=n),
     }
-    persons = pairs["subject"].nunique()
     norms = [", ".join(sorted(set(pairs[f"{k}_norm"]))) for k in ("single", "rig")]
     return Table(
         "index_agreement",
         "Index of one camera against several, each with a norm of the same kind",
         {(_ROW, column): cell for column, cell in values.items()},
-        f"{n} visits of {persons} persons. Norms: {norms[0]} (one camera), {norms[1]} (several). Bias: one camera "
-        "minus several; limits of agreement hold 95 % of the visits. r with its 95 % interval, which is too narrow "
-        "where a person has several visits.",
+        f"The first such visit of each of {n} persons. Norms: {norms[0]} (one camera), {norms[1]} (several). Both "
+        "indices are unshrunk. Bias: one camera minus several; limits of agreement hold 95 % of the persons. r with "
+        "its 95 % interval.",
         {column: 1 if column not in ("r", "r, low", "r, high") else 2 for column in values},
     )
 

@@ -19,7 +19,7 @@ import pandas as pd
 from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
-from pbl_pipeline.gait import MEASURES, Z90, load_norm
+from pbl_pipeline.gait import MEASURES, Z90, GaitCycle, load_norm, passes_of, score_gdi
 from pbl_pipeline.gait.events import LEFT, RIGHT
 from pbl_pipeline.gait.events import METHODS as EVENT_METHODS
 from pbl_pipeline.gait.measurement import (
@@ -30,16 +30,14 @@ from pbl_pipeline.gait.measurement import (
     View,
     chances,
     change_sd,
-    estimate,
-    expected_index,
     load_model,
     measure_error,
 )
 from pbl_pipeline.gait.normative import DEFAULT_NORM, NormativeSet
 from research.corpus.passes import ANGLES, PASSES, SESSIONS, STEP_DEG
-from research.corpus.walks import HEALTHY
+from research.corpus.walks import ANYWHERE, HEALTHY, THERE_AND_BACK
 
-#: The leg behind the other, by view of the corpus.
+#: The leg behind the other, by view of the corpus; of the views that are left out it differs.
 FAR_LEG = {"sagittal": RIGHT, "sagittal_right": LEFT, "frontal": "", "rear": "", "oblique": ""}
 MIRRORED = {"sagittal": "sagittal_right", "sagittal_right": "sagittal"}
 OTHER = {LEFT: RIGHT, RIGHT: LEFT, "": ""}
@@ -56,7 +54,7 @@ ALONE, TOGETHER = "fitted alone", "fitted together"
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """A pass: whose, its scores (2, K) and the true ones, how many cycles each side has."""
+    """A recording: whose, its cycles and the passes that the index makes of them, and the true scores (2, K)."""
 
     person: str
     held_out: bool
@@ -66,9 +64,9 @@ class Seen:
     view: str
     visit: int
     session: tuple[str, int]  # that it was fitted in: kind (of `SESSIONS`) and number
-    scores: np.ndarray
+    cycles: tuple[GaitCycle, ...]
+    passes: tuple[Pass, ...]
     true: np.ndarray
-    n_cycles: tuple[int, int]
     within: np.ndarray  # (K, K) sum of squares of the cycles' scores about their side's mean
     measures: np.ndarray  # (2, M) of `gait.MEASURES`, found and true
     angles: np.ndarray  # (2, 2, 3, 2) deg: found and true, left and right, `ANGLES`, mean and range of the mean curve
@@ -82,32 +80,40 @@ class Seen:
         """True if it was fitted alone."""
         return sum(SESSIONS[self.session[0]].values()) == 1
 
+    @property
+    def turns(self) -> bool:
+        """True if not all of its cycles have the same leg behind the other."""
+        return len({c.far_leg for c in self.cycles}) > 1
+
     def mirrored(self) -> Seen:
-        """The same pass of the mirrored person."""
+        """The same recording of the mirrored person."""
         return dataclasses.replace(
             self,
             angles=self.angles[:, ::-1],
             view=MIRRORED.get(self.view, self.view),
-            scores=self.scores[::-1],
+            passes=tuple(_mirrored(p) for p in self.passes),
             true=self.true[::-1],
-            n_cycles=self.n_cycles[::-1],
         )
 
-    def as_pass(self) -> Pass:
-        return Pass((self.scores[0], self.scores[1]), self.n_cycles, FAR_LEG[self.view])
+
+def _mirrored(seen: Pass) -> Pass:
+    (left, right), (n_left, n_right) = seen.scores, seen.n_cycles
+    return Pass((right, left), (n_right, n_left), OTHER[seen.far_leg])
 
 
 def read_passes(folder: Path, norm: NormativeSet) -> list[Seen]:
-    """The passes of all `passes-*.npz` of a folder and those in it that have cycles of both sides."""
+    """The recordings of all `passes-*.npz` of a folder and those in it that have cycles of both sides."""
     out = []
     for path in sorted(folder.rglob("*.npz")):
         with np.load(path, allow_pickle=False) as file:
             data = dict(file)
         columns = zip(_scores(data, "detected", norm), _scores(data, "true", norm), strict=True)
         angles = list(zip(_angles(data, "detected"), _angles(data, "true"), strict=True))
+        cycles = list(_cycles(data))
         for i, (found, true) in enumerate(columns):
             if min(map(len, found)) == 0 or min(map(len, true)) == 0:
                 continue
+            passes = passes_of(cycles[i], norm)
             off = np.concatenate([side - side.mean(axis=0) for side in found])
             out.append(
                 Seen(
@@ -119,15 +125,30 @@ def read_passes(folder: Path, norm: NormativeSet) -> list[Seen]:
                     str(data["view"][i]),
                     int(data["visit"][i]),
                     (str(data["session"][i]), int(data["number"][i])),
-                    np.array([side.mean(axis=0) for side in found]),
+                    cycles[i],
+                    tuple(passes),
                     np.array([side.mean(axis=0) for side in true]),
-                    (len(found[0]), len(found[1])),
                     off.T @ off,
                     np.array([data["measures"][i], data["true_measures"][i]]),
                     np.array(angles[i]),
                 )
             )
     return out
+
+
+def _cycles(data: dict[str, np.ndarray]) -> Iterator[tuple[GaitCycle, ...]]:
+    """Return the used cycles of each recording, by which `score_gdi` knows it."""
+    ends = np.cumsum(data["detected_curves_n"])[:-1]
+    columns = (np.split(data[f"detected_{k}"], ends) for k in ("curves", "right", "far_leg"))
+    for i, (curves, right, far_leg) in enumerate(zip(*columns, strict=True)):
+        name = f"{data['view'][i]} {data['recording'][i]}"
+        yield tuple(
+            GaitCycle(
+                name, k, 0, RIGHT if right[k] else LEFT, 0.0, 0.0, 0.0, 0.0, 1.0,
+                curves=dict(zip(ANGLES, curves[k] * STEP_DEG, strict=True)), far_leg=str(far_leg[k]),
+            )
+            for k in range(len(curves))
+        )  # fmt: skip
 
 
 def _scores(data: dict[str, np.ndarray], kind: str, norm: NormativeSet) -> Iterator[list[np.ndarray]]:
@@ -156,38 +177,45 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
     components by the means of products of two passes of a walk: of different views `person`; of one view at two visits
     `person` and `view`; of different views in one fit `person` and `visit`; of a pass with itself all. Mirrored passes
     count as well: left and right are alike. Of passes fitted alone `visit` is 0."""
-    both = [*seen, *(s.mirrored() for s in seen)]
-    true = np.array([s.true.ravel() for s in both])
+    both = [
+        (s, p, i >= len(seen))
+        for i, s in enumerate([*seen, *(s.mirrored() for s in seen)])
+        for p in s.passes
+        if min(p.n_cycles) > 0
+    ]
+    true = np.array([s.true.ravel() for s, _, _ in both])
+    found = np.array([np.concatenate(p.scores) for _, p, _ in both])
+    far_legs = np.array([p.far_leg for _, p, _ in both])
     mean, spread = true.mean(axis=0), np.cov(true.T)
     terms: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for far_leg in ("", LEFT):
-        own = [s for s in both if FAR_LEG[s.view] == far_leg]
-        off = np.array([s.true.ravel() for s in own]) - mean
-        error = np.array([(s.scores - s.true).ravel() for s in own])
+        own = far_legs == far_leg
+        off, error = true[own] - mean, (found - true)[own]
         about = error.mean(axis=0)
         slope = np.linalg.solve(off.T @ off + RIDGE * len(off) * np.eye(len(mean)), off.T @ (error - about))
         terms[far_leg] = about - slope.T @ off.mean(axis=0), slope.T
     half = len(mean) // 2
     terms[RIGHT] = np.roll(terms[LEFT][0], half), np.roll(terms[LEFT][1], (half, half), axis=(0, 1))
-    by_walk: dict[tuple, list[tuple[Seen, np.ndarray]]] = {}
-    for i, s in enumerate(both):
-        bias, slope = terms[FAR_LEG[s.view]]
-        rest = (s.scores - s.true).ravel() - bias - slope @ (s.true.ravel() - mean)
-        by_walk.setdefault((s.walk, i >= len(seen)), []).append((s, rest))
+    by_walk: dict[tuple, list[tuple[Seen, str, np.ndarray]]] = {}
+    for (s, p, mirrored), y, x in zip(both, found, true, strict=True):
+        bias, slope = terms[p.far_leg]
+        by_walk.setdefault((s.walk, mirrored), []).append((s, p.far_leg, y - x - bias - slope @ (x - mean)))
     products: dict[tuple[str, str], list[np.ndarray]] = {}
     for group in by_walk.values():
-        for (a, x), (b, y) in itertools.combinations(group, 2):
+        for (a, of_a, x), (b, of_b, y) in itertools.combinations(group, 2):
             of_one_fit = (a.visit, a.session) == (b.visit, b.session)
-            if of_one_fit and a.view != b.view:
+            if a is b:
+                continue  # two directions of one recording
+            if of_one_fit and of_a != of_b:
                 products.setdefault(("visit", ""), []).append(_symmetric(x, y))
             elif a.visit == b.visit and not (a.alone and b.alone):
                 continue  # the same recordings are in several fits
-            elif a.view != b.view:
+            elif of_a != of_b:
                 products.setdefault(("person", ""), []).append(_symmetric(x, y))
             elif a.visit != b.visit:
-                products.setdefault(("view", FAR_LEG[a.view]), []).append(_symmetric(x, y))
-        for s, x in group:
-            products.setdefault(("all", FAR_LEG[s.view]), []).append(np.outer(x, x))
+                products.setdefault(("view", of_a), []).append(_symmetric(x, y))
+        for _, far_leg, x in group:
+            products.setdefault(("all", far_leg), []).append(np.outer(x, x))
     person = _positive(np.mean(products["person", ""], axis=0))
     common = products.get(("visit", ""), [person])
     visit = _positive(np.mean(common, axis=0) - person)
@@ -197,7 +225,8 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
         view = _positive(np.mean(products["view", far_leg], axis=0) - person)
         anew = _positive(np.mean(products["all", far_leg], axis=0) - person - visit - view) + LEAST * np.eye(len(mean))
         views[far_leg] = View(bias, np.eye(len(mean)) + slope, view, anew)
-    freedom = sum(sum(s.n_cycles) - 2 for s in seen)
+    freedom = sum(len(s.cycles) - 2 for s in seen)
+    n_cycles = [n for _, p, _ in both for n in p.n_cycles]
     return MeasurementModel(
         "",
         norm.name,
@@ -208,15 +237,18 @@ def fit_model(seen: Sequence[Seen], norm: NormativeSet, fits: Sequence[str], wid
         visit,
         views | {RIGHT: views[LEFT].mirrored()},
         np.sum([s.within for s in seen], axis=0) / freedom,
-        float(np.median([n for s in seen for n in s.n_cycles])),
+        float(np.median(n_cycles)),
         widening,
         EVENT_METHODS.find().paramset.hash,
-        float(np.median([sum(s.n_cycles) for s in seen])),
-        {
-            far_leg: parts_of_errors([s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")])
-            for far_leg in ("", LEFT)
-        },
+        float(np.median([len(s.cycles) for s in seen])),
+        {far_leg: parts_of_errors([s for s in seen if far_leg_of_view(s) == bool(far_leg)]) for far_leg in ("", LEFT)},
     )
+
+
+def far_leg_of_view(seen: Seen) -> bool | None:
+    """Return True for a view from a side, False for one from the front, the back or between; None for one that differs
+    between recordings or in one."""
+    return None if seen.view in (ANYWHERE, THERE_AND_BACK) else FAR_LEG[seen.view] != ""
 
 
 def parts_of_errors(seen: Sequence[Seen]) -> dict[str, MeasureError]:
@@ -277,36 +309,42 @@ def sessions_of(seen: Iterable[Seen]) -> Iterator[tuple[str, int, list[Seen]]]:
 
 
 def judged(seen: Iterable[Seen], model: MeasurementModel, norm: NormativeSet) -> pd.DataFrame:
-    """A row per session: whose, the true index, the found one with its errors, and that of the plain mean curves."""
+    """A row per session: whose, the true index, and what `score_gdi` says of all its cycles."""
     rows = []
-    for kind, visit, passes in sessions_of(seen):
-        found = expected_index(estimate(model, [s.as_pass() for s in passes]), norm, model.widening)
-        plain, true = (np.mean([getattr(s, n) for s in passes], axis=0) for n in ("scores", "true"))
-        first = passes[0]
+    for kind, visit, recordings in sessions_of(seen):
+        found = score_gdi([c for s in recordings for c in s.cycles], norm, error_model=model)
+        true = np.mean([s.true for s in recordings], axis=0)
+        first = recordings[0]
         rows.append(
             {
                 "kind": kind,
-                "passes": len(passes),
+                "passes": len(recordings),
                 **{n: getattr(first, n) for n in ("person", "held_out", "source", "condition", "severity")},
                 "visit": visit,
+                "turns": any(s.turns for s in recordings),
                 "true": norm.index_of_scores(true).mean(),
-                "plain": norm.index_of_scores(plain).mean(),
                 "found": found.mean,
                 "sd": found.sd,
-                "sd_anew": found.sd_anew,
+                "sd_anew": (found.minimal_change or np.nan) / (np.sqrt(2.0) * Z90),
+                "unshrunk": found.unshrunk,
+                "unshrunk_sd": found.unshrunk_sd,
+                "disagree": any(c.check == "passes_agree" and c.advice for c in found.qc),
             }
         )
     return pd.DataFrame(rows)
 
 
 def error_table(frame: pd.DataFrame) -> pd.DataFrame:
-    """Per kind of session: bias, sd and rms of the error, of the plain mean curves beside it; the fraction of 90 %
-    intervals that hold the truth; the fraction of pairs of visits without a change that lie within the minimal one."""
+    """Per kind of session: bias, sd and rms of the error; of the unshrunk index beside it, with its slope on the true
+    one among healthy walks; the fraction of 90 % intervals that hold the truth, and of visits whose passes are said to
+    disagree; the fraction of pairs of visits without a change that lie within the minimal one."""
     rows: list[dict[str, Any]] = []
     single = frame[frame["passes"] == 1]
-    groups = [("one pass, any view", single)] if len(single) else []
+    groups = [("all", frame), ("far leg changes", frame[frame["turns"]]), ("one pass, any view", single)]
+    groups = [(name, group) for name, group in groups if len(group)]
     for name, group in [*groups, *frame.groupby("kind", sort=False)]:
-        off, plain = group["found"] - group["true"], group["plain"] - group["true"]
+        off, unshrunk = group["found"] - group["true"], group["unshrunk"] - group["true"]
+        healthy = group[group["condition"] == HEALTHY]
         keys = ["kind", "person", "condition", "severity"]
         visits: Any = group.groupby([*keys, "visit"])[["found", "sd_anew"]].first().unstack("visit").dropna()
         apart = (visits["found"][0] - visits["found"][1]).abs()
@@ -318,8 +356,11 @@ def error_table(frame: pd.DataFrame) -> pd.DataFrame:
                 "bias": off.mean(),
                 "sd": off.std(),
                 "rms": float(np.sqrt((off**2).mean())),
-                "plain bias": plain.mean(),
-                "plain sd": plain.std(),
+                "unshrunk bias": unshrunk.mean(),
+                "unshrunk sd": unshrunk.std(),
+                "stated": group["unshrunk_sd"].mean(),
+                "slope": np.polyfit(healthy["true"], healthy["unshrunk"], 1)[0] if len(healthy) > 2 else np.nan,
+                "disagree": group["disagree"].mean(),
                 "recorded bias": off[group["source"] == "recorded"].mean(),
                 "mean sd": group["sd"].mean(),
                 "in 90 %": (off.abs() <= Z90 * group["sd"]).mean(),
@@ -355,12 +396,12 @@ def change_table(frame: pd.DataFrame) -> pd.DataFrame:
     left out."""
     keys = ["kind", "person"]
     own: Any = frame[frame["source"] == "synthetic"]
-    healthy: Any = own[own["condition"].isin(["", HEALTHY])].groupby(keys)[["found", "plain", "true"]].mean()
+    healthy: Any = own[own["condition"].isin(["", HEALTHY])].groupby(keys)[["found", "unshrunk", "true"]].mean()
     severe: Any = own[own["severity"] == own["severity"].max()]
-    change: Any = severe.groupby(["condition", *keys])[["found", "plain", "true"]].mean() - healthy
+    change: Any = severe.groupby(["condition", *keys])[["found", "unshrunk", "true"]].mean() - healthy
     total: Any = change.dropna().groupby(["kind", "condition"]).mean()
     total = total[total["true"].abs() >= 3.0]
-    share: Any = pd.DataFrame({n: total[n] / total["true"] for n in ("found", "plain")})
+    share: Any = pd.DataFrame({n: total[n] / total["true"] for n in ("found", "unshrunk")})
     return share.unstack("kind")
 
 
@@ -460,13 +501,13 @@ def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame
     truth, and of pairs of two visits in one view within the minimal detectable change."""
     rows = []
     for title, far_leg in (("sides", LEFT), ("front, back", "")):
-        own = [s for s in seen if (FAR_LEG[s.view] != "") == (far_leg != "")]
+        own = [s for s in seen if far_leg_of_view(s) == bool(far_leg)]
         for k, name in enumerate(MEASURES):
             held, within, sds = [], [], []
             visits: dict[tuple, dict[int, tuple[float, float]]] = {}
             for s in own:
                 stated, off = (
-                    measure_error(model, name, {far_leg: sum(s.n_cycles)}),
+                    measure_error(model, name, {far_leg: len(s.cycles)}),
                     s.measures[0, k] - s.measures[1, k],
                 )
                 if stated is None or not np.isfinite(off):
@@ -490,7 +531,7 @@ def angle_errors(seen: Sequence[Seen]) -> pd.DataFrame:
     """Error (deg) of mean and range of each angle's mean curve, of one pass: bias and sd of the leg near to the camera
     and of the one behind it, or of both from front and back."""
     rows = []
-    far = {title: [s for s in seen if FAR_LEG[s.view] == leg] for title, leg in ((RIGHT, RIGHT), (LEFT, LEFT))}
+    far = {title: [s for s in seen if FAR_LEG.get(s.view) == leg] for title, leg in ((RIGHT, RIGHT), (LEFT, LEFT))}
     errors = {n: np.array([s.angles[0] - s.angles[1] for s in own]) for n, own in far.items()}
     other = np.array([s.angles[0] - s.angles[1] for s in seen if s.view in ("frontal", "rear")])
     groups = {

@@ -26,8 +26,12 @@ from pbl_pipeline.gait import MEASURES, detect_events, feet_from_fit, find_cycle
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.synthetic import IMPAIRMENTS
 from research.corpus.walks import (
+    ANYWHERE,
     CAMERAS,
+    LONG_SECONDS,
+    SECONDS,
     SEVERITIES,
+    THERE_AND_BACK,
     Case,
     Walk,
     detector_model,
@@ -35,6 +39,7 @@ from research.corpus.walks import (
     recorded_walks,
     synthetic_seeds,
     synthetic_walk,
+    there_and_back,
 )
 
 #: Walks whose passes are fitted in one call.
@@ -48,6 +53,8 @@ SESSIONS: dict[str, dict[str, int]] = {
     "front": {"frontal": 1},
     "back": {"rear": 1},
     "obliquely": {"oblique": 1},
+    "from anywhere": {ANYWHERE: 1},
+    "there and back": {THERE_AND_BACK: 1},
     "both sides": {"sagittal": 1, "sagittal_right": 1},
     "both sides twice": {"sagittal": 2, "sagittal_right": 2},
     "sides, front, back": {"sagittal": 1, "sagittal_right": 1, "frontal": 1, "rear": 1},
@@ -58,26 +65,28 @@ ANGLES = ("hip_flexion", "hip_adduction", "knee_flexion")
 STEP_DEG = 0.01
 
 
-def walks_of(people: int, tuning: int, motions: Path | None) -> Iterator[tuple]:
+def walks_of(people: int, tuning: int, motions: Path | None, impaired: int | None = None) -> Iterator[tuple]:
     """Arguments of `walk_of`: of `people` synthetic ones, half of them held out, and `tuning` further ones who are not,
-    healthy and with each impairment at two severities, and of the recorded ones of a folder."""
+    healthy and with each impairment at two severities, or with so many (`impaired`) of these, drawn for each person,
+    and of the recorded ones of a folder."""
     seeds = synthetic_seeds(people // 2)
     further = [s for s in synthetic_seeds(people // 2 + tuning) if s not in seeds and not is_held_out(f"synthetic {s}")]
     for seed in seeds + further:
         yield ("synthetic", seed, "", 0.0)
-        for name in IMPAIRMENTS:
-            for severity in SEVERITIES:
-                yield ("synthetic", seed, name, severity)
+        each = [(name, severity) for name in IMPAIRMENTS for severity in SEVERITIES]
+        drawn = np.random.default_rng([seed, 43]).permutation(len(each))
+        for i in sorted(drawn[:impaired]):
+            yield ("synthetic", seed, *each[i])
     if motions is not None:
-        for i in range(len(recorded_walks(motions))):
-            yield ("recorded", str(motions), i)
+        for walk in recorded_walks(motions):
+            yield ("recorded", str(motions), walk.person)
 
 
-def walk_of(which: tuple) -> Walk:
-    """A walk by the arguments that `walks_of` gives."""
+def walk_of(which: tuple, seconds: float = SECONDS) -> Walk | None:
+    """A walk by the arguments that `walks_of` gives; None for a recorded person without one that is so long."""
     if which[0] == "synthetic":
-        return synthetic_walk(*which[1:])
-    return recorded_walks(which[1])[which[2]]
+        return synthetic_walk(*which[1:], seconds=seconds)
+    return next((w for w in recorded_walks(which[1], seconds) if w.person == which[2]), None)
 
 
 class Fitted(NamedTuple):
@@ -95,18 +104,27 @@ class Fitted(NamedTuple):
 
 def observed(which: tuple, detector: str, kinds: Sequence[str]) -> list[Fitted]:
     """The sessions of a walk at each visit. The camera is held at one visit and stands at the other."""
-    walk = walk_of(which)
+    walk, longer = walk_of(which), walk_of(which, LONG_SECONDS) if "there and back" in kinds else None
+    if walk is None:
+        return []
     first = len(walk.person) + int(10 * walk.severity)
+    walks = {THERE_AND_BACK: None if longer is None else there_and_back(longer)}
     out = []
     for visit in range(VISITS):
-        views = dict.fromkeys(v for kind in kinds for v in SESSIONS[kind])
+        views = dict.fromkeys(v for kind in kinds for v in SESSIONS[kind] if walks.get(v, walk) is not None)
         cases = {
-            v: [Case(walk, v, CAMERAS[(first + visit) % 2], detector, visit, 1 + i) for i in range(PASSES)]
+            v: [
+                Case(w, v, CAMERAS[(first + visit) % 2], detector, visit, 1 + i)
+                for i in range(PASSES)
+                if (w := walks.get(v, walk)) is not None
+            ]
             for v in views
         }
         seen = {v: [c.keypoints() for c in cases[v]] for v in views}
         for kind in kinds:
             wanted = SESSIONS[kind]
+            if not set(wanted) <= set(views):
+                continue
             for number in range(PASSES + 1 - max(wanted.values())):
                 own = [(v, number + i) for v, n in wanted.items() for i in range(n)]
                 out.append(Fitted(kind, number, [cases[v][i] for v, i in own], [seen[v][i] for v, i in own]))
@@ -114,11 +132,13 @@ def observed(which: tuple, detector: str, kinds: Sequence[str]) -> list[Fitted]:
 
 
 def _curves(cycles: Sequence) -> dict[str, np.ndarray]:
-    """Curves (N, 3, 51) of the used cycles as integers of `STEP_DEG`, and their sides."""
+    """Curves (N, 3, 51) of the used cycles in order of time, as integers of `STEP_DEG`, their sides, and the leg behind
+    the other in each (`GaitCycle.far_leg`)."""
     used = [c for c in cycles if c.used and all(a in c.curves for a in ANGLES)]
     values = np.array([[c.curves[a] for a in ANGLES] for c in used]).reshape(-1, 3, 51)
     sides = np.array([c.side == "right" for c in used], bool)
-    return {"curves": np.round(values / STEP_DEG).astype(np.int16), "right": sides}
+    far = np.array([c.far_leg for c in used], "<U5")
+    return {"curves": np.round(values / STEP_DEG).astype(np.int16), "right": sides, "far_leg": far}
 
 
 def _measures(cycles: Sequence) -> np.ndarray:
@@ -153,7 +173,7 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
         values = [r[key] for r in rows]
         if np.ndim(values[0]) == 0:
             out[key] = np.array(values)
-        elif key.endswith(("_curves", "_right")):
+        elif key.endswith(("_curves", "_right", "_far_leg")):
             out[key] = np.concatenate(values)
             out[f"{key}_n"] = np.array([len(v) for v in values])
         else:
@@ -166,6 +186,7 @@ def save_rows(path: Path, rows: Sequence[dict]) -> None:
 @click.option("--motions", type=click.Path(path_type=Path), metavar="DIR", help="Recorded motions, with index.csv.")
 @click.option("--people", default=12, show_default=True, help="Synthetic people, half of them held out.")
 @click.option("--tuning", default=0, show_default=True, help="Further synthetic people who are not held out.")
+@click.option("--impaired", type=int, help="Walks of each synthetic person with an impairment (default: all).")
 @click.option("--detector", default="blazepose-heavy", show_default=True, metavar="NAME", help="Error model.")
 @click.option(
     "--session", "kinds", multiple=True, type=click.Choice(list(SESSIONS)), help="Kind of session (default: all)."
@@ -183,6 +204,7 @@ def main(
     motions: Path | None,
     people: int,
     tuning: int,
+    impaired: int | None,
     detector: str,
     kinds: Sequence[str],
     processes: int,
@@ -194,7 +216,7 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     model = detector_model(detector)
     method = METHODS[default_fit((model.marker_set, model.root_relative))]
-    walks = list(walks_of(people, tuning, motions))
+    walks = list(walks_of(people, tuning, motions, impaired))
     walks = [walks[i] for i in np.random.default_rng(0).permutation(len(walks))]  # any part of them has all kinds
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the processes, which leave a GPU to this one
     with multiprocessing.get_context("spawn").Pool(processes) as pool:

@@ -29,10 +29,16 @@ from research.corpus.motions import Motion, read_motions
 from research.corpus.true_fit import fit_of_qpos
 from research.walker.detectors import DETECTORS, DetectorModel
 from research.walker.observe import observe, resized, zoomed
+from research.walker.turns import turned
 
 #: A trial of the corpus (s, frames a second).
 SECONDS, RATE_HZ = 6.0, 30.0
 VIEWS = ("frontal", "rear", "sagittal", "sagittal_right", "oblique")
+#: Further views of passes: from a direction that is drawn for each recording; from the left on the way there and from
+#: the right on the way back, of a walk that turns round (`there_and_back`).
+ANYWHERE, THERE_AND_BACK = "anywhere", "there_and_back"
+#: Length (s) of a walk that turns round, when it begins to turn, and how long the turn lasts.
+LONG_SECONDS, TURN_FROM_S, TURN_S = 15.0, 8.0, 1.5
 CAMERAS = ("static", "handheld")
 HEALTHY = "healthy"
 #: Severities of an impairment at two visits.
@@ -109,13 +115,18 @@ class Case:
         model = detector_model(self.detector)
         drawn = f"|{self.visit}|{self.recording}" if self.visit or self.recording else ""
         seed = _number(f"{self.walk.person}|{self.view}|{self.camera}|{self.detector}{drawn}")
+        view: str | float = "sagittal" if self.view == THERE_AND_BACK else self.view
+        passing, lens_view = float("sagittal" in view), view
+        if view == ANYWHERE:
+            view, lens_view = float(np.random.default_rng([seed, 41]).uniform(-180.0, 180.0)), "oblique"
+            passing = abs(np.sin(np.radians(view)))
         reach = np.ptp(self.walk.qpos[:, _columns("pelvis_tx", "pelvis_tz")], axis=0)
-        aside = float(np.hypot(*reach)) if self.camera == "static" and "sagittal" in self.view else 0.0
+        aside = passing * float(np.hypot(*reach)) if self.camera == "static" else 0.0
         look = functools.partial(
             observe,
             self.walk.qpos,
             self.walk.time_s,
-            view=self.view,
+            view=view,
             distance_m=max(4.5, (0.5 * aside + _MARGIN_M) / _HALF_WIDTH),
             marker_set=model.marker_set,
             root_relative=model.root_relative,
@@ -124,7 +135,7 @@ class Case:
             seed=seed,
             camera_motion=self.camera,
         )
-        camera, size = lens(self.view, self.camera)
+        camera, size = lens(lens_view, self.camera)
         rng = np.random.default_rng([_number(self.name), 31])
         short_px, share = int(rng.choice(PICTURES_PX)), rng.uniform(*BODY_SHARE)
         truth = look(noise=NO_NOISE, camera=camera, image_size_px=size).keypoints.xy_px
@@ -258,6 +269,18 @@ def recorded_walks(motions: str | Path | Iterable[Motion], seconds: float = SECO
                 walks.append(walk)
                 break
     return walks
+
+
+def there_and_back(walk: Walk) -> Walk:
+    """A walk of `LONG_SECONDS` that turns round on the way: the same joint angles and events on another path."""
+    after = np.clip((walk.time_s - TURN_FROM_S) / TURN_S, 0.0, 1.0)
+    heading = np.pi * after**2 * (3.0 - 2.0 * after)
+    qpos, place = turned(walk.qpos, heading), _columns("pelvis_tx", "pelvis_tz")
+    ahead, aside = np.diff(walk.qpos[:, place], axis=0).T
+    c, s = np.cos(heading[1:]), np.sin(heading[1:])
+    qpos[1:, place] = np.cumsum(np.stack([c * ahead + s * aside, -s * ahead + c * aside], axis=1), axis=0)
+    qpos[0, place] = 0.0
+    return dataclasses.replace(walk, qpos=qpos)
 
 
 def _recorded_walk(person: str, motion: Motion, seconds: float) -> Walk | None:

@@ -31,7 +31,7 @@ def observe(
     qpos: Float[np.ndarray, "T 40"],
     time_s: Float[np.ndarray, " T"],
     *,
-    view: str | None = None,
+    view: str | float | None = None,
     distance_m: float | None = None,
     marker_set: str | MarkerSet = "bml_movi_87",
     scale: Float[np.ndarray, " 8"] | None = None,
@@ -57,8 +57,8 @@ def observe(
         From `walk_qpos`, with the same camera height, or any motion (a recorded one, `research.corpus.motions`) with a
         `view`.
     view
-        One of `VIEWS_DEG`: the motion, wherever it was, is turned and moved so that the phone sees it from there, the
-        phone about 1.2 m above the lowest point of its soles. None: the motion is where it is.
+        One of `VIEWS_DEG`, or such an angle (deg): the motion, wherever it was, is turned and moved so that the phone
+        sees it from there, the phone about 1.2 m above the lowest point of its soles. None: the motion is where it is.
     distance_m
         With a view: from the phone to the middle of the way; None: 4.5 m. No motion comes nearer than 2.5 m.
     marker_set, scale, site_offset_m
@@ -134,7 +134,7 @@ def observe(
 def stage(
     qpos: Float[np.ndarray, "T 40"],
     scale: Float[np.ndarray, " 8"] | None,
-    view: str,
+    view: str | float,
     seed: int,
     distance_m: float | None = None,
 ) -> Float[np.ndarray, "T 40"]:
@@ -143,7 +143,8 @@ def stage(
     The direction is that of the way, of the pelvis where a person stays; the floor is the lowest point of the soles.
     Raises `PblError` USAGE for an unknown view and for "follow", whose phone moves.
     """
-    if view not in VIEWS_DEG or view == "follow":
+    degrees = VIEWS_DEG.get(view) if isinstance(view, str) else view
+    if degrees is None or view == "follow":
         known = ", ".join(v for v in VIEWS_DEG if v != "follow")
         raise PblError("USAGE", found=f"view {view!r}", expected=f"one of {known}", next_step="pass one of these")
     rng = np.random.default_rng([seed, 21])
@@ -153,7 +154,7 @@ def stage(
     way = qpos[-1, column[:2]] - qpos[0, column[:2]]
     if np.linalg.norm(way) < 1.0:
         way = facing(qpos)[[0, 2]]
-    out = turned(qpos, np.radians(VIEWS_DEG[view]) + slant - np.arctan2(-way[1], way[0]))
+    out = turned(qpos, np.radians(degrees) + slant - np.arctan2(-way[1], way[0]))
     xy = out[:, column[:2]] * [1, -1]
     low, high = xy.min(axis=0), xy.max(axis=0)
     to = np.array([distance_m or MIDDLE_M, within(rng, 0.0, 0.1)]) - 0.5 * (low + high)

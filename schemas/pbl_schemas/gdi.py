@@ -90,6 +90,8 @@ class GDI(dj.Computed):
     gdi_right=null  : float64                  # (-)
     gdi_sd=null     : float64                  # (-) standard deviation of the error of gdi
     gdi_minimal_change=null : float64          # (-) minimal detectable change (90 percent) between two such visits
+    gdi_unshrunk=null    : float64             # (-) not drawn towards the mean of people: for correlations and means over people
+    gdi_unshrunk_sd=null : float64             # (-) standard deviation of the error of gdi_unshrunk
     gdi_n           : int16                    # cycles with an index
     gdi_gps=null       : float64               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
     gdi_gps_left=null  : float64               # (deg)
@@ -181,6 +183,8 @@ class SessionGdi(dj.Computed):
     session_gdi_right=null      : float64      # (-)
     session_gdi_sd=null         : float64      # (-) standard deviation of the error of session_gdi
     session_gdi_minimal_change=null : float64  # (-) minimal detectable change (90 percent) between two such visits
+    session_gdi_unshrunk=null    : float64     # (-) not drawn towards the mean of people: for correlations and means over people
+    session_gdi_unshrunk_sd=null : float64     # (-) standard deviation of the error of session_gdi_unshrunk
     session_gdi_n               : int16        # cycles with an index
     session_gps=null            : float64      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
     session_gps_left=null       : float64      # (deg)
@@ -320,7 +324,7 @@ class SessionGdi(dj.Computed):
 
 
 #: End of a column of the index -> field of the library's `Gdi`.
-_INDEX = {"": "mean", "_left": "left", "_right": "right", "_sd": "sd", "_minimal_change": "minimal_change"}
+_INDEX = {"": "mean"} | {f"_{k}": k for k in ("left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")}
 
 
 def index_row(index: lib.Gdi, prefix: str) -> dict[str, Any]:

@@ -134,3 +134,10 @@ def undo_0008(cursor: Any) -> None:
     """Forget the errors of a visit's measures."""
     for column in ("session_measure_error", "session_measure_minimal_change"):
         cursor.execute(f"ALTER TABLE pbl_gdi.__session_gdi__measure DROP COLUMN {column}")
+
+
+def undo_0009(cursor: Any) -> None:
+    """Forget the unshrunk index."""
+    for table, prefix in (("__g_d_i", "gdi"), ("__session_gdi", "session_gdi")):
+        for column in (f"{prefix}_unshrunk", f"{prefix}_unshrunk_sd"):
+            cursor.execute(f"ALTER TABLE pbl_gdi.{table} DROP COLUMN {column}")

@@ -128,8 +128,16 @@ def test_the_phone_against_cameras(visit: dict[str, Any], monkeypatch: pytest.Mo
     one, rng = frames.session_summary().iloc[0], np.random.default_rng(0)
     index = rng.normal(90, 8, 6)
     rows = [
-        {**one, "subject": f"P{i:03}", "fit_set_kind": kind, "session_gdi": index[i] + shift + rng.normal(0, 0.1)}
+        {
+            **one,
+            "subject": f"P{i:03}",
+            "session_label": f"{visit}",
+            "session_date": f"2026-01-0{1 + visit}",
+            "fit_set_kind": kind,
+            "session_gdi_unshrunk": index[i] + (shift + rng.normal(0, 0.1) if visit == 0 else 40.0),
+        }
         for i in range(6)
+        for visit in (1, 0)
         for kind, shift in (("single", -3.0), ("rig", 0.0))
     ]
     monkeypatch.setattr(frames, "session_summary", lambda: pd.DataFrame(rows))

@@ -10,6 +10,7 @@ from scipy.io import loadmat
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
     NINE_ANGLES,
+    NUMBERS,
     THREE_ANGLES,
     Exclusion,
     GaitCycle,
@@ -250,7 +251,7 @@ def test_too_few_cycles_give_none_with_a_reason(toy, n_left):
     # The reason asks for as many cycles as the check does.
     (check,) = [c for c in result.qc if c.check == "gdi_cycles"]
     assert f"needs {check.threshold:g} complete gait cycles with curves, 1 or more on each side" in result.reason
-    none = dict.fromkeys(("left", "right", "mean", "sd", "minimal_change", "interval"))
+    none = dict.fromkeys((*NUMBERS, "interval"))
     counted = {"n": n_left, "n_left": n_left, "n_right": 0, "norm": "toy", "params_hash": result.params_hash}
     assert result.to_dict() == {**none, **counted, "cycles": [dataclasses.asdict(c) for c in result.cycles]}
     assert [(c.number, c.side) for c in result.cycles] == [(i, "left") for i in range(n_left)]

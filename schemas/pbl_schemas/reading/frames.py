@@ -33,6 +33,8 @@ _SESSION_COLUMNS = (
     "session_gdi_right",
     "session_gdi_sd",
     "session_gdi_minimal_change",
+    "session_gdi_unshrunk",
+    "session_gdi_unshrunk_sd",
     "session_gdi_n",
 )
 
@@ -135,7 +137,7 @@ def index_frame() -> pd.DataFrame:
 
     from pbl_pipeline.validation import INDEX_COLUMNS
 
-    found = current_sets() * gdi.SessionGdi.proj("session_gdi") * gdi.NormativeSet.proj("norm_query")
+    found = current_sets() * gdi.SessionGdi.proj("session_gdi_unshrunk") * gdi.NormativeSet.proj("norm_query")
     rows = found.to_dicts(order_by="session_id")
     renamed = [
         {
@@ -143,7 +145,7 @@ def index_frame() -> pd.DataFrame:
             "kind": row["fit_set_kind"],
             "method": row["gdi_method"],
             "norm_kind": ((row["norm_query"] or {}).get("methods") or {}).get("fit_set_kind", ""),
-            "index": row["session_gdi"],
+            "index": row["session_gdi_unshrunk"],
         }
         for row in rows
     ]
@@ -215,7 +217,9 @@ def trial_summary(restriction: Any = True) -> pd.DataFrame:
     events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
     cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
     measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
-    index = gdi.GDI.proj("gdi", "gdi_left", "gdi_right", "gdi_sd", "gdi_minimal_change", "gdi_n")
+    index = gdi.GDI.proj(
+        "gdi", "gdi_left", "gdi_right", "gdi_sd", "gdi_minimal_change", "gdi_unshrunk", "gdi_unshrunk_sd", "gdi_n"
+    )
     joined = current_sets() * trials * events * cycles * measures * index
     return (joined & restriction).to_pandas(order_by="video_id").reset_index()
 

@@ -299,13 +299,15 @@ def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     index = (gdi.SessionGdi & chain & of_sets).proj(
         "session_gdi_left", "session_gdi_right", "session_gps", "session_gps_left", "session_gps_right",
         gdi="session_gdi", gdi_sd="session_gdi_sd", n_cycles="session_gdi_n",
+        gdi_unshrunk="session_gdi_unshrunk", gdi_unshrunk_sd="session_gdi_unshrunk_sd",
     )  # fmt: skip
     index = frame_of(index)
     more = ("intervention", "intervention_date", "assistive_device", "orthosis", "visit_age")
     people = session.Session.proj("subject", date="session_date") * lab.Subject.proj("population")
     visit = frame_of(study.Visit.proj(*more) * people & ids).drop(columns="subject")
     visits = rows[[*key, "role", "days", "included", "reason", "fit_set"]].merge(visit, on="session_id")
-    visits = visits.merge(index[["fit_set", "gdi", "gdi_sd", "n_cycles"]], how="left", on="fit_set")
+    found = ["fit_set", "gdi", "gdi_sd", "gdi_unshrunk", "gdi_unshrunk_sd", "n_cycles"]
+    visits = visits.merge(index[found], how="left", on="fit_set")
     visits["group"] = _groups(visits, about.get("cohort"))
     visits = visits.sort_values(["subject", "date", "session_id"], ignore_index=True)
     visits = visits.drop(columns=["session_id", "fit_set"]).rename(columns={"visit_age": "age"})
