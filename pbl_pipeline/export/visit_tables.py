@@ -25,6 +25,7 @@ _MEANINGS = json.loads(shipped_text("export/meanings.json"))
 JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
 _SIDES = {"r": "right", "l": "left"}
 _STATISTICS: dict[str, str] = _MEANINGS["statistics"]
+_OF_INDEX: dict[str, str] = _MEANINGS["index_statistics"]
 _TRIAL = "name of the trial"
 
 
@@ -306,7 +307,7 @@ def _measures_wide(parts: Sequence[_Part]) -> Table:
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])
     for measure, statistic in wanted:
         values = _floats(row.get((measure, statistic), np.nan) for row in rows)
-        text = _STATISTICS.get(statistic, statistic.replace("_", " "))
+        text = (_STATISTICS | _OF_INDEX).get(statistic, statistic.replace("_", " "))
         columns.append(Column(f"{measure}_{statistic}", values, _unit(measure, statistic), text))
     return Table("measures_wide", tuple(columns))
 

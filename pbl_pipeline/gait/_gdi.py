@@ -370,13 +370,14 @@ def passes_of(cycles: Sequence[GaitCycle], norm: NormativeSet) -> list[Pass]:
 def _views(cycles: Sequence[GaitCycle]) -> list[tuple[str, str]]:
     """Trial and view of each cycle's direction of walking, which ends where the other leg comes to be behind."""
     directions: dict[tuple[str, int], list[int]] = {}
-    number, side = {}, {}
+    number: dict[str, int] = {}
+    side: dict[str, str] = {}
     for i in sorted(range(len(cycles)), key=lambda i: cycles[i].number):
         trial, far_leg = cycles[i].trial, cycles[i].far_leg
-        turned = far_leg and side.get(trial, far_leg) != far_leg
-        number[trial] = number.get(trial, 0) + bool(turned)
-        side[trial] = far_leg or side.get(trial, "")
-        directions.setdefault((trial, number[trial]), []).append(i)
+        if far_leg:
+            number[trial] = number.get(trial, -1) + (side.get(trial) != far_leg)
+            side[trial] = far_leg
+        directions.setdefault((trial, max(number.get(trial, 0), 0)), []).append(i)
     of_cycle = {i: (key[0], far_leg_of([cycles[i] for i in own])) for key, own in directions.items() for i in own}
     return [of_cycle[i] for i in range(len(cycles))]
 

@@ -228,18 +228,22 @@ def unshrunk_index(model: MeasurementModel, passes: Sequence[Pass], norm: Normat
     """Return the index without people's distribution as prior knowledge, and the standard deviation of its error about
     the true index, of people like those whom the passes suggest.
 
-    The scores are those of generalised least squares; of each side's squared distance d^2 from the norm, the expected
-    lengthening V by their error is taken back as d^2 exp(-V / d^2). Both sides must have cycles.
+    The scores are those of generalised least squares. An error of covariance C adds (tr C - 2 u C u) / d^2 to the
+    expected logarithm of a side's squared distance d^2 from the norm in the direction u, to the second order; that is
+    taken back. Both sides must have cycles.
     """
     off, gain, error, *_ = _joint(model, passes)
     weighed = np.linalg.solve(error, gain)
     covariance = np.linalg.inv(gain.T @ weighed)
-    longer = np.diag(covariance).reshape(2, -1).sum(axis=1)
+    half = len(covariance) // 2
+    of_sides = [covariance[k : k + half, k : k + half] for k in (0, half)]
 
     def index(scores: np.ndarray) -> np.ndarray:
-        square = np.sum(scores.reshape(-1, 2, len(scores.T) // 2) ** 2, axis=-1)
-        of_side = _index(scores, norm) + 5.0 / norm.ln_sd * np.minimum(longer / square, MOST_LONGER)
-        return of_side.mean(axis=-1)
+        sides = scores.reshape(-1, 2, half)
+        square = np.sum(sides**2, axis=-1)
+        radial = np.stack([np.sum(sides[:, k] @ c * sides[:, k], axis=-1) for k, c in enumerate(of_sides)], axis=-1)
+        longer = ([np.trace(c) for c in of_sides] - 2.0 * radial / square) / square
+        return (_index(scores, norm) + 5.0 / norm.ln_sd * np.clip(longer, 0.0, MOST_LONGER)).mean(axis=-1)
 
     likely = estimate(model, passes)
     true, new = (np.random.default_rng(i).standard_normal((N_DRAWS, len(model.mean))) for i in (2, 3))

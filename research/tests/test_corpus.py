@@ -14,9 +14,21 @@ from pbl_pipeline.synthetic import NO_NOISE, VIEWS_DEG, Noise, plain_walk
 from research.corpus.errors import corpus_errors, corpus_tables, print_corpus, responsiveness, view_table, write_corpus
 from research.corpus.motions import Motion
 from research.corpus.true_fit import fit_of_qpos
-from research.corpus.walks import Case, Walk, is_held_out, joined, lasting
+from research.corpus.walks import (
+    LONG_SECONDS,
+    TURN_FROM_S,
+    TURN_S,
+    Case,
+    Walk,
+    is_held_out,
+    joined,
+    lasting,
+    synthetic_walk,
+    there_and_back,
+)
 from research.walker.detectors import DETECTORS, DetectorNoise
 from research.walker.observe import observe
+from research.walker.turns import facing
 from tests import not_none
 
 COLUMN = {n: i for i, n in enumerate(load_body().joint_names)}
@@ -263,3 +275,18 @@ def test_each_detector_has_its_points_and_a_memory(detector: str):
     assert Case(_walk(), "oblique", "handheld", detector).keypoints().xy_px == pytest.approx(
         keypoints.xy_px, nan_ok=True
     )
+
+
+def test_a_walk_turns_round_with_the_same_joint_angles():
+    walk = synthetic_walk(3, seconds=LONG_SECONDS)
+    bent = there_and_back(walk)
+    turning = [i for n, i in COLUMN.items() if not n.startswith("pelvis")]
+    assert np.array_equal(bent.qpos[:, turning], walk.qpos[:, turning])
+    place = [COLUMN["pelvis_tx"], COLUMN["pelvis_tz"]]
+    steps, before = (np.diff(w.qpos[:, place], axis=0) for w in (bent, walk))
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), np.linalg.norm(before, axis=1), atol=1e-12)
+    turned = walk.time_s[1:] > TURN_FROM_S + TURN_S
+    np.testing.assert_allclose(steps[turned], -before[turned], atol=1e-12)
+    np.testing.assert_allclose(steps[walk.time_s[1:] < TURN_FROM_S], before[walk.time_s[1:] < TURN_FROM_S])
+    heading = facing(bent.qpos[walk.time_s > TURN_FROM_S + TURN_S])
+    assert np.dot(heading, facing(walk.qpos)) < -0.95

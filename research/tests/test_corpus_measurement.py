@@ -30,7 +30,7 @@ def made(walk: int, view: str, visit: int, errors: np.ndarray, angles: np.ndarra
     nothing, true = np.zeros((2, 2)), np.full(len(MEASURES), 50.0)
     off = np.zeros((2, 2, 3, 2)) if angles is None else angles
     about = f"p{walk}", False, "synthetic", "", 0.0, view, visit, ("left", 0)
-    return Seen(*about, nothing, nothing, (4, 4), np.eye(2), np.stack([true + errors, true]), off)
+    return Seen(*about, (), (), nothing, np.eye(2), np.stack([true + errors, true]), off)
 
 
 def test_parts_of_errors_are_found_again():

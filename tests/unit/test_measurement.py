@@ -193,7 +193,8 @@ def test_the_interval_shrinks_with_passes_and_differs_by_view():
     both = score_gdi(walk(rng, "left", "a") + walk(rng, "right", "b"))
     four = score_gdi([c for i, leg in enumerate(["left", "right"] * 2) for c in walk(rng, leg, f"{i}")])
     sd, least = zip(*(errors(g) for g in (four, both, side, front)), strict=True)
-    assert sd == tuple(sorted(sd))
+    assert sd[:3] == tuple(sorted(sd[:3]))
+    assert sd[1] < sd[3]
     assert least[:3] == tuple(sorted(least[:3]))
 
 
