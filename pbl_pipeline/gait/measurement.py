@@ -77,8 +77,8 @@ _FOLDER = resources.files("pbl_pipeline.gait").joinpath("measurement_models")
 #: Errors count as at most so many times the squared distance that was found: a larger correction would be a guess.
 MOST_LONGER = 2.0
 #: Passes disagree where the probability of a difference like theirs, times their number, is below this. Of visits of
-#: tuning persons 0.2 % do, of persons held out 0.4 % (`research.corpus.measurement`).
-DISAGREE = 1e-3
+#: tuning persons 0.2 % do, of persons held out 0.2 % (`research.corpus.measurement`).
+DISAGREE = 1e-4
 
 
 class Pass(NamedTuple):

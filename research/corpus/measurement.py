@@ -47,7 +47,7 @@ RIDGE = 300.0
 #: Least variance (deg^2) of a pass' error in any direction.
 LEAST = 1.0
 #: Groups of persons who are left out in turn.
-FOLDS = 5
+FOLDS = 16
 #: How a pass was fitted.
 ALONE, TOGETHER = "fitted alone", "fitted together"
 
