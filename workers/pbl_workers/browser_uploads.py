@@ -12,14 +12,14 @@ import time
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import record
 from pbl_schemas.intake import Registered, VisitRecord
 from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import VIDEO_ENDINGS, Copy, check_opens, register_copies
+from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, register_copies
 
 #: Age at which the rest of a broken upload is removed (s).
 _REST_S = 86_400.0
@@ -104,9 +104,9 @@ class Arriving:
 
 
 def check(arrived: Arriving) -> PblError | None:
-    """Return what is wrong with a file that is to be a video: VIDEO_..., or None. Its first picture is decoded."""
+    """Return what is wrong with a file that arrived, or could not be checked (`check_opens`, `check_log`); or None."""
     try:
-        check_opens(arrived.path, "a video file", "copy it from the phone again")
+        (check_log if arrived.is_log else check_opens)(arrived.path)
     except PblError as error:
         return error.with_key(arrived.name)
     return None
@@ -146,7 +146,7 @@ def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str)
     try:
         result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
-        if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
+        if CODES[error.code].cause == MACHINE:  # the others would meet it as well
             raise
         return Outcome(name, "refused", error=error.with_key(name))
     assert result.video_id is not None

@@ -127,7 +127,7 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
             good = []
             for one, copy in whole:
-                error = None if one.is_log else await _on_disk(browser_uploads.check, one)
+                error = await _on_disk(browser_uploads.check, one)
                 if error is None:
                     good.append((one, copy))
                 else:
