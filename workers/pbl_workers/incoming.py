@@ -190,6 +190,9 @@ def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload],
                 raise
             if CODES[coded.code].cause == MACHINE:
                 out.left[name] = coded
+                for copy in copies:  # the next run makes them again; one with a row was registered before
+                    if not video.Video & {"video_path": str(copy.path)}:
+                        copy.path.unlink(missing_ok=True)
                 return
             out.refused[name] = coded
             _set_aside(drop, given, copies, archive, coded)
