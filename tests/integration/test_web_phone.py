@@ -3,10 +3,13 @@
 import contextlib
 import hashlib
 import json
+import os
 import random
 import re
+import shutil
 import socket
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,8 @@ from pbl_schemas.intake.protocols import add_protocol, read_protocol
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.usable import Next, Usable
 from pbl_schemas.rows import check_row
-from pbl_workers import incoming, phone_uploads, queue
+from pbl_workers import browser_uploads, incoming, phone_uploads, queue
+from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, verdict
@@ -622,6 +626,51 @@ def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(incoming, "KEPT_FREE", 10**18)
     answer = phone(visit).post("/phone/recordings.json", json=stated(film(tmp_path)))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_room_is_promised_to_all_recordings_that_were_begun(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Twice its length for each: the parts, and the whole beside them."""
+    one, two = film(tmp_path, "one"), film(tmp_path, "two")
+    disk = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + 3 * len(one)))
+    browser = phone(visit)
+    first = begin(browser, one)
+    answer = browser.post("/phone/recordings.json", json=stated(two))
+    assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+    assert [row["phone_recording"] for row in PhoneRecording().to_dicts()] == [first["number"]]
+    assert send(browser, one)["state"] == "received"
+    assert send(browser, two)["state"] == "received"
+
+
+def test_no_part_takes_the_room_that_is_kept_free(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    browser, whole = phone(visit), film(tmp_path)
+    told = begin(browser, whole)
+    with monkeypatch.context() as full:
+        full.setattr(incoming, "KEPT_FREE", 10**18)
+        answer = put(browser, told["number"], 0, parts_of(whole)[0], len(whole))
+        assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+        to = browser_uploads.place(visit)
+        arriving = browser_uploads.Arriving(to, "walk.mp4")
+        with pytest.raises(OSError, match="kept free"):
+            arriving.write(b"a piece, whatever length was announced")
+        arriving.discard()
+    assert begin(browser, whole)["missing"] == list(range(len(parts_of(whole))))
+    assert send(browser, whole)["state"] == "received"
+
+
+def test_parts_of_a_recording_that_did_not_go_on_give_their_room_back(visit: int, tmp_path: Path):
+    browser, whole, other = phone(visit), film(tmp_path), film(tmp_path, "other")
+    for one in (whole, other):
+        put(browser, begin(browser, one)["number"], 0, parts_of(one)[0], len(one))
+    old, new = sorted((tmp_path / "archive" / "_phone" / "P001").iterdir())
+    for path in (old / "0", old):
+        os.utime(path, times=(time.time() - 8 * 86_400,) * 2)
+    done = CliRunner().invoke(cron, ["release"])
+    assert "removed 1 recordings" in done.output
+    assert (old.exists(), new.exists()) == (False, True)
+    assert send(browser, whole)["state"] == "received"  # the phone has it still
 
 
 def test_the_size_of_a_part_is_that_of_the_page(visit: int):

@@ -12,6 +12,7 @@ Uploads are imported in random order, so that none waits forever behind one that
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import multiprocessing
 import os
@@ -220,8 +221,7 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> C
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, normalised_label(upload.name.parts[0]))
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
-    if not has_room(folder, upload.size):
-        raise OSError(f"{upload.size / 1e9:.1f} GB do not fit beside {KEPT_FREE / 1e9:.0f} GB that are kept free")
+    keep_free(folder, upload.size)
     try:
         with (
             drop.open(upload) as source,
@@ -250,6 +250,12 @@ def has_room(folder: Path, n_bytes: int) -> bool:
     while not folder.is_dir():
         folder = folder.parent
     return shutil.disk_usage(folder).free >= n_bytes + KEPT_FREE
+
+
+def keep_free(folder: Path, n_bytes: int) -> None:
+    """Raise OSError if so many bytes do not fit on the disk of a folder beside `KEPT_FREE`."""
+    if not has_room(folder, n_bytes):
+        raise OSError(errno.ENOSPC, f"no room beside the {KEPT_FREE / 1e9:.0f} GB that are kept free")
 
 
 def check_room(n_bytes: int, next_step: str) -> None:

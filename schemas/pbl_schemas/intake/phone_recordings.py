@@ -214,6 +214,18 @@ def begin(phone: Phone, stated: object) -> Sent:
     return _sent((PhoneRecording & same).fetch1())
 
 
+def begun_bytes(days: float) -> int:
+    """Return the length of all recordings that phones began to send within so many days and have not ended (byte)."""
+    since = utc_now() - datetime.timedelta(days=days)
+    begun = PhoneRecording & {"phone_state": UPLOADING} & f"phone_created > '{since:%F %T}'"
+    return int(sum(sum(begun.to_arrays(name)) for name in ("phone_video_size", "phone_log_size")))
+
+
+def not_begun(number: int) -> None:
+    """Take back that a recording was begun, of which nothing is here; the phone begins it again."""
+    (PhoneRecording & {"phone_recording": number, "phone_state": UPLOADING}).delete_quick()
+
+
 def recording(phone: Phone, number: int) -> Sent:
     """Return a recording of the phone's visit. Raises `PblError` DB_NOT_FOUND for that of another one."""
     rows = (PhoneRecording & {"phone_recording": number, "session_id": phone.session_id}).to_dicts()

@@ -29,10 +29,10 @@ from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import Step, steps_of
+from pbl_schemas.operations.archive import UNFINISHED_DAYS
 from pbl_schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
-from ..incoming import check_room
 from ..process_queue import ProcessQueue
 from . import certificates
 from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, read_form, sender
@@ -225,8 +225,13 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
     async def told(request: Request, sent: Sent) -> Response:
         missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
         if len(missing) == sent.n_parts:
-            # Twice: the parts stay until the whole is registered.
-            await _on_disk(check_room, 2 * (sent.video_bytes + sent.log_bytes), _NEXT_STEP)
+            begun = await tables.ask(phone_recordings.begun_bytes, UNFINISHED_DAYS)
+            try:
+                await _on_disk(phone_uploads.check_promised, begun, _NEXT_STEP)
+            except PblError:
+                await tables.ask(phone_recordings.not_begun, sent.number)
+                await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+                raise
         return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
 
     async def worker(request: Request) -> Response:
