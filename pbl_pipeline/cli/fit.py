@@ -14,7 +14,7 @@ from .options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
-    from pbl_pipeline.fit import Recording
+    from pbl_pipeline.fit import RecordingFacts
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
 _ENDS = (".npz", ".keypoints", ".markers", ".csv", ".h5", ".hdf5", ".dlc", ".analysis")
@@ -72,8 +72,8 @@ def fit(
     check_out_folder(out)
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
     table = _marker_set(marker_set)
-    recordings = _recordings(len(files), video, fps, width, height, camera, person)
-    trials: Sequence[Any] = [_load(path, table, up, r) for path, r in zip(files, recordings, strict=True)]
+    facts = _facts(len(files), video, fps, width, height, camera, person)
+    trials: Sequence[Any] = [_load(path, table, up, f) for path, f in zip(files, facts, strict=True)]
     paramset = fit_paramset(solver, params, points_of(trials))
     stems = [_stem(path) for path in files]
     if cameras:
@@ -85,10 +85,10 @@ def fit(
     markers = {} if table is None else {"markers": table}
     motion = motions[0] if len(set(motions)) == 1 else motions
     session = fit_session(trials, names, paramset, motion, height_m=height_m, **markers)
-    results = tuple(Recording.of(trial.name, trial) for trial in session.trials)
+    recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
     laboratory = all(isinstance(trial, WorldMarkers) for trial in trials)
     kind = "rig" if cameras else "markers" if laboratory else "single"
-    visit = Visit(results, Solution.of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
+    visit = Visit(recordings, Solution.of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
     for path in save_visit(visit, out):
         click.echo(path)
     click.echo(f"fitted in {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")
@@ -106,7 +106,7 @@ def _marker_set(given: str | None) -> MarkerSet | None:
     return load_marker_set(Path(given)) if given.lower().endswith(".csv") else marker_set(given)
 
 
-def _recordings(
+def _facts(
     n: int,
     videos: Sequence[Path],
     fps: float | None,
@@ -114,9 +114,9 @@ def _recordings(
     height: int | None,
     camera: Path | None,
     people: Sequence[str],
-) -> list[Recording]:
-    """Properties of the recording of each of `n` files."""
-    from pbl_pipeline.fit import Recording
+) -> list[RecordingFacts]:
+    """Facts of the recording of each of `n` files."""
+    from pbl_pipeline.fit import RecordingFacts
 
     for option, values, allowed in (("--video", videos, (0, n)), ("--person", people, (0, 1, n))):
         if len(values) not in allowed:
@@ -126,11 +126,11 @@ def _recordings(
         if value is not None and not 0 < value < 1e5:
             raise PblError("USAGE", f"{option} {value:g}", "a number above 0", "see `pbl fit --help`")
     size = (width, height) if width and height else None
-    videos, people = videos or [None] * n, people if len(people) == n else (people or [None]) * n
-    return [Recording(v, fps, size, camera, p) for v, p in zip(videos, people, strict=True)]
+    each = [[*values] * (n if len(values) == 1 else 1) or [None] * n for values in (videos, people)]
+    return [RecordingFacts(v, fps, size, camera, p) for v, p in zip(*each, strict=True)]
 
 
-def _load(path: Path, table: MarkerSet | None, up: str, recording: Recording) -> Keypoints | WorldMarkers:
+def _load(path: Path, table: MarkerSet | None, up: str, facts: RecordingFacts) -> Keypoints | WorldMarkers:
     """Load one file as a trial; markers of a laboratory are sorted as in their marker set."""
     import dataclasses
 
@@ -140,7 +140,7 @@ def _load(path: Path, table: MarkerSet | None, up: str, recording: Recording) ->
     from pbl_pipeline.keypoints.pose_files import is_pose_file
 
     if is_pose_file(path):
-        trial, text = read_keypoints(path, recording, table)
+        trial, text = read_keypoints(path, facts, table)
         click.echo(f"{path.name}: {text}\n  camera {trial.camera.source}")
         for check in check_keypoints(trial):
             if check.advice:

@@ -23,11 +23,13 @@ from .world_checks import check_picture
 _DETECTORS = ("halpe_26", "body25b", "blazepose_33", "bml_movi_87", "mpi_inf_3dhp_17")
 #: Largest relative difference between the file's rate and the stated one: programs round 29.97 to 30.
 _SAME_RATE = 0.05
+#: Keypoints of a smaller copy of the picture lie within this fraction of its width and height.
+_UPPER_LEFT = 2 / 3
 _usage = functools.partial(PblError, "USAGE")
 
 
 @dataclasses.dataclass(frozen=True)
-class Recording:
+class RecordingFacts:
     """Properties of a recording that files of 2D keypoints lack: a video, or rate and size of its upright picture."""
 
     video: Path | None = None
@@ -37,7 +39,7 @@ class Recording:
     person: str | None = None  # name of the person to measure
 
 
-def read_keypoints(path: Path, recording: Recording, table: MarkerSet | None = None) -> tuple[Keypoints, str]:
+def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | None = None) -> tuple[Keypoints, str]:
     """Return the keypoints of one person, in the order of a marker set, and a line on what was read.
 
     `table` says where the points sit on the body; None: the detectors' set that has most of the file's names. Points
@@ -100,12 +102,14 @@ def read_keypoints(path: Path, recording: Recording, table: MarkerSet | None = N
     text = f"{poses.program}, person {poses.people[chosen]}, {len(column)} of {len(markers)} points of {markers.name}"
     for what, names in (("not in the file", absent), ("not in the marker set", unused)):
         text += f"\n  {what}: {', '.join(sorted(names))}" if names else ""
+    if (np.nanmax(trial.xy_px, axis=(0, 1)) < _UPPER_LEFT * np.array(size)).all():
+        text += f"\n  all points are in the upper left {_UPPER_LEFT:.0%} of the picture: is its size right?"
     return trial, text
 
 
 def _person(path: Path, poses: Poses, wanted: str | None, rate_hz: float) -> int:
     """Number of the person to measure: the only one who is seen for as long as a fit needs, or the wanted one."""
-    seen = (poses.confidence > 0).any(axis=2)
+    seen = np.asarray((poses.confidence > 0).any(axis=2))
     if wanted in poses.people:
         return poses.people.index(wanted)
     step = int(poses.frame[1] - poses.frame[0]) if len(poses.frame) > 1 else 1
@@ -119,7 +123,9 @@ def _person(path: Path, poses: Poses, wanted: str | None, rate_hz: float) -> int
         f"people {', '.join(listed[:20])}" + f" and {len(listed) - 20} more" * (len(listed) > 20)
         if listed
         else "no person in any frame",
-        f"one of them: {wanted!r} is none" if wanted else f"one person in view for {ViewParams().min_in_view_s:g} s",
+        f"one of them: {wanted!r} is none"
+        if wanted
+        else f"a single person who is in view for {ViewParams().min_in_view_s:g} s and more",
         "pass --person with the name of one; where a person has several numbers, track the people first",
         key=str(path),
     )

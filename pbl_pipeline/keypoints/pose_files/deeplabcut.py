@@ -57,7 +57,7 @@ def read_dlc_h5(path: Path, file: Any) -> Poses:
     if "table" in group:
         table = array_of(group["table"])
         index = table["index"]
-        for name in [n for n in table.dtype.names if n.startswith("values_block_")]:
+        for name in [n for n in table.dtype.names or () if n.startswith("values_block_")]:
             blocks.append(table[name].reshape(len(table), -1))
             columns += _columns(_texts(bytes(group["table"].attrs[f"{name}_kind"])), blocks[-1].shape[1])
     else:

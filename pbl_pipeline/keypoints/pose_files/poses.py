@@ -12,7 +12,7 @@ from pbl_pipeline.bounded import MAX_ROWS
 from pbl_pipeline.errors import PblError
 
 bad_file = functools.partial(
-    PblError, "FILE_FORMAT", next_step="see docs/files.md, section 2D keypoints of other programs"
+    PblError, "FILE_FORMAT", next_step="see docs/models.md, section 2D keypoints of other programs"
 )
 
 
