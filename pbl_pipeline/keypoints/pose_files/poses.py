@@ -14,6 +14,8 @@ from pbl_pipeline.errors import PblError
 bad_file = functools.partial(
     PblError, "FILE_FORMAT", next_step="see docs/models.md, section 2D keypoints of other programs"
 )
+#: No pixel is further from the picture's corner.
+_FURTHEST_PX = 1e6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Poses:
 
     def __post_init__(self) -> None:
         confidence = np.where(np.isnan(self.confidence), 1.0, np.clip(self.confidence, 0.0, 1.0))
-        seen = np.isfinite(self.xy_px).all(axis=-1) & (confidence > 0)
+        seen = np.all(np.abs(self.xy_px) < _FURTHEST_PX, axis=-1) & (confidence > 0)
         object.__setattr__(self, "xy_px", np.where(seen[..., None], self.xy_px, np.nan))
         object.__setattr__(self, "confidence", np.where(seen, confidence, 0.0))
 
