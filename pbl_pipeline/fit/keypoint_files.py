@@ -74,10 +74,8 @@ def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | Non
     order = [column.get(name, -1) for name in markers.names]
     xy, confidence = poses.xy_px[chosen][:, order], poses.confidence[chosen][:, order]
     confidence = np.where(np.array(order) < 0, 0.0, confidence)
-    if recording.camera:
-        camera = find_camera(info, recording.camera) if info else load_camera(recording.camera, size)
-    else:
-        camera = find_camera(info) if info else guess_camera(size)
+    file = recording.camera
+    camera = find_camera(info, file) if info else load_camera(file, size) if file else guess_camera(size)
     trial = Keypoints(
         time_s=time_s,
         names=markers.names,
