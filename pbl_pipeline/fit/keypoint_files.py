@@ -55,7 +55,7 @@ def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | Non
         raise _usage(
             "a video together with a rate or a size" if size else "no size of the picture",
             "--video, or --width and --height (and --fps)",
-            f"pass the video of {path.name}, or what is known of it",
+            f"pass the video of {path.name}, or its rate and size",
             key=str(path),
         )
     poses = read_poses(path, rate or 30.0, table)

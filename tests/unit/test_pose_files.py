@@ -47,7 +47,7 @@ ALL = RecordingFacts(rate_hz=RATE, size_px=SIZE)
 
 @functools.cache
 def walk() -> Keypoints:
-    """A walk from the side, with a frame of nobody, a missing point, and different confidences."""
+    """A walk from the side, with an empty frame, a missing point, and different confidences."""
     time = np.arange(90) / RATE
     seen = observe(plain_walk(time, stride_s=1.1, speed_m_per_s=1.2, start_m=(6.0, -1.8)), time, "halpe_26")
     confidence = np.random.default_rng(0).uniform(0.6, 1.0, seen.confidence.shape) * (seen.confidence > 0)
@@ -204,7 +204,7 @@ def test_the_video_gives_times_and_size(tmp_path: Path):
         read_keypoints(tmp_path / "json", RecordingFacts(video=video, rate_hz=RATE))
 
 
-def test_missing_files_are_frames_of_nobody_and_every_second_frame_is_half_the_rate(tmp_path: Path):
+def test_missing_files_are_empty_frames_and_every_second_frame_is_half_the_rate(tmp_path: Path):
     folder = openpose(tmp_path / "json", points())
     for t in (3, 4, 50):
         (folder / f"walk_{t:012d}_keypoints.json").unlink()

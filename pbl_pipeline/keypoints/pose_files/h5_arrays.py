@@ -18,7 +18,7 @@ from .poses import bad_file
 
 @contextmanager
 def opened_h5(path: Path) -> Iterator[Any]:
-    """An h5py.File to read. Raises `PblError` FILE_MISSING, FILE_FORMAT (also for what is missing in it)."""
+    """An h5py.File to read. Raises `PblError` FILE_MISSING, FILE_FORMAT (also for a field that it lacks)."""
     h5py = needed("h5py", f"reading {path.name}")
     with os_errors_as("FILE_MISSING", "an HDF5 file", "check the path, and that you may read the file", path):
         path.open("rb").close()

@@ -1,6 +1,6 @@
 """TRC files in pixels, as Sports2D writes them from RTMLib: `<video>_Sports2D_px_person00.trc`.
 
-Their header states metres. x is right, y down, z 0; there is no confidence. `DataRate` is the video's rate, rounded to
+Their header states metres. x is right, y down, z 0; they have no confidence. `DataRate` is the video's rate, rounded to
 a whole number.
 """
 
