@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import functools
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -359,6 +360,27 @@ def test_an_ankle_without_a_point_on_the_foot_is_open():
         assert sd is not None
         assert (sd[0, joints.index("ankle_angle_r")] >= OPEN_RAD) == is_open
         assert sd[0, joints.index("knee_angle_r")] < OPEN_RAD
+
+
+def test_an_h5_without_its_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "a.h5").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(PblError, match=r"pbl-pipeline\[h5\]"):
+        read_keypoints(tmp_path / "a.h5", ALL)
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (("--video", "a.mp4", "--video", "b.mp4"), "--video 2 times, 1 files"),
+        (("--fps", "-30"), "--fps -30"),
+        (("--fps", "30", "--width", "640"), "no size of the picture"),
+    ],
+)
+def test_options_that_do_not_fit(tmp_path: Path, options: tuple[str, ...], found: str):
+    done = pbl("fit", dlc_csv(tmp_path / "a.csv", points()), "--out", tmp_path / "out", *options)
+    assert done.error_code == "USAGE"
+    assert found in done.err
 
 
 @pytest.mark.needs_extra
