@@ -42,6 +42,7 @@ BODY_25 = (
     *("left_big_toe", "left_small_toe", "left_heel", "right_big_toe", "right_small_toe", "right_heel"),
 )
 PARAMS = METHODS.find().params
+WHOLE_BODY = (*HALPE.names[:17], *BODY_25[19:])
 RATE, WIDTH, HEIGHT = 30.0, *SIZE
 ALL = RecordingFacts(rate_hz=RATE, size_px=SIZE)
 
@@ -166,6 +167,7 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "BODY_25": lambda p: openpose(p / "json", points(BODY_25)),
     "Halpe": lambda p: openpose(p / "json", points(), first=1000),
     "COCO": lambda p: openpose(p / "json", points(HALPE.names[:17])),
+    "whole body": lambda p: openpose(p / "json", np.pad(points(WHOLE_BODY), ((0, 0), (0, 110), (0, 0)))),
     "csv": lambda p: dlc_csv(p / "walkDLC.csv", points()),
     "csv of several": lambda p: dlc_csv(p / "walkDLC.csv", np.full_like(points(), np.nan), points()),
     "h5 fixed": lambda p: dlc_h5_fixed(p / "walkDLC.h5"),
@@ -179,7 +181,9 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_is_read_to_the_same_keypoints(tmp_path: Path, name: str):
     found, text = read_keypoints(FORMATS[name](tmp_path), ALL)
-    has = np.isin(HALPE.names, {"BODY_25": BODY_25, "COCO": HALPE.names[:17]}.get(name, HALPE.names))
+    has = np.isin(
+        HALPE.names, {"BODY_25": BODY_25, "COCO": HALPE.names[:17], "whole body": WHOLE_BODY}.get(name, HALPE.names)
+    )
     assert found.names == HALPE.names
     assert found.marker_set == "halpe_26"
     assert f"{has.sum()} of 26 points of halpe_26" in text

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from pbl_pipeline.body import MarkerSet, marker_set
-from pbl_pipeline.bounded import count_rows, read_json
+from pbl_pipeline.bounded import MAX_ARRAYS, count_rows, read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.tracking import AssociationParams
 
@@ -26,6 +26,8 @@ _LEG = ("hip", "knee", "ankle")
 _FACE = ("right_eye", "left_eye", "right_ear", "left_ear")
 _FEET = tuple(f"{s}_{p}" for s in ("left", "right") for p in ("big_toe", "small_toe", "heel"))
 _BODY_25 = ("nose", *_ARMS_LEGS, "hip", *(f"{s}_{p}" for s in ("right", "left") for p in _LEG), *_FACE, *_FEET)
+#: Of COCO's whole body 17 points of the body and 6 of the feet; face and hands follow.
+_OF_133 = 23
 _COCO_18 = tuple(n for n in _BODY_25 if n != "hip" and n not in _FEET)
 #: Fewest points that two detections of a person share; largest distance of a middle (the hips', the neck) from where
 #: the points of both sides place it, as a fraction of the trunk.
@@ -39,9 +41,8 @@ def read_openpose(folder: Path, rate_hz: float, table: MarkerSet | None = None) 
     numbers = np.array([int(m[1]) if m and len(m[1]) < 16 else -1 for m in matches], np.int64)
     if not files or (numbers < 0).any() or len(set(numbers)) < len(files):
         found = f"{len(files)} JSON files, {len(set(numbers[numbers >= 0]))} different numbers of frames in their names"
-        raise bad_file(
-            found, "one file a frame, such as walk_000000000012_keypoints.json, of one recording", key=folder
-        )
+        expected = "a file for each frame of one recording, such as walk_000000000012_keypoints.json"
+        raise bad_file(found, expected, key=folder)
     order = np.argsort(numbers)
     try:
         count_rows(len(files))
@@ -49,18 +50,19 @@ def read_openpose(folder: Path, rate_hz: float, table: MarkerSet | None = None) 
         sizes = {len(points) for people in frames for _, points in people}
         if len(sizes) != 1:
             raise ValueError("no person in any frame" if not sizes else f"people of {sorted(sizes)} points")
+        n = _OF_133 if sizes == {133} else min(sizes)
         tracks = _tracks(frames, numbers[order] / rate_hz)
-        rows = [np.full((len(frames), sizes.copy().pop(), 3), np.nan) for _ in tracks]
-        for row, track in zip(rows, tracks.values(), strict=True):
-            row[[t for t, _ in track]] = [points for _, points in track]
+        room = max(MAX_ARRAYS // (8 * 3 * n * len(frames)), 1)
+        longest = sorted(sorted(tracks, key=lambda name: len(tracks[name]))[-room:], key=int)
+        rows = [np.full((len(frames), n, 3), np.nan) for _ in longest]
+        for row, name in zip(rows, longest, strict=True):
+            row[[t for t, _ in tracks[name]]] = [points[:n] for _, points in tracks[name]]
         frame, *rows = every_frame(numbers[order], *rows)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-        raise bad_file(
-            str(error) or "no people", "JSON of OpenPose with people of the same points", key=folder
-        ) from error
+        raise bad_file(str(error), "JSON of OpenPose with people of the same points", key=folder) from error
     points = np.stack(rows)
     found = np.where(np.isfinite(points), points, 0.0)
-    return Poses("OpenPose JSON", frame, tuple(tracks), _names(folder, found, table), found[..., :2], found[..., 2])
+    return Poses("OpenPose JSON", frame, tuple(longest), _names(folder, found, table), found[..., :2], found[..., 2])
 
 
 def _people(path: Path) -> list[tuple[int, np.ndarray]]:
@@ -87,9 +89,8 @@ def _tracks(
     for t, people in enumerate(frames):
         live = [track for track in tracks if time_s[t] - time_s[track[-1][0]] <= params.max_gap_s]
         gates = [params.gate + params.gate_per_s * (time_s[t] - time_s[track[-1][0]]) for track in live]
-        cost = np.array([[_apart(track[-1][1], p) for _, p in people] for track in live]).reshape(
-            len(live), len(people)
-        )
+        cost = np.array([_apart(track[-1][1], p) for track in live for _, p in people])
+        cost = cost.reshape(len(live), len(people))
         cost = np.where(cost <= np.reshape(gates, (-1, 1)), cost, 1e3)
         pairs = [(i, j) for i, j in zip(*linear_sum_assignment(cost), strict=True) if cost[i, j] < 1e3]
         for i, j in pairs:
@@ -110,11 +111,9 @@ def _apart(a: np.ndarray, b: np.ndarray) -> float:
 def _names(folder: Path, points: np.ndarray, table: MarkerSet | None) -> tuple[str, ...]:
     """Names of points (P, T, J, 3) by their number."""
     halpe, n = marker_set("halpe_26").names, points.shape[2]
-    orders = {17: halpe[:17], 18: _COCO_18, 25: _BODY_25, 26: halpe}
+    orders = {17: halpe[:17], 18: _COCO_18, _OF_133: (*halpe[:17], *_FEET), 25: _BODY_25, 26: halpe}
     if table is not None and n == len(table):
         return table.names
-    if n == 133:  # COCO's whole body: 17 of the body, 6 of the feet, then face and hands
-        return (*halpe[:17], *_FEET, *(f"{i}" for i in range(23, 133)))
     if n not in orders or (n == 25 and not _is_body_25(points.reshape(-1, n, 3))):
         found = f"{n} points" + " in another order than BODY_25's" * (n == 25)
         expected = "17 (COCO), 18 (OpenPose's COCO), 25 (BODY_25), 26 (Halpe) or 133 (COCO whole body)"
