@@ -405,7 +405,7 @@ def test_what_movement_writes_is_read(tmp_path: Path, people: int):
         assert found.confidence == pytest.approx(walk().confidence, abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_folder_of_openpose_becomes_angles_and_gait(tmp_path: Path):
     time = np.arange(180) / RATE
     truth = plain_walk(time, stride_s=1.1, speed_m_per_s=1.0, start_m=(7.0, -3.0))
