@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import SEEN_SHARE, Keypoints
 from pbl_pipeline.keypoints.pose_files import Poses, read_poses
 from pbl_pipeline.keypoints.types import box_of_points
-from pbl_pipeline.video import find_camera, guess_camera, load_camera, probe
+from pbl_pipeline.video import check_timing, find_camera, guess_camera, load_camera, probe
 
 from .params import ViewParams
 from .world_checks import check_picture
@@ -102,6 +102,8 @@ def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | Non
         text += f"\n  {what}: {', '.join(sorted(names))}" if names else ""
     if (np.nanmax(trial.xy_px, axis=(0, 1)) < _UPPER_LEFT * np.array(size)).all():
         text += f"\n  all points are in the upper left {_UPPER_LEFT:.0%} of the picture: is its size right?"
+    for check in check_timing(info) if info else ():
+        text += f"\n  {check.outcome} {check.check}: {check.advice}" if check.advice else ""
     return trial, text
 
 
