@@ -283,6 +283,16 @@ def test_the_floor_is_at_0_where_it_was_found(walk, tmp_path):
     assert json.loads((tmp_path / "a" / "export.json").read_text())["trials"]["walk"]["ground"] == ground
 
 
+def test_the_floor_is_followed_to_the_ends_of_a_recording(walk, tmp_path):
+    qpos, time = walk.qpos.copy(), walk.time_s
+    # As in the demonstration, the floor seems to rise where the person comes and to sink where the person goes.
+    qpos[:, walk.joint_names.index("pelvis_ty")] -= 0.11 * np.abs(time - time.mean())
+    fit = with_markers(dataclasses.replace(walk, qpos=qpos))
+    pelvis, _ = _heights(written(Recording.of("walk", fit), tmp_path / "a", "trc", "mot"))
+    step = 17  # frames
+    assert [pelvis[:step].mean(), pelvis[-step:].mean()] == pytest.approx([0.96, 0.96], abs=0.005)
+
+
 def test_the_floor_of_a_c3d_is_at_0(walk, tmp_path):
     file = c3d_of(written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d")
     heels = [walk.marker_names.index(f"{s}_heel") for s in ("left", "right")]
