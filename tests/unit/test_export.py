@@ -24,6 +24,7 @@ from pbl_pipeline.export import FORMATS, ExportOptions, write_export
 from pbl_pipeline.export.columns import Column, Labels, Table, lines, number_cells, text_cells, write_csv
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
+from pbl_pipeline.gait.c3d_file import C3dFile
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import FAIL, Check
@@ -464,12 +465,14 @@ def test_sensors_of_the_phone_are_analog_channels_on_the_videos_clock(fit, tmp_p
     xyz = np.column_stack([time, 2 * time, np.full_like(time, 9.81)])  # straight lines: interpolation is exact
     log = PhoneLog(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), "camera", None, "own", None, {}, "CSV")
     log = dataclasses.replace(log, sensors={"accelerometer": Sensor(time, xyz), "gyroscope": Sensor(time, xyz)})
-    file = c3d_of(written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d")
+    path = written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d"
+    file = c3d_of(path)
     analog = file["parameters"]["ANALOG"]
     assert analog["LABELS"]["value"][:4] == [*(f"phone_accelerometer_{a}" for a in "xyz"), "phone_gyroscope_x"]
     assert analog["UNITS"]["value"][:4] == ["m/s^2"] * 3 + ["rad/s"]
     assert analog["RATE"]["value"][0] == 120  # the multiple of 30 Hz that is not below the sensor's 100
     values = file["data"]["analogs"][0]
+    np.testing.assert_allclose(C3dFile(path.read_bytes()).analogs().reshape(-1, 6).T, values, atol=1e-5)
     at = np.arange(values.shape[1]) / 120
     inside = (at >= 0.5) & (at <= 5.49)
     np.testing.assert_allclose(values[1, inside], 2 * (at[inside] - 0.5), atol=1e-5)
