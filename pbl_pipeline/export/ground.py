@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,10 +44,16 @@ def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], titl
             columns += list(values.T)
             axes = {"force": "v", "point": "p", "torque": ""}[what]
             names += [f"ground_{'torque' if what == 'torque' else 'force'}_{side}_{axes}{x}" for x in "xyz"]
-    table = np.column_stack(columns)[known]
+    units = "units: N, m, Nm; ground with y up; r is the right foot, l the left"
+    _write_motion(path, title, origin, units, names, np.column_stack(columns)[known])
+
+
+def _write_motion(
+    path: Path, title: str, origin: Mapping[str, str], units: str, names: Sequence[str], table: np.ndarray
+) -> None:
+    """Write columns with a header of OpenSim, without an empty line (pyomeca stops at one)."""
     head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
-    head += [f"{name}={text}" for name, text in origin.items()]
-    head += ["units: N, m, Nm; ground with y up; r is the right foot, l the left", "endheader", "\t".join(names)]
+    head += [*(f"{name}={text}" for name, text in origin.items()), units, "endheader", "\t".join(names)]
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
 
 
@@ -90,11 +96,8 @@ def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: 
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
-    head += [f"{name}={text}" for name, text in origin.items()]
-    head += ["units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up", "endheader"]
-    head.append("\t".join(["time", *names]))
-    path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
+    units = "units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up"
+    _write_motion(path, title, origin, units, ("time", *names), table)
 
 
 #: Largest distance (m) of the lowest sole from a floor in `_OF_FRAMES` of the frames.
@@ -127,7 +130,7 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
     if len(times) < 3:
         return None
     size = min(1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)), len(times))
-    followed = savgol_filter(lowest, size, 1)
+    followed = np.asarray(savgol_filter(lowest, size, 1), float)
     pelvis = poses.position_m[known, poses.index("pelvis"), :2]
     path = float(np.linalg.norm(np.ptp(pelvis, axis=0)))
     close = np.mean(np.abs(lowest - followed) <= FLOOR_WITHIN_M) >= _OF_FRAMES
