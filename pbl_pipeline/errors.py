@@ -172,6 +172,15 @@ class PblError(Exception):
         return PblError, (self.code, self.found, self.expected, self.next_step, self.key)
 
 
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and the errors that it came from, each once: their chain may be a circle."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__
+
+
 @contextlib.contextmanager
 def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -> Iterator[None]:
     """Raise an OSError of the block as a `PblError`; `found` is the system's message."""
