@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import PurePath
 from typing import NamedTuple
 from unicodedata import category
@@ -179,6 +179,11 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         seen.add(id(error))
         yield error
         error = error.__cause__ or error.__context__
+
+
+#: Functions that return the coded error for an exception of a package that the library does not know, else None; rooms
+#: above the library add theirs.
+CODERS: list[Callable[[BaseException], PblError | None]] = []
 
 
 @contextlib.contextmanager

@@ -7,7 +7,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pbl_pipeline.errors import CODES, PblError, causes
+import pymysql
+
+from pbl_pipeline.errors import CODERS, CODES, PblError, causes
 
 from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
 
@@ -67,6 +69,15 @@ def of_server(error: Exception) -> PblError:
         expected="a statement that the server executes; nothing was written",
         next_step=next((said for numbers, said in steps.items() if number in numbers), "report it with the whole text"),
     )
+
+
+def of_database(error: BaseException) -> PblError | None:
+    """The coded error for one that the driver or DataJoint raised, or that came from such a one; else None."""
+    found = (e for e in causes(error) if isinstance(e, (pymysql.err.Error, LostConnectionError)))
+    return next((of_server(e) for e in found if isinstance(e, Exception)), None)
+
+
+CODERS.append(of_database)
 
 
 def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
