@@ -323,6 +323,40 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert migrations.migrate().steps == []
 
 
+def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
+    put(without_instruments)
+    add = "INSERT INTO pbl_worker.worker (worker, worker_host, worker_pid, worker_resource, worker_version,"
+    add += " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 7, 'any', %s, NOW(3),"
+    add += " NOW(3) - INTERVAL %s SECOND, NULL, '')"
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for name, version, ago in (
+            ("a" * 16, "0.1.0", 5),
+            ("b" * 16, code_version()[:64], 5),
+            ("c" * 16, "0.1.0", 500),
+        ):
+            cursor.execute(add, (name, f"host-{name[0]}", version, ago))
+    dry = pbl("db", "migrate", "--dry-run")
+    assert [line for line in dry.out.splitlines() if "running" in line] == [
+        "  still running: process 7 on host-a, pbl-pipeline 0.1.0"
+    ]
+    refused = pbl("db", "migrate")
+    assert (refused.error_code, "host-a" in refused.err, "--force" in refused.err) == ("DB_MIGRATION", True, True)
+    assert "joint_normal_p" not in columns_of("pbl_validation", "__kinematic_error__joint")
+    assert pbl("db", "migrate", "--force").code == 0
+    assert "joint_normal_p" in columns_of("pbl_validation", "__kinematic_error__joint")
+    assert pbl("db", "migrate").code == 0  # nothing is left to do
+
+
+def columns_of(schema: str, table: str) -> set[str]:
+    """Columns of a table on the server."""
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
+            (schema, table),
+        )
+        return {str(row[0]) for row in cursor.fetchall()}
+
+
 def test_corrections_by_a_method_become_rows(put: Put):
     rows = put(corrected_by_a_method)
     assert len(everything()["pbl_gdi.__session_gdi"]) == 2
