@@ -56,6 +56,8 @@ LOWERED, APART = 0.25, 0.12
 #: Fractions of the way from the seat to standing: between two extremes; least of standing and of an attempt to rise;
 #: most of a seat; of one plateau.
 TURNED, WHOLE, ATTEMPT, SEATED, NEAR = 0.35, 0.95, 0.4, 0.25, 0.15
+#: A rise that is so close to `WHOLE` may be either.
+DOUBT = 0.015
 #: Fraction of the variance of the hips' height that the knees explain if they are to tell standing.
 EXPLAINED = 0.9
 #: Fractions of the way between two levels at which a movement begins and ends.
@@ -132,6 +134,7 @@ class Stands:
     attempts: list[Move]  #: risings that went back to the seat before the person stood; each ends where it is highest
     dips: int  #: times that the hips went down, but not to the seat
     cut: bool  #: the recording begins during a rise
+    doubt: float | None  #: fraction of the way up of a rise that may or may not be one to standing
 
 
 def task_motion(fit: TrialFit, poses: BodyPoses | None = None) -> TaskMotion:
@@ -173,7 +176,7 @@ def stands(motion: TaskMotion, least: float | None = None) -> Stands:
     seen = np.flatnonzero(np.isfinite(value))
     time, value = motion.time_s[seen], value[seen]
     if len(seen) < 2 or np.ptp(value) < (least or APART):
-        return Stands([], [], 0, cut=False)
+        return Stands([], [], 0, cut=False, doubt=None)
     way = float(np.ptp(value))
     lows, tops = (_peaks(v, TURNED * way if least is None else 0.8 * least) for v in (value, -value))
     low, high = _furthest(value[lows], NEAR * way), -_furthest(-value[tops], NEAR * way)
@@ -181,11 +184,12 @@ def stands(motion: TaskMotion, least: float | None = None) -> Stands:
     seat, whole = (low - SEATED * (low - high), WHOLE) if least is None else (high + least, 1.0 - SEATED)
     seats = [int(i) for i in lows if value[i] >= seat]
     last = len(value) - 1
-    moves, attempts = [], []
+    moves, attempts, doubt = [], [], None
     for a, b in itertools.pairwise([0, *seats, last]):
         top = a + int(np.argmax(up[a : b + 1]))
         if up[top] < ATTEMPT:
             continue
+        doubt = float(up[top]) if abs(up[top] - whole) < DOUBT else doubt
         # An attempt begins as a rise would.
         level = _level(value, top, NEAR * way) if up[top] >= whole else high
         sat_a, sat_b = ((i, _level(value, i, NEAR * way)) for i in (a, b))
@@ -196,7 +200,7 @@ def stands(motion: TaskMotion, least: float | None = None) -> Stands:
         elif rise and sit:
             attempts += rise
     dips = [i for i in lows if value[i] < seat and i < last]
-    return Stands(moves, attempts, sum(i > 0 for i in dips), cut=0 in dips)
+    return Stands(moves, attempts, sum(i > 0 for i in dips), cut=0 in dips, doubt=doubt)
 
 
 def _peaks(value: np.ndarray, least: float) -> np.ndarray:
@@ -318,13 +322,15 @@ def _sit_to_stand(motion: TaskMotion) -> _Values:
     rises = [m for m in found.moves if m.direction < 0]
     n, sat_back, five = len(rises), len(found.attempts), []
     unsure = _hidden(motion, [*found.moves, *found.attempts])
+    if found.doubt is not None:
+        unsure = f"a rise came {100 * found.doubt:.0f} percent of the way up: whether the person stood is not known"
     reason = unsure or ("the recording begins during a rise" if found.cut else "")
     if n < 5 and not reason:
         reason = f"five rises are needed, {n} were found"
         if sat_back or found.dips:
             reason = (
-                f"five rises are needed, {n} were found; {sat_back} times the person sat back before standing, "
-                f"{found.dips} times rose again before sitting"
+                f"five rises are needed, {n} were found (sat back before standing: {sat_back}, "
+                f"rose again before sitting: {found.dips})"
             )
     elif not reason:
         five = [rises[4].end_s - min(m.begin_s for m in (rises[0], *found.attempts))]
