@@ -180,14 +180,16 @@ def stands(motion: TaskMotion, least: float | None = None) -> Stands:
     way = float(np.ptp(value))
     lows, tops = (_peaks(v, TURNED * way if least is None else 0.8 * least) for v in (value, -value))
     low, high = _furthest(value[lows], NEAR * way), -_furthest(-value[tops], NEAR * way)
-    up = _fraction_up(value, _smooth(motion.time_s, motion.knee_deg, SMOOTH_S)[seen], tops, (low, high))
+    up = (low - value) / (low - high)
+    if least is None:
+        up = _by_knees(up, value, _smooth(motion.time_s, motion.knee_deg, SMOOTH_S)[seen], tops, low)
     seat, whole = (low - SEATED * (low - high), WHOLE) if least is None else (high + least, 1.0 - SEATED)
     seats = [int(i) for i in lows if value[i] >= seat]
     last = len(value) - 1
     moves, attempts, doubt = [], [], None
     for a, b in itertools.pairwise([0, *seats, last]):
         top = a + int(np.argmax(up[a : b + 1]))
-        if up[top] < ATTEMPT:
+        if up[top] < ATTEMPT or top in seats:
             continue
         doubt = float(up[top]) if abs(up[top] - whole) < DOUBT else doubt
         # An attempt begins as a rise would.
@@ -232,14 +234,12 @@ def _furthest(values: np.ndarray, near: float) -> float:
     return float(np.median(values[values >= values.max() - near]))
 
 
-def _fraction_up(value: np.ndarray, knee_deg: np.ndarray, tops: np.ndarray, levels: tuple[float, float]) -> np.ndarray:
-    """Return the fraction of the way from the seat to standing (`levels`) by frame.
+def _by_knees(up: np.ndarray, value: np.ndarray, knee_deg: np.ndarray, tops: np.ndarray, low: float) -> np.ndarray:
+    """Return the fraction of the way up; near standing from the knees, which straighten much where hips rise little.
 
-    Near standing the knees straighten much while the hips rise little. Where the knees explain the height of the hips
-    in this recording (r2 of `EXPLAINED`), the height that they mean stands for the measured one.
+    Where the knees explain the height of the hips in this recording (r2 of `EXPLAINED`), the height that they mean
+    stands for the measured one; `low` is the level of the seat.
     """
-    low, high = levels
-    up = (low - value) / (low - high)
     upper = up > ATTEMPT
     if not np.isfinite(knee_deg).all():
         return up
@@ -248,7 +248,7 @@ def _fraction_up(value: np.ndarray, knee_deg: np.ndarray, tops: np.ndarray, leve
     by_knee = terms @ np.linalg.lstsq(terms[upper], value[upper], rcond=None)[0]
     if np.var((value - by_knee)[upper]) > (1 - EXPLAINED) * np.var(value[upper]):
         return up
-    high = -_furthest(-by_knee[tops], (1 - WHOLE) * (low - high))
+    high = -_furthest(-by_knee[tops], (1 - WHOLE) * (low - value.min()))
     return np.where(upper, (low - by_knee) / (low - high), up)
 
 
@@ -271,7 +271,7 @@ def turns(motion: TaskMotion, rise: Move, sit: Move) -> tuple[list[Move], str]:
     start = np.diff([time[0], rise.end_s, rise.end_s + half, *(s + d for s in steps for d in (-half, half))])
     least = np.array([0.05, *[0.3, 0.05] * 2, 0.3])
     # The seat is left by the end of the rise or soon after, and the way to the first line is short.
-    most = np.array([rise.end_s - time[0] + half, 3 * half, *[np.inf] * 4])
+    most = np.array([max(rise.end_s - time[0], 0.0) + half, 3 * half, *[np.inf] * 4])
     level = LEVEL_COST * np.array([[0, -1, 1, 0, 0, 0], [0, 0, 0, -1, 1, 0]])
     wanted = np.append(heading, [0.0, 0.0])
 
@@ -352,7 +352,7 @@ def _tug(motion: TaskMotion) -> _Values:
         missing = "the recording begins during a rise" if found.cut else missing
         return dict.fromkeys(names, ([], missing)) | _rise_and_sit(motion, found.moves)
     turned = [(rise, sit, *turns(motion, rise, sit)) for rise, sit in pairs]
-    # Who stands up more often walks once.
+    # A person who stands up more often walks once.
     rise, sit, half_turns, reason = next((t for t in turned if t[2]), turned[0])
     if gap := _gap(motion, rise.begin_s, sit.end_s):
         return dict.fromkeys(names, ([], gap)) | _rise_and_sit(motion, found.moves)
@@ -430,7 +430,8 @@ def _hidden(motion: TaskMotion, moves: Sequence[Move]) -> str:
 def _gap(motion: TaskMotion, begin_s: float, end_s: float) -> str:
     """Return the reason why a time from begin to end is not known; empty if the person was in view throughout."""
     seen = motion.time_s[np.isfinite(motion.lowered)]
-    inside = seen[(seen >= begin_s - BRIDGED_S) & (seen <= end_s + BRIDGED_S)]
+    first = max(int(np.searchsorted(seen, begin_s - BRIDGED_S, side="right")) - 1, 0)
+    inside = seen[first : int(np.searchsorted(seen, end_s + BRIDGED_S)) + 1]
     longest = float(np.diff(inside).max()) if len(inside) > 1 else 0.0
     return f"the person is out of view for {longest:.1f} s in between" if longest > 2 * BRIDGED_S else ""
 
