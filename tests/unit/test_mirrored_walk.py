@@ -94,8 +94,13 @@ def test_measures_index_and_their_errors(walk):
     assert_mirrored(found.spatiotemporal.measures, reflected.spatiotemporal.measures, BAR)
     assert found.gdi.interval is not None
     assert_mirrored({"gdi": found.gdi}, {"gdi": reflected.gdi}, BAR)
-    errors = [(g.gdi.sd, g.gdi.minimal_change) for g in (found, reflected)]
-    np.testing.assert_allclose(errors[0], errors[1], atol=BAR)
+    known = [m for m in found.spatiotemporal.measures.values() if m is not None]
+    assert all(m.error_sd is not None for m in known)
+    stated = [
+        [(m.error_sd, m.minimal_change) for m in g.spatiotemporal.measures.values() if m] for g in (found, reflected)
+    ]
+    np.testing.assert_allclose(*stated, atol=BAR)
+    np.testing.assert_allclose(*[(g.gdi.sd, g.gdi.minimal_change) for g in (found, reflected)], atol=BAR)
 
 
 @pytest.mark.parametrize("model", [m for m in GDI_METHODS if m != GDI_METHODS.default])
