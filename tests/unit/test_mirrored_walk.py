@@ -1,7 +1,7 @@
 """A walk in a mirror: from the fit on, all results are those of the walk with the sides exchanged."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,10 @@ import pytest
 from pbl_pipeline.body import SCALE_NAMES
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import TrialFit, default_fit
-from pbl_pipeline.gait import GDI_METHODS, detect_events, feet_from_fit, gait_metrics
+from pbl_pipeline.gait import GDI_METHODS, Measure, detect_events, feet_from_fit, gait_metrics
 from pbl_pipeline.gait.events import METHODS
-from pbl_pipeline.kinetics import METHODS as KINETICS
 from pbl_pipeline.kinetics import MEASURES, visit_kinetics
+from pbl_pipeline.kinetics import METHODS as KINETICS
 from pbl_pipeline.kinetics.compute import HEALTHY_SD
 from research.corpus.walks import synthetic_walk
 
@@ -75,6 +75,11 @@ def assert_mirrored(found: Mapping[str, Any], reflected: Mapping[str, Any], bar:
             np.testing.assert_allclose(two[[1, 0, 2]], one, atol=bar, err_msg=name)
 
 
+def errors(measures: Sequence[Measure]) -> np.ndarray:
+    """Their stated errors and minimal changes (M, 2)."""
+    return np.array([(m.error_sd, m.minimal_change) for m in measures], float)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_events_of_each_method(walk, method):
     found, reflected = (detect_events(feet_from_fit(f), method).events for f in (walk, mirrored(walk)))
@@ -82,8 +87,7 @@ def test_events_of_each_method(walk, method):
     swapped = [dataclasses.replace(e, side=OTHER[e.side]) for e in found]
     keys = [[(e.side, e.event, e.bout) for e in events] for events in (swapped, reflected)]
     assert keys[0] == keys[1]
-    times = [[e.time_s for e in events] for events in (found, reflected)]
-    np.testing.assert_allclose(*times, atol=EVENT_BAR_S)
+    np.testing.assert_allclose([e.time_s for e in reflected], [e.time_s for e in found], atol=EVENT_BAR_S)
 
 
 def test_measures_index_and_their_errors(walk):
@@ -94,13 +98,11 @@ def test_measures_index_and_their_errors(walk):
     assert_mirrored(found.spatiotemporal.measures, reflected.spatiotemporal.measures, BAR)
     assert found.gdi.interval is not None
     assert_mirrored({"gdi": found.gdi}, {"gdi": reflected.gdi}, BAR)
-    known = [m for m in found.spatiotemporal.measures.values() if m is not None]
-    assert all(m.error_sd is not None for m in known)
-    stated = [
-        [(m.error_sd, m.minimal_change) for m in g.spatiotemporal.measures.values() if m] for g in (found, reflected)
-    ]
-    np.testing.assert_allclose(*stated, atol=BAR)
-    np.testing.assert_allclose(*[(g.gdi.sd, g.gdi.minimal_change) for g in (found, reflected)], atol=BAR)
+    one, two = (errors([*filter(None, g.spatiotemporal.measures.values())]) for g in (found, reflected))
+    assert np.isfinite(one).all()
+    np.testing.assert_allclose(two, one, atol=BAR)
+    one, two = ((g.gdi.sd, g.gdi.minimal_change) for g in (found, reflected))
+    assert two == pytest.approx(one, abs=BAR)
 
 
 @pytest.mark.parametrize("model", [m for m in GDI_METHODS if m != GDI_METHODS.default])
