@@ -201,12 +201,8 @@ def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
 def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
     """Return the index of scores with an error: its expectation, not the index of the expected scores, because an
     error in any direction lengthens a short distance from the norm."""
-    # The same draws at each call, and each with its opposite: an index changes only with its scores.
-    half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
-    spread = np.concatenate([half, -half]) @ _root(posterior.covariance).T
+    spread, visits = _drawn(posterior.covariance, N_DRAWS, 0), _drawn(posterior.anew, N_VISITS, 1)
     sides = _index(posterior.mean + spread, norm)
-    visits = np.random.default_rng(1).standard_normal((N_VISITS // 2, len(posterior.mean)))
-    visits = np.concatenate([visits, -visits]) @ _root(posterior.anew).T
     anew = _index(posterior.mean + visits[:, None] + spread[None, ::4], norm).mean(axis=(1, 2))
     left, right = sides.mean(axis=0)
     return ExpectedIndex(
@@ -255,6 +251,14 @@ def _fewer_cycles(model: MeasurementModel, seen: Pass) -> np.ndarray:
 
 def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
     return norm.index_of_scores(scores.reshape(*scores.shape[:-1], 2, -1))
+
+
+def _drawn(covariance: np.ndarray, n: int, seed: int) -> np.ndarray:
+    """Normal draws (n, 2K) of this covariance, the same at each call and each with its opposite and its mirror image:
+    an index changes only with its scores, and mirrored scores have the mirrored index."""
+    own = np.random.default_rng(seed).standard_normal((n // 4, len(covariance)))
+    both = np.concatenate([own, np.roll(own, len(covariance) // 2, axis=1)])
+    return np.concatenate([both, -both]) @ _root(covariance).T
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -51,7 +51,8 @@ METHOD_SD = _column("method")
 #: is drawn (root mean square over recorded walks of the tuning persons, each from three sides:
 #: `python -m research.benchmarks.kinetics_phone`). Of another marker set the larger one of 33 points. Of 87 points the
 #: peak of loading is of `--walks recorded` and `--walks synthetic` together, and that of push-off of `--walks
-#: synthetic`: 0.030 on recorded walks left out sharper push-offs than theirs.
+#: synthetic`: 0.030 on recorded walks left out sharper push-offs than theirs. The excursion of the centre of mass is of
+#: all three kinds of walks together, with `--tilt 1`.
 ONE_CAMERA_SD = {marker_set: _column(marker_set) for marker_set in ("blazepose_33", "bml_movi_87")}
 #: Standard deviation of a measure between healthy people: the plates' forces of the 11 children of
 #: `python -m research.benchmarks.kinetics`, means over two steps.

@@ -2,6 +2,7 @@
 
     python -m research.benchmarks.kinetics_phone
     python -m research.benchmarks.kinetics_phone --walks recorded --detector metrabs-87
+    python -m research.benchmarks.kinetics_phone --tilt 1
 
 Known walks are seen by a phone that stands, from the front, the side and obliquely, with the measured errors of a
 detector (`research.walker.detectors`), the body height stated:
@@ -10,6 +11,8 @@ detector (`research.walker.detectors`), the body height stated:
   forces, so its interval is judged as a whole. Events are the labels: the walks are too short for a cycle without ends;
 - recorded: walks of other laboratories (`research.corpus`); synthetic: `pbl synth`. Fit and exact motion both go
   through the stage, so the interval is judged without the part of the method, which cancels.
+
+With `--tilt` the fit's vertical is off by so many degrees, along the way to both sides.
 
 For persons on whom numbers were chosen and for the others: the mean true measure, the error's mean and root mean square
 over both sides and all views, the stated standard deviation, how many of the 90 % intervals hold the truth, and, of
@@ -20,6 +23,7 @@ further off than the bar.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import sys
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -28,8 +32,9 @@ from unittest import mock
 import click
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import load_body, stature_m
+from pbl_pipeline.body import PELVIS_TURNS, load_body, stature_m
 from pbl_pipeline.fit import TrialFit, default_fit, fit_session
 from pbl_pipeline.gait import GaitCycle, GaitEvents, find_cycles, gait_metrics
 from pbl_pipeline.gait.events import SIDES
@@ -87,15 +92,31 @@ def known_walks(kind: str) -> Iterator[Known]:
         yield from (Known(w, not w.held_out) for w in map(synthetic_walk, range(N_SYNTHETIC)))
 
 
-def forces(known: Known, view: str, detector: str) -> tuple[TrialFit, TrialFit, Kinetics, Kinetics]:
-    """Return the fit of what the phone saw, the exact motion in the form of a fit, and the kinetics of both with every
-    measure; without the error of the method where the exact motion is the truth."""
+def tilted(fit: TrialFit, tilt_deg: float) -> TrialFit:
+    """The fit in a world that is turned by an angle about the horizontal axis across the way, rising ahead."""
+    names = (("pelvis_tx", "pelvis_ty", "pelvis_tz"), PELVIS_TURNS)
+    place, turns = (np.array([fit.joint_names.index(n) for n in of]) for of in names)
+    qpos, seen = fit.qpos.copy(), np.flatnonzero(np.isfinite(fit.qpos).all(axis=1))
+    at, angles = qpos[np.ix_(seen, place)], qpos[np.ix_(seen, turns)]
+    way = (at[-1] - at[0]) * [1.0, 0.0, 1.0]
+    world = Rotation.from_rotvec(np.radians(tilt_deg) * np.cross(way / np.linalg.norm(way), [0.0, 1.0, 0.0]))
+    turned = (world * Rotation.from_euler("ZXY", angles)).as_euler("ZXY")
+    qpos[np.ix_(seen, place)] = world.apply(at)
+    qpos[np.ix_(seen, turns)] = turned + 2 * np.pi * np.round((angles - turned) / (2 * np.pi))
+    return dataclasses.replace(fit, qpos=qpos)
+
+
+def forces(
+    known: Known, view: str, detector: str, tilt_deg: float = 0.0
+) -> tuple[TrialFit, TrialFit, Kinetics, Kinetics]:
+    """Return the fit of what the phone saw, its vertical off by `tilt_deg`, the exact motion in the form of a fit, and
+    the kinetics of both with every measure; without the error of the method where the exact motion is the truth."""
     walk, method = known.walk, METHODS.find()
     points = Case(walk, view, "static", detector).keypoints()
     chosen = default_fit((points.marker_set, points.root_relative))
     height = stature_m(load_body(), walk.scale)
     session = fit_session([points], [walk.person], chosen, "static", height_m=height)
-    fit = dataclasses.replace(session.trials[0], orientation_source="measured: phone")
+    fit = dataclasses.replace(tilted(session.trials[0], tilt_deg), orientation_source="measured: phone")
     unknown = np.full_like(walk.qpos, np.nan)  # the exact motion has no error to draw
     exact = dataclasses.replace(walk.fit(), orientation_source="measured: phone", qpos_sd=unknown)
     gait = [known.labels] * 2 if known.labels else [gait_metrics([f]).trials[0] for f in (fit, exact)]
@@ -123,13 +144,14 @@ def vertical_rms(walk: Walk, fit: TrialFit, exact: TrialFit) -> float:
 @click.command()
 @click.option("--walks", "kind", type=click.Choice(("plates", "recorded", "synthetic")), default="plates")
 @click.option("--detector", type=click.Choice(tuple(DETECTORS)), default="blazepose-heavy", show_default=True)
-def main(kind: str, detector: str) -> None:
+@click.option("--tilt", default=0.0, metavar="DEG", help="Error of the vertical along the way, to both sides.")
+def main(kind: str, detector: str, tilt: float) -> None:
     """Print the tables."""
     rows: dict[tuple[bool, str], list[tuple[float, ...]]] = {}
     rms: dict[bool, list[float]] = {True: [], False: []}
     for known in known_walks(kind):
-        for view in VIEWS:
-            fit, exact, seen, true = forces(known, view, detector)
+        for view, tilt_deg in itertools.product(VIEWS, sorted({-tilt, tilt})):
+            fit, exact, seen, true = forces(known, view, detector, tilt_deg)
             if not seen.measures or not true.measures:
                 click.echo(f"{known.walk.person} {view}: {seen.code or true.code}")
                 continue

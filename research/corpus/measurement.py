@@ -581,7 +581,11 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
 @click.option("--norm", default=DEFAULT_NORM, show_default=True, help="Normative set.")
 @click.option("--fit", default="blazepose", show_default=True, help="Method the passes were fitted with.")
 @click.option("--model", "stored", help="Judge this stored model of passes fitted alone instead of the estimated one.")
-@click.option("--write", type=click.Path(path_type=Path), help="Write the model there.")
+@click.option(
+    "--write",
+    type=click.Path(path_type=Path),
+    help="Write the model there; with --model that one, its gait measures anew.",
+)
 def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | None) -> None:
     """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
     basis, method = load_norm(norm), METHODS[fit]
@@ -605,7 +609,9 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
                 out = left_out_in_turn(parts["tuning", ALONE], own, basis)
                 _echo_left_out(out, models[ALONE].widening, people[1])
     if stored is not None:
-        models[ALONE] = load_model(stored)
+        own = models[ALONE]
+        parts_anew = {"events": own.events, "pass_cycles": own.pass_cycles, "measures": own.measures}
+        models[ALONE] = dataclasses.replace(load_model(stored), **parts_anew)
     for (title, fitted), part in parts.items():
         if not part:
             continue
@@ -625,7 +631,8 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         model = dataclasses.replace(models[ALONE], name=write.stem)
-        write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
+        index = f"; index of {load_model(stored).name}" if stored else ""
+        write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons{index}")
         click.echo(f"\n{write}")
 
 
