@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,27 @@ def mostly(names: np.ndarray) -> str:
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
+#: Usual standard deviation between the cycles of a side, in the unit of the measure: what nine of ten recorded people
+#: do not exceed (`python -m research.corpus.spread`; single support as swing, which it is of the other foot). They are
+#: healthy: of times and percentages twice that.
+CYCLE_SPREAD = {
+    "cadence_steps_per_min": 3.5,
+    "stride_time_s": 0.029,
+    "step_time_s": 0.023,
+    "stance_time_s": 0.019,
+    "swing_time_s": 0.021,
+    "stance_percent": 1.2,
+    "swing_percent": 1.2,
+    "single_support_percent": 1.2,
+    "double_support_percent": 1.5,
+    "double_support_time_s": 0.018,
+    "speed_m_per_s": 0.055,
+    "stride_length_m": 0.034,
+    "step_length_m": 0.047,
+}
+#: As many degrees of freedom the usual spread counts for where a person's own is larger: of smaller numbers, three
+#: cycles of a person with twice the usual spread would have a larger error than two, whose spread is not known.
+USUAL_FREEDOM = 6
 #: Measures in the order of metrics.json; the unit is in the name.
 MEASURES = tuple(words.MEASURES)
 #: Measures that need the positions of the feet on the floor.
@@ -76,6 +98,18 @@ CADENCE_PER_MIN = (60.0, 150.0)
 #: Key in `Spatiotemporal.reasons` of the reason why the measures have no spread.
 SPREAD = "spread"
 NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
+
+
+def sampling_sd(usual: float, n: int, own: float | None = None, freedom: int = 0) -> float:
+    """Return the standard deviation of a mean over n cycles by their spread: the `usual` one, or more if that of the
+    person (`own`, with `freedom` degrees of freedom) is larger.
+
+    The excess counts by its degrees of freedom (as in a posterior mean with a scaled inverse chi-square prior; Gelman
+    et al. 2013, Bayesian Data Analysis, section 2.6). A smaller spread does not count, because by chance a few cycles
+    of anyone are alike: so fewer cycles never have a smaller error, up to a spread that is larger than usual.
+    """
+    excess = 0.0 if own is None else max(own**2 - usual**2, 0.0) * freedom / (USUAL_FREEDOM + freedom)
+    return math.sqrt((usual**2 + excess) / n)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,15 +211,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     if not used:
         reason = _none_used(cycles)
         return Spatiotemporal("EMPTY", reason, measures, dict.fromkeys(MEASURES, reason), len(cycles), 0, 0)
-    by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
-    steps: dict[tuple[str, str, float], float] = {}
-    for c in used:
-        for name, value in cycle_measures(c).items():
-            by_cycle[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
-        other = RIGHT if c.side == LEFT else LEFT
-        steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
-        steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
-    by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
+    by_cycle = measured_values(used)
     alike = not far_leg_of(used)
     measures.update({n: measure_of(values, alike and n in SIDED) for n, values in by_cycle.items() if values})
     for name in LENGTHS:
@@ -198,7 +224,20 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
         )
         none = {"sd": None, "variability": None, "cv_percent": None}
         measures = {name: m and dataclasses.replace(m, **none) for name, m in measures.items()}
-    return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
+    return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(by_cycle["step_time_s"]))
+
+
+def measured_values(used: Sequence[GaitCycle]) -> dict[str, list[tuple[str, float]]]:
+    """Values of each measure with their sides ("" for a measure without), of cycles or steps."""
+    values: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
+    steps: dict[tuple[str, str, float], float] = {}
+    for c in used:
+        for name, value in cycle_measures(c).items():
+            values[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
+        other = RIGHT if c.side == LEFT else LEFT
+        steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
+        steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
+    return values | {"step_time_s": [(side, value) for (_, side, _), value in steps.items()]}
 
 
 def far_leg_of(cycles: Sequence[GaitCycle]) -> str:
