@@ -248,8 +248,8 @@ def measure_error(
     Views count alike, so that neither gets smaller when cycles or passes are left out. `own` is the spread of the
     cycles within a side, with `freedom` degrees of freedom: a larger one than is usual counts by `sampling_sd`.
     """
-    errors = [of_view.get(name) for of_view in model.measures.values()]
-    if None in errors:
+    errors = [of_view[name] for of_view in model.measures.values() if name in of_view]
+    if len(errors) < len(model.measures):
         return None
     lasting, visit, anew = np.sqrt(np.mean(np.square(errors), axis=0))
     usual = float(np.hypot(CYCLE_SPREAD.get(name, 0.0), anew * np.sqrt(model.pass_cycles)))

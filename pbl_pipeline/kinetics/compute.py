@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -97,8 +98,8 @@ def visit_kinetics(
     forces are not computed.
     """
     trials = tuple(trial_kinetics(f, g, method.params, aid=aid) for f, g in zip(fits, gait, strict=True))
-    pooled = [t for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None]
-    cycles = [c for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None for c in g.cycles]
+    pairs = [(t, g) for t, g in zip(trials, gait, strict=True) if g.pooled and t.series is not None]
+    pooled, cycles = [t for t, _ in pairs], [c for _, g in pairs for c in g.cycles]
     cameras = [ONE_CAMERA_SD.get(f.marker_set, ONE_CAMERA_SD["blazepose_33"]) for f in fits if not is_metric(f)]
     of_camera = {name: max((c[name] for c in cameras), default=0.0) for name in MEASURES}
     measures, reasons = _pool(pooled, of_camera, not far_leg_of(cycles))
@@ -288,22 +289,18 @@ def _measure(
     own = measure_of(values)
     mean = {s: m for s, m in (("left", own.left), ("right", own.right)) if m is not None}
     n = {s: sum(side == s for side, _ in values) for s in ("left", "right")}
-    every = [d for of_side in drawn.values() for d in of_side]
-    known = len(every) == own.n
+    known = sum(map(len, drawn.values())) == own.n
     varies = {s: np.nanmean(drawn[s], axis=0) for s in mean} if known else {}
-    # The drawn error is in the cycles' spread as well.
-    fit = float(np.nanmean(np.nanvar(every, axis=1, ddof=1))) if known else 0.0
-    spread = None if own.variability is None else np.sqrt(max(own.variability**2 - fit, 0.0))
-    chance = {s: sampling_sd(CYCLE_SD[name], max(k, 1), spread, own.n - 2) for s, k in n.items()}
+    chance = {s: sampling_sd(CYCLE_SD[name], max(k, 1), own.variability, own.n - 2) for s, k in n.items()}
 
     def sd(weights: Mapping[str, float], least_chance: float = 0.0) -> float | None:
         if not known:
             return None
-        each, squares, total = weights.items(), sum(w**2 for w in weights.values()), sum(weights.values())
+        each, squares = weights.items(), sum(w**2 for w in weights.values())
+        fit = np.var(np.sum([w * varies[s] for s, w in each], axis=0), ddof=1)
+        camera = of_camera**2 * max(sum(weights.values()) ** 2, squares)
         walk = max(sum((w * chance[s]) ** 2 for s, w in each), least_chance**2)
-        camera = of_camera**2 * max(total**2, squares)
-        drawn_part = np.var(np.sum([w * varies[s] for s, w in each], axis=0), ddof=1)
-        return float(np.sqrt(drawn_part + METHOD_SD[name] ** 2 * squares + camera + walk))
+        return float(np.sqrt(fit + METHOD_SD[name] ** 2 * squares + camera + walk))
 
     middle = float(np.mean(list(mean.values())))
     asymmetry = asymmetry_sd = None
@@ -319,7 +316,7 @@ def _measure(
         sd_left=sd({"left": 1.0}) if "left" in mean else None,
         sd_right=sd({"right": 1.0}) if "right" in mean else None,
         # A side that is missing counts like one of one cycle.
-        sd=sd(dict.fromkeys(mean, 1.0 / len(mean)), 0.5 * float(np.hypot(*chance.values()))),
+        sd=sd(dict.fromkeys(mean, 1.0 / len(mean)), 0.5 * math.hypot(*chance.values())),
         n=own.n,
         asymmetry_percent=asymmetry,
         asymmetry_sd=asymmetry_sd,

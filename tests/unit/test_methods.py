@@ -38,7 +38,7 @@ SHIPPED = {
     ("gdi", "pbl-2025-three-angles", 6): "fa0e247c66df42b3",
     ("gdi", "gillette-2008", 1): "a68829dd8731dde1",
     ("gdi", "paper-2025", 1): "a51bf145c1179652",
-    ("kinetics", "newton-euler", 4): "6dd63d7ec4a4d5ee",
+    ("kinetics", "newton-euler", 5): "d299a6ce470641b0",
 }
 EVERY = [m for name in methods.STAGES for m in of_stage(name).values()]
 
