@@ -62,9 +62,9 @@ Z90 = 1.6449
 #: do not exceed (`python -m research.corpus.spread`; single support as swing, which it is of the other foot). They are
 #: healthy: of times and percentages twice that.
 CYCLE_SPREAD = {
-    "cadence_steps_per_min": 3.5,
+    "cadence_steps_per_min": 3.8,
     "stride_time_s": 0.029,
-    "step_time_s": 0.023,
+    "step_time_s": 0.034,
     "stance_time_s": 0.019,
     "swing_time_s": 0.021,
     "stance_percent": 1.2,
@@ -211,7 +211,15 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
     if not used:
         reason = _none_used(cycles)
         return Spatiotemporal("EMPTY", reason, measures, dict.fromkeys(MEASURES, reason), len(cycles), 0, 0)
-    by_cycle = measured_values(used)
+    by_cycle: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
+    steps: dict[tuple[str, str, float], float] = {}
+    for c in used:
+        for name, value in cycle_measures(c).items():
+            by_cycle[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
+        other = RIGHT if c.side == LEFT else LEFT
+        steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
+        steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
+    by_cycle["step_time_s"] = [(side, value) for (_, side, _), value in steps.items()]
     alike = not far_leg_of(used)
     measures.update({n: measure_of(values, alike and n in SIDED) for n, values in by_cycle.items() if values})
     for name in LENGTHS:
@@ -224,20 +232,7 @@ def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:
         )
         none = {"sd": None, "variability": None, "cv_percent": None}
         measures = {name: m and dataclasses.replace(m, **none) for name, m in measures.items()}
-    return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(by_cycle["step_time_s"]))
-
-
-def measured_values(used: Sequence[GaitCycle]) -> dict[str, list[tuple[str, float]]]:
-    """Values of each measure with their sides ("" for a measure without), of cycles or steps."""
-    values: dict[str, list[tuple[str, float]]] = {name: [] for name in MEASURES}
-    steps: dict[tuple[str, str, float], float] = {}
-    for c in used:
-        for name, value in cycle_measures(c).items():
-            values[name].append(("" if name == "cadence_steps_per_min" else c.side, value))
-        other = RIGHT if c.side == LEFT else LEFT
-        steps[c.trial, other, c.opposite_foot_down_s] = c.opposite_foot_down_s - c.start_s
-        steps[c.trial, c.side, c.end_s] = c.end_s - c.opposite_foot_down_s
-    return values | {"step_time_s": [(side, value) for (_, side, _), value in steps.items()]}
+    return Spatiotemporal("PASS", "", measures, reasons, len(cycles), len(used), len(steps))
 
 
 def far_leg_of(cycles: Sequence[GaitCycle]) -> str:

@@ -284,7 +284,7 @@ def _measure(
 ) -> KineticMeasure:
     """Return means and standard deviations of values with their sides; `compared`: with the asymmetry. The method errs
     on each side by itself, and a mean also errs by the spread of its cycles. One camera counts as erring alike on both
-    sides in their mean, by itself on each in their difference: its errors of left and right correlate by -0.5 to 0.8
+    sides in their mean, by itself on each in their difference: its errors of left and right correlate by -0.5 to 0.9
     (`python -m research.benchmarks.kinetics_phone`)."""
     own = measure_of(values)
     mean = {s: m for s, m in (("left", own.left), ("right", own.right)) if m is not None}

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import gait_metrics
-from pbl_pipeline.gait.cycle_measures import MEASURES, measured_values
+from pbl_pipeline.gait.cycle_measures import MEASURES, cycle_measures
 from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.kinetics import MEASURES as FORCES
 from pbl_pipeline.kinetics import METHODS, visit_kinetics
@@ -50,11 +50,13 @@ def squares_of(fit: TrialFit) -> Squares:
     """Return the spread between the cycles of each side of a walk, in the mean of both."""
     gait = gait_metrics([fit])
     forces = visit_kinetics([fit], gait.trials, METHODS.find()).trials[0].cycles
-    values = measured_values([c for c in gait.cycles if c.used])
-    values |= {n: [(c.side, c.measures[n]) for c in forces if c.used and n in c.measures] for n in FORCES}
+    values = [
+        (c.side, cycle_measures(c) | {"step_time_s": c.end_s - c.opposite_foot_down_s}) for c in gait.cycles if c.used
+    ]
+    values += [(c.side, c.measures) for c in forces if c.used]
     out: Squares = {}
-    for name, own in values.items():
-        sides = [np.array([v for s, v in own if s == side]) for side in (*SIDES, "")]
+    for name in (*MEASURES, *FORCES):
+        sides = [np.array([m[name] for s, m in values if s == side and name in m]) for side in SIDES]
         out[name] = (
             float(sum(np.sum((v - v.mean()) ** 2) for v in sides if len(v))),
             sum(len(v) - 1 for v in sides if len(v)),

@@ -1,13 +1,17 @@
 """Properties of everything that pools: less data has no smaller error, and names, order and labels do not matter."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from click.testing import CliRunner
 
 from pbl_pipeline.body import load_body
+from pbl_pipeline.cli.gait import gait as gait_command
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import (
     MEASURES,
@@ -20,6 +24,7 @@ from pbl_pipeline.gait import (
     load_norm,
     pool_trials,
 )
+from pbl_pipeline.gait.measurement import load_model
 from pbl_pipeline.gait.metrics import TrialCycles
 from pbl_pipeline.kinetics import MEASURES as FORCES
 from pbl_pipeline.kinetics import METHODS, Kinetics, visit_kinetics
@@ -204,3 +209,31 @@ def test_sides_that_were_not_seen_alike_are_not_compared(walks: list[TrialFit]):
     check = next(c for c in withheld.qc if c.check == "legs_seen_alike")
     assert check == next(c for c in pooled([unlike]).qc if c.check == "legs_seen_alike")
     assert check.outcome == "WARN"
+
+
+def test_pbl_gait_measures_the_same_from_files_in_another_order_and_of_one_name(tmp_path: Path, walks: list[TrialFit]):
+    found = []
+    for names, order in (("ab", 1), ("xx", -1)):
+        files = [tmp_path / f"{names} {i}" / f"{name}.fit.npz" for i, name in enumerate(names)]
+        for file, fit in zip(files, walks, strict=True):
+            file.parent.mkdir()
+            dataclasses.replace(fit, name=file.name.removesuffix(".fit.npz")).save(file)
+        done = CliRunner().invoke(gait_command, [*map(str, files[::order]), "--out", str(tmp_path / f"{names}.json")])
+        assert done.exit_code == 0, done.output
+        found.append(json.loads((tmp_path / f"{names}.json").read_text())["session"])
+    for name in MEASURES:
+        assert found[1][name] == found[0][name], name
+    assert found[1]["cycles"] == found[0]["cycles"]
+
+
+def test_no_measure_has_a_smaller_error_without_frames(walks: list[TrialFit]):
+    fit = dataclasses.replace(walks[0], params_hash=load_model("blazepose-33").fits[0], height_m=float("nan"))
+    whole = errors(gait_metrics([fit]))
+    assert whole.keys() == set(MEASURES) - {"step_width_m"}
+    for lost in (slice(0, 60), slice(70, 90), slice(110, None)):
+        qpos = fit.qpos.copy()
+        qpos[lost] = np.nan
+        part = errors(gait_metrics([dataclasses.replace(fit, qpos=qpos)]))
+        assert part
+        for name, of_part in part.items():
+            assert np.all(np.array(of_part) >= np.array(whole[name]) - CLOSE), (name, lost)
