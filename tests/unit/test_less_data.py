@@ -33,7 +33,7 @@ from tests import not_none
 from tests.walking_fit import walking_fit
 
 NORM, PARAMS = load_norm(), GaitParams()
-#: What of two results may differ by rounding.
+#: Largest difference by rounding.
 CLOSE = 1e-9
 
 
