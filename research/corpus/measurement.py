@@ -391,25 +391,6 @@ def change_pairs(frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def drawn(seen: Sequence[Seen], model: MeasurementModel) -> list[Seen]:
-    """The same passes with scores that are drawn from the model about the true ones: its own world."""
-    rng, errors = np.random.default_rng(0), {}
-
-    def draw(key: tuple, covariance: np.ndarray) -> np.ndarray:
-        if key not in errors:
-            values, vectors = np.linalg.eigh(covariance)
-            errors[key] = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        return errors[key]
-
-    out = []
-    for i, s in enumerate(seen):
-        view, true = model.views[FAR_LEG[s.view]], s.true.ravel()
-        off = draw((s.person,), model.person) + draw((s.person, FAR_LEG[s.view]), view.view) + draw((i,), view.anew)
-        scores = model.mean + view.bias + view.gain @ (true - model.mean) + off
-        out.append(dataclasses.replace(s, scores=scores.reshape(s.scores.shape)))
-    return out
-
-
 def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
     """Logarithmic loss of both probabilities by how much of what two visits have in common does not cancel
     (`gait.measurement.REMAINS`), over pairs that were filmed alike and that changed, and their mean absolute true
@@ -668,8 +649,6 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
         _echo(f"{about}: which part of what visits have in common remains", remains_table(pairs), 3)
         _echo(f"{about}: probability of a change, as stated and as found", probability_table(pairs), 3)
         _echo(f"{about}: probability of a change, by session", probability_errors(pairs), 3)
-        own_world = change_pairs(judged(drawn(part, models[fitted]), models[fitted], basis))
-        _echo(f"{about}, drawn from the model: probability of a change", probability_table(own_world), 3)
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         model = dataclasses.replace(models[ALONE], name=write.stem)
