@@ -16,8 +16,9 @@ With `--tilt` the fit's vertical is off by so many degrees, along the way to bot
 
 For persons on whom numbers were chosen and for the others: the mean true measure, the error's mean and root mean square
 over both sides and all views, the stated standard deviation, how many of the 90 % intervals hold the truth, and, of
-the whole interval, how often the visit shows the measure. Exit code 1 where the vertical force of the others is
-further off than the bar.
+the whole interval, how often the visit shows the measure. The same of the asymmetry (percent) from the front and
+obliquely, where it may be shown, and the correlation of the errors of left and right there and from the side. Exit code
+1 where the vertical force of the others is further off than the bar.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from pbl_pipeline.gait import GaitCycle, GaitEvents, find_cycles, gait_metrics
 from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.gait.laboratory import read_lab_trial
 from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, visit_kinetics
-from pbl_pipeline.kinetics.compute import HEALTHY_SD, METHOD_SD, too_uncertain, trial_series
+from pbl_pipeline.kinetics.compute import CYCLE_SD, HEALTHY_SD, MAX_ASYMMETRY_SD, METHOD_SD, too_uncertain, trial_series
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
 from pbl_pipeline.kinetics.types import WIDTH_SD
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
@@ -123,6 +124,8 @@ def forces(
     with (
         mock.patch.dict(HEALTHY_SD, dict.fromkeys(MEASURES, np.inf)),
         mock.patch.dict(METHOD_SD, {} if known.plates else dict.fromkeys(MEASURES, 0.0)),
+        mock.patch.dict(CYCLE_SD, dict.fromkeys(MEASURES, 0.0)),  # the truth is of the same cycles
+        mock.patch("pbl_pipeline.kinetics.compute.MAX_ASYMMETRY_SD", np.inf),
     ):
         seen, true = (visit_kinetics([f], [g], method) for f, g in zip((fit, exact), gait, strict=True))
     return fit, exact, seen, true
@@ -149,6 +152,7 @@ def main(kind: str, detector: str, tilt: float) -> None:
     """Print the tables."""
     rows: dict[tuple[bool, str], list[tuple[float, ...]]] = {}
     rms: dict[bool, list[float]] = {True: [], False: []}
+    sides: dict[tuple[bool, str, bool], list[tuple[float, ...]]] = {}
     for known in known_walks(kind):
         for view, tilt_deg in itertools.product(VIEWS, sorted({-tilt, tilt})):
             fit, exact, seen, true = forces(known, view, detector, tilt_deg)
@@ -157,13 +161,20 @@ def main(kind: str, detector: str, tilt: float) -> None:
                 continue
             rms[known.tuning].append(vertical_rms(known.walk, fit, exact))
             for name, measure in seen.measures.items():
-                shown = not too_uncertain(name, measure.sd or 0.0)
+                shown, both = not too_uncertain(name, measure.sd or 0.0), []
                 for side in SIDES:
                     value, truth = getattr(measure, side), getattr(true.measures.get(name), side, None)
                     truth = known.plates.get(side, {}).get(name) if known.plates else truth
                     if value is not None and truth is not None:
                         row = (truth, value - truth, getattr(measure, f"sd_{side}"), shown)
                         rows.setdefault((known.tuning, name), []).append(row)
+                        both.append(row)
+                if len(both) == len(SIDES):
+                    (left, off_left, *_), (right, off_right, *_) = both
+                    asymmetry, stated = measure.asymmetry_percent, measure.asymmetry_sd
+                    off = np.nan if asymmetry is None else asymmetry - 200.0 * (right - left) / abs(right + left)
+                    row = (off, np.nan if stated is None else stated, off_left, off_right)
+                    sides.setdefault((known.tuning, name, view == "sagittal"), []).append(row)
     bar = BARS[detector_model(detector).marker_set]
     for tuning in (True, False):
         click.echo(f"\n{kind}, {detector}, {'tuning' if tuning else 'held out'}: {len(rms[tuning])} clips")
@@ -176,6 +187,19 @@ def main(kind: str, detector: str, tilt: float) -> None:
             cells = (truth.mean(), error.mean(), np.sqrt(np.mean(error**2)), np.sqrt(np.mean(sd**2)))
             found = (np.mean(np.abs(error) < WIDTH_SD * sd), shown.mean())[: len(shares)]
             click.echo(f"{name:42}" + "".join(f"{c:9.3f}" for c in cells) + "".join(f"{s:7.0%}" for s in found))
+        click.echo(f"\n{'asymmetry (percent)':42}{'rms':>9}{'sd':>9}{'held':>7}{'shown':>7}{'together':>10}{'side':>9}")
+        for name in MEASURES:
+            alike, unlike = (np.array(sides.get((tuning, name, side), np.zeros((0, 4)))) for side in (False, True))
+            if not np.isfinite(alike[:, 1]).any():
+                continue
+            off, sd = alike[np.isfinite(alike[:, 1]), :2].T
+            cells = (np.sqrt(np.mean(off**2)), np.sqrt(np.mean(sd**2)))
+            found = (np.mean(np.abs(off) < WIDTH_SD * sd), np.mean(sd <= MAX_ASYMMETRY_SD))
+            alone = [np.mean(v[:, 2] * v[:, 3]) / np.mean(v[:, 2:] ** 2) if len(v) else np.nan for v in (alike, unlike)]
+            click.echo(
+                f"{name:42}" + "".join(f"{c:9.1f}" for c in cells) + "".join(f"{s:7.0%}" for s in found)
+                + f"{alone[0]:10.2f}{alone[1]:9.2f}"
+            )  # fmt: skip
     sys.exit(int(np.mean(rms[False]) > bar))
 
 
