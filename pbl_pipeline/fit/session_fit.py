@@ -131,7 +131,7 @@ def check_trial(
 
     Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN if the trial cannot be fitted.
     """
-    return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
+    return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)[:2]
 
 
 def _session_fit(packed: Packed, solution: Solution, paramset: Paramset, given: SessionInput) -> SessionFit:

@@ -144,7 +144,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def notes(trial: Any) -> str:
-    return "".join(c.advice for c in trial.events.qc if c.check == "c3d_assumptions")
+    return "".join(c.advice for c in trial.events.qc if c.check == "input_assumptions")
 
 
 def refused(code: str, path: Path, **options: Any) -> str:
