@@ -1,4 +1,4 @@
-"""What a reader took from a file, computed from its data and assumed, and the checks of it against a person.
+"""Origin of the data of a file (taken, computed, assumed), and checks of them against a person.
 
 Assumed of the person: 0.75 to 3.4 m tall; a stride takes 0.4 to 8 s. A file states its unit and its times, or a reader
 assumes them; a body shows them.

@@ -151,6 +151,7 @@ def find_cycles(
     series: AngleSeries | None = None,
     feet: FootTrajectories | None = None,
     keep_ends: bool = False,
+    no_width: str = "",
 ) -> tuple[GaitCycle, ...]:
     """All cycles whose inner events are complete and in order, with curves and lengths if a fit is given.
 
@@ -169,7 +170,7 @@ def find_cycles(
     stride, and a slow stride belongs to the spread. Nor is one whose curves are far from the others'.
 
     `series` and `feet` replace the fit's angles and feet if there is no fit (a laboratory's recording; positions in
-    metres in a fixed world).
+    metres in a fixed world). `no_width`: the reason if these do not tell the step width.
 
     If one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Nor is
     one of a fit whose cadence is too high for walking (`with_cadence_accepted` takes that back).
@@ -206,8 +207,10 @@ def find_cycles(
                 missing = missing or ", ".join(f"no {angle}" for angle in absent)
             lengths, slide = Lengths(missing=no_lengths), None
             if feet is not None and not no_lengths:
-                times = (start.time_s, inner[1].time_s, end.time_s)
-                lengths, slide = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=metric)
+                times, width = (start.time_s, inner[1].time_s, end.time_s), metric and not no_width
+                lengths, slide = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=width)
+                if no_width and not lengths.missing:
+                    lengths = dataclasses.replace(lengths, missing=no_width)
             cycle = GaitCycle(
                 trial=name,
                 number=0,
@@ -269,7 +272,7 @@ _SWINGS, _STANDS, _LESS_DEG = (0.62, 0.88), (0.12, 0.38), 8.0
 
 
 def check_sides(cycles: Sequence[GaitCycle], name: str) -> None:
-    """Check that knees bend more in the swing of their own side than in its stance. Raises `PblError` GAIT_INPUT."""
+    """Check that each knee bends more in swing than in stance. Raises `PblError` GAIT_INPUT."""
     knees = np.array([c.curves["knee_flexion"] for c in cycles if "knee_flexion" in c.curves])
     phase = REPORT_PERCENT / 100.0
     mean = [knees[:, (phase >= a) & (phase <= b)].mean() if len(knees) else 0.0 for a, b in (_SWINGS, _STANDS)]

@@ -58,13 +58,14 @@ _damaged = functools.partial(PblError, "FILE_FORMAT", next_step="export the reco
 
 @dataclasses.dataclass(frozen=True)
 class LabTrial:
-    """One recording: `series` of nine angles per side (Plug-in Gait's, degrees), `events`, and `feet` where the markers
-    are there (metres)."""
+    """One recording: `series` of angles per side (degrees), `events`, and `feet` where markers or coordinates place
+    them on the floor (metres). `no_width`: why they do not tell the step width."""
 
     name: str
     series: AngleSeries
     events: GaitEvents
     feet: FootTrajectories | None
+    no_width: str = ""
 
 
 def read_lab_trial(

@@ -296,7 +296,8 @@ def _trial(
     task: tuple[dict[str, Any], dict[str, str]] = {}, {}
     if isinstance(trial, LabTrial):
         events = trial.events
-        cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
+        about = {"trial": trial.name, "series": trial.series, "feet": trial.feet, "no_width": trial.no_width}
+        cycles = find_cycles(events, **about, keep_ends=True)
         check_sides(cycles, trial.name)
     else:
         poses, events = _events(trial, event_method)

@@ -109,6 +109,7 @@ def test_our_own_motion_has_the_index_and_the_lengths_of_its_fit(mot: Path):
     )
     own = np.mean([not_none(c.lengths.step_length_m) for c in cycles_of_fit() if c.used])
     assert mean(found, "step_length_m") == pytest.approx(own, abs=0.01)
+    assert "16 cm" in found.spatiotemporal.reasons["step_width_m"]
     said = origin(mot)
     assert "pbl-pipeline 1.2" in said
     assert "angles in degrees" in said
