@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pbl_pipeline.assumptions import SIZES, Origin, check_size
+from pbl_pipeline.assumptions import SIZES, Origin, check_size, check_steps
 from pbl_pipeline.bounded import count_rows, read_text
 from pbl_pipeline.errors import PblError
 
@@ -62,7 +62,7 @@ def read_motion(path: str | Path) -> OpenSimMotion:
         if twice or len(names) != values.shape[1]:
             wrong = f"{', '.join(twice[:5])} twice" if twice else f"{len(names)} names of {values.shape[1]} columns"
             raise ValueError(wrong)
-        column = {n: values[:, i] for i, n in enumerate(names) if n}
+        column = {n: values[:, i] for i, n in enumerate(names) if n and np.isfinite(values[:, i]).any()}
         time = column.pop("time")
     except (OSError, StopIteration, KeyError, ValueError, IndexError) as error:
         absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
@@ -181,10 +181,9 @@ def read_motion_trial(path: str | Path, events_csv: str | Path | None = None, me
     """Read the angles of an OpenSim motion (`read_motion`) and its events.
 
     Events: those of `events_csv` (`pbl events`), else found by `method` from the feet (`read_motion_feet`). Angles of
-    absent coordinates are absent; without pelvis_tx, ty, tz there are no lengths on the floor. Stride and step length
-    differ by 4 and 6 mm at most from the markers' in 11 walks of a laboratory whose angles were written so, the step
-    width by up to 16 cm: it is left out. The check
-    `input_assumptions` lists what was read, computed and assumed.
+    absent coordinates are absent; lengths on the floor need pelvis_tx, ty, tz. Stride and step length differ by 4 and
+    6 mm at most from the markers' in 11 walks of a laboratory whose angles were written so, the step width by up to
+    16 cm: it is left out. The check `input_assumptions` lists what was read, computed and assumed.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT, ANGLE_UNITS (`read_motion`), GAIT_INPUT (no angle of a leg; neither
     events nor the coordinates to find them; angles, size, times or strides that no person has; sides exchanged).
@@ -214,6 +213,10 @@ def read_motion_feet(path: str | Path) -> FootTrajectories:
 
 def _series(path: Path, motion: OpenSimMotion) -> AngleSeries:
     """The angles of the legs, checked."""
+    time = motion.time_s
+    if not np.isfinite(time).all() or np.any(np.diff(time) <= 0):
+        raise _refuse(path, "times that are missing or do not increase", "seconds", "export the motion again")
+    check_steps(time, functools.partial(_refuse, path))
     legs = legs_of(motion.angles_deg)
     if not any(legs.values()):
         raise _refuse(
@@ -223,7 +226,7 @@ def _series(path: Path, motion: OpenSimMotion) -> AngleSeries:
             "pass the motion of the inverse kinematics, with the coordinates of the model",
         )
     left, right = (legs[side] for side in SIDES)
-    series = AngleSeries(motion.time_s, left, right)
+    series = AngleSeries(time, left, right)
     check_ranges(series, str(path))
     return series
 

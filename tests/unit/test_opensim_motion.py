@@ -197,6 +197,20 @@ def test_what_no_person_does_is_refused(mot: Path, change: Callable[[Columns], C
     assert said in refused("GAIT_INPUT", read_motion_trial, written(mot, change(columns()))).found
 
 
+def test_times_and_gaps(mot: Path):
+    back = columns() | {"time": columns()["time"][::-1]}
+    assert "do not increase" in refused("GAIT_INPUT", read_motion_trial, written(mot, back)).found
+    lost = columns() | {n: np.where(np.arange(len(v)) % 800 < 300, np.nan, v) for n, v in turned(columns()).items()}
+    found = read_motion_trial(written(mot, lost))
+    assert found.events.events[0].time_s > 2.9
+    none = columns() | {
+        n: np.where(np.arange(len(v)) % 2 == (n[-1] == "r"), np.nan, v) for n, v in turned(columns()).items()
+    }
+    assert read_motion_trial(written(mot, none)).events.reason
+    nan = columns() | {"hip_rotation_r": np.full(800, np.nan)}
+    assert "not measured: hip_rotation_r" in origin(written(mot, nan))
+
+
 def test_signs_of_the_pelvis_that_do_not_fit_the_hips_are_named(mot: Path):
     other = columns() | {n: -columns()[n] for n in ("pelvis_list",)}
     assert "may have other signs" in origin(written(mot, other))

@@ -76,7 +76,7 @@ def poses_of(qpos: np.ndarray, scale: np.ndarray) -> BodyPoses:
     from pbl_pipeline.body import load_body
 
     body, seen = load_body(), np.flatnonzero(np.all(np.isfinite(qpos), axis=1))
-    padded = np.zeros((-(-len(seen) // _CHUNK) * _CHUNK, qpos.shape[1]), np.float32)
+    padded = np.zeros((max(-(-len(seen) // _CHUNK), 1) * _CHUNK, qpos.shape[1]), np.float32)
     padded[: len(seen)] = qpos[seen]
     scale = np.asarray(scale, np.float32)
     parts = [_compiled()(padded[i : i + _CHUNK], scale) for i in range(0, len(padded), _CHUNK)]
