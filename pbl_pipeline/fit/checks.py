@@ -40,6 +40,9 @@ FOCAL_SD_WARN = 0.02
 #: mean error of hips, knees and ankles with and without 3D was 3.6 and 4.0 deg from the side, 3.9 and 4.8 at 42 to 52
 #: deg; from the front 4.2 and 12.1 (knees 10 to 21), from the front at an equal distance 4.0 and 4.8 (knees 6 to 10).
 FACING_FAIL_DEG = 30.0
+#: A turn of the pelvis (deg) within a time (s) that no person makes. Without 3D points, and points on the feet, a part
+#: of a walk may be fitted facing the other way.
+TURN_FAIL_DEG, TURN_S = 90.0, 0.2
 
 
 def check_fit(
@@ -119,19 +122,28 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> 
 
 def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
     """Check the view of trials of one camera whose detector has no 3D points; empty if there are none."""
-    facing = []
+    facing, turns = [], []
     for trial, fit in zip(session.trials, trials, strict=True):
         known = np.isfinite(fit.qpos[:, 0])
         if not isinstance(trial, Keypoints) or has_3d(trial) or not known.any():
             continue
-        forward = pelvis_path(session.body, np.asarray(fit.qpos[known], float))[1][:, :, 0].mean(axis=0)
+        way = pelvis_path(session.body, np.asarray(fit.qpos[known], float))[1][:, :, 0]
+        heading, time = np.unwrap(np.arctan2(way[:, 1], way[:, 0])), np.asarray(fit.time_s)[known]
+        turns.append(float(np.rad2deg(np.max(np.abs(np.interp(time + TURN_S, time, heading) - heading)))))
+        forward = way.mean(axis=0)
         axis = Rotation.from_quat(fit.phone_quat_wxyz[known], scalar_first=True).apply([0.0, 0.0, 1.0]).mean(axis=0)
         across = np.linalg.norm(np.cross(forward, axis)) / (np.linalg.norm(forward) * np.linalg.norm(axis))
         facing.append(float(np.rad2deg(np.arcsin(min(across, 1.0)))))
     if not facing:
         return []
-    value = min(facing)
+    value, turn = min(facing), max(turns)
+    advice = (
+        "the fitted pelvis turns faster than a person can: one view without 3D points, and without points on the feet, "
+        "does not always show which way a person faces; use a model with feet, or with 3D"
+    )
+    fast = Check("pelvis_turn_without_3d_deg", FAIL, turn, TURN_FAIL_DEG, advice)
     return [
+        *[fast] * (turn > TURN_FAIL_DEG),
         Check(
             "facing_without_3d_deg",
             WARN if value >= FACING_FAIL_DEG else FAIL,
@@ -139,7 +151,7 @@ def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
             FACING_FAIL_DEG,
             "the keypoint model gives pixels only, and one camera then tells nothing of depth: film from the side, or "
             "use a model with 3D, or several cameras; from the front knee angles come out wrong by 6 to 21 deg",
-        )
+        ),
     ]
 
 

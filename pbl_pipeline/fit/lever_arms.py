@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
-from .session import Session
+from .session import Session, has_3d
 from .solution import Solution
 from .standing import bodies_at, marker_places
 
@@ -26,8 +26,9 @@ _FRAMES, _STEP_RAD = 20, 1e-3
 
 
 def with_open_joints(session: Session, solution: Solution) -> Solution:
-    """Return the solution with standard deviations that say which joints markers and several cameras leave open."""
-    if solution.qpos_sd is None or isinstance(session.trials[0], Keypoints):
+    """Return the solution with standard deviations that say which joints markers, several cameras, and pixels alone
+    leave open."""
+    if solution.qpos_sd is None or any(isinstance(t, Keypoints) and has_3d(t) for t in session.trials):
         return solution
     used = np.flatnonzero(np.concatenate([a.used for a in session.arrays]))
     some = used[np.linspace(0, len(used) - 1, min(_FRAMES, len(used))).astype(int)]

@@ -158,7 +158,7 @@ PAPER_2025 = ImplicitAdamParams(cost=CostParams(pixel="1080x1920"))
 #: The paper's costs unchanged, for comparison: the optimum of `paper-2025` found by `gauss-newton`.
 PAPER_GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=30.0, smooth_per_m2=3_000.0, cost=CostParams(pixel="1080x1920"))
 #: For 87 points of MeTRAbs. Pixels count more against 3D than in the paper, and depth less than what lies across the
-#: line of sight, because it errs more and together (docs/benchmarks.md). Tuned on the synthetic walker, with temporally
+#: line of sight, because it errs more and together (research/reports). Tuned on the synthetic walker, with temporally
 #: correlated and with independent pixel noise. With a gain of 1e-5 as the end, wrists were 0.1 deg short of where one
 #: step more, or other padding, had them.
 GAUSS_NEWTON = GaussNewtonParams(

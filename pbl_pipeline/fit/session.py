@@ -272,7 +272,7 @@ def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     c = np.asarray(trial.confidence, float)
     seen = c > 0
     known = seen & _finite(trial.xyz_cam_m)
-    xy, x_cam = np.array(trial.xy_px), np.array(trial.xyz_cam_m)
+    xy, x_cam = np.array(trial.xy_px, order="C"), np.array(trial.xyz_cam_m, order="C")  # views are written below
     for x, known_there in ((xy, seen), (x_cam, known)):
         x.reshape(-1, x.shape[-1])[np.flatnonzero(~known_there)] = 0.0
     return undistort_px(xy, trial.camera), c, x_cam, np.where(known, c, 0.0)

@@ -1,4 +1,5 @@
-"""Checks of the world of laboratory markers and calibrated cameras against the body that moves in it.
+"""Checks of the world of laboratory markers and calibrated cameras, and of the picture of another program's keypoints,
+against the body that moves in it.
 
 Assumed of the person, beyond `assumptions`: in a trial as a whole the head is above the feet, as in walking, standing,
 sitting and squatting, not in lying.
@@ -16,7 +17,7 @@ import numpy as np
 from pbl_pipeline.assumptions import SIZES, UNITS, check_size, check_steps, check_strides
 from pbl_pipeline.body import MarkerSet, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import MOST_MISS_M, MultiView, WorldMarkers
+from pbl_pipeline.keypoints import MOST_MISS_M, SEEN_SHARE, Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.keypoints.multi_view import meeting_points
 from pbl_pipeline.video import CameraPose
 
@@ -28,6 +29,8 @@ WRONG_DEG, NEAR_DEG, STEADY = 60.0, 40.0, 0.8
 #: Least standard deviation (m) of the markers' heights on the standing body that shows a direction.
 _SPREAD_M = 0.15
 _LEGS = ("tibia", "talus", "calcn", "toes")
+#: Least size of a body in a picture (px); largest fraction of the points outside the picture.
+_LEAST_PX, _MOST_OUTSIDE = 20.0, 0.05
 
 
 World = TypeVar("World", bound=MultiView | WorldMarkers)
@@ -87,6 +90,54 @@ def body_axis(points: np.ndarray, markers: MarkerSet) -> tuple[np.ndarray, float
     mean = np.sum(along[length > 0] / length[length > 0, None], axis=0) / max(len(length), 1)
     steady = float(np.linalg.norm(mean))
     return (mean / steady, steady) if steady > 0 else (np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def check_picture(trial: Keypoints, name: str, markers: MarkerSet) -> None:
+    """Check pixels against the body and the picture, which is taken as a level view of it.
+
+    Raises `PblError` FIT_INPUT: a body upside down or on its side, points outside the picture, coordinates that are
+    fractions of it, times or strides that no person has.
+    """
+    xy = np.where((trial.confidence > 0)[..., None], np.asarray(trial.xy_px, float), np.nan)
+    extent = np.nanmax(xy, axis=1, initial=-np.inf) - np.nanmin(xy, axis=1, initial=np.inf)
+    seen = np.isfinite(xy).all(axis=2).mean(axis=1) >= SEEN_SHARE * np.isfinite(xy).all(axis=2).any(axis=0).mean()
+    if not seen.any():
+        raise _error(name, "no frame with most of the points", "a person in view", "look at the file")
+    size, picture = float(np.median(extent[seen].max(axis=1))), "x".join(map(str, trial.image_size_px))
+    if size < _LEAST_PX:
+        raise _error(
+            name,
+            f"a body of {size:.3g} px",
+            f"pixels of the picture, at least {_LEAST_PX:g} for a body",
+            "write pixels, not fractions of the picture (OpenPose: --keypoint_scale 0)",
+        )
+    points = np.stack([xy[..., 0], np.zeros(xy.shape[:2]), -xy[..., 1]], axis=-1)
+    points *= np.ptp(standing_markers(load_body(), markers)[:, 2]) / size
+    up = body_axis(points, markers)[0]
+    if np.degrees(np.arccos(np.clip(up[2], -1, 1))) > WRONG_DEG:
+        upside = abs(up[2]) > abs(up[0])
+        raise _error(
+            name,
+            "a person who is upside down: y points up, or the picture is turned by 180 deg"
+            if upside
+            else "a person who lies on the side: the picture is turned by 90 deg",
+            "a person who stands or sits upright in the picture, y down from its upper edge",
+            "write y as height - 1 - y" if upside else "find the keypoints in the upright picture",
+        )
+    width, height = trial.image_size_px
+    known = xy[np.isfinite(xy).all(axis=2)]
+    outside = float(np.mean(np.any((known < -0.5) | (known > np.array([width, height]) - 0.5), axis=1)))
+    if outside > _MOST_OUTSIDE:
+        low, high = known.min(axis=0), known.max(axis=0)
+        raise _error(
+            name,
+            f"{outside:.0%} of the points outside the picture of {picture} px: x {low[0]:.0f} to {high[0]:.0f}, "
+            f"y {low[1]:.0f} to {high[1]:.0f}",
+            "pixels of the upright picture, from its upper left corner",
+            "pass the size of the picture in which the keypoints were found",
+        )
+    _check_steps(np.asarray(trial.time_s), name)
+    _check_strides(points, np.asarray(trial.time_s), name, markers)
 
 
 def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | None:

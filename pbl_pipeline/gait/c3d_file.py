@@ -111,10 +111,14 @@ class C3dFile:
             return self._floats(piece.bytes)
         return np.frombuffer(piece.bytes, {1: np.uint8, 2: self._types.uint16}[piece.bytes_per_element]).astype(float)
 
+    def numbers(self, key: str) -> np.ndarray:
+        """All numbers of a parameter, whose first dimension runs fastest; none where it is absent."""
+        piece = self._get(key)
+        return self._numbers(piece) if piece else np.zeros(0)
+
     def number(self, key: str) -> float:
         """A number; one of two 16-bit words has the low word first. NaN where it is absent."""
-        piece = self._get(key)
-        values = self._numbers(piece) if piece else np.zeros(0)
+        piece, values = self._get(key), self.numbers(key)
         if len(values) == 2 and piece.bytes_per_element == 2:
             return float(values[0] + _WORD * values[1])
         return float(values[0]) if len(values) else math.nan
@@ -170,16 +174,28 @@ class C3dFile:
             elif begin != first:
                 self.origin.assumed.append(f"first frame {first}, which fits the data; {begin:g} of TRIAL does not")
 
+    def _words(self, first: int, shape: tuple[int, int]) -> np.ndarray:
+        """Words (T, *shape) as they lie in the frames, from word `first` of each."""
+        kind = {2: self._types.int16, 4: "<u4" if self._types.is_dec else self._types.float32}[self._bytes]
+        steps = (self._size, shape[1] * self._bytes, self._bytes)
+        return np.ndarray((self.n_frames, *shape), kind, self._data, self._start + first * self._bytes, steps)
+
+    def _decoded(self, words: np.ndarray) -> np.ndarray:
+        if self._types.is_dec and self._bytes == 4:
+            return self._floats(words.tobytes()).reshape(words.shape)
+        return words.astype(float)
+
+    def analogs(self) -> np.ndarray:
+        """Signed analog samples (T, samples per frame, channels) in the units of ANALOG:UNITS."""
+        used = int(self.number("ANALOG:USED"))
+        words = self._words(4 * self._points, ((self._size // self._bytes - 4 * self._points) // used, used))
+        scale, offset = (self.numbers(f"ANALOG:{key}")[:used] for key in ("SCALE", "OFFSET"))
+        return (self._decoded(words) - offset) * scale * self.number("ANALOG:GEN_SCALE")
+
     def points(self, columns: Collection[int]) -> np.ndarray:
         """Coordinates (T, P, 3) in the file's unit. NaN where a point is missing: its residual is negative, a number is
         not finite, or all four are 0."""
-        formats = {2: self._types.int16, 4: "<u4" if self._types.is_dec else self._types.float32}
-        steps = (self._size, 4 * self._bytes, self._bytes)
-        shape = (self.n_frames, self._points, 4)
-        words = np.ndarray(shape, formats[self._bytes], self._data, self._start, steps)[:, list(columns)]
-        if self._types.is_dec and self._bytes == 4:
-            words = self._floats(words.tobytes()).reshape(words.shape)
-        values = words.astype(float)
+        values = self._decoded(self._words(0, (self._points, 4))[:, list(columns)])
         zeros = np.asarray(~values.any(axis=-1))
         if zeros.any():
             names = ", ".join(self.labels[c] for i, c in enumerate(columns) if zeros[:, i].any())

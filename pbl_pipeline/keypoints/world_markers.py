@@ -47,8 +47,8 @@ class Trc:
     origin: Origin
 
 
-def read_trc(path: str | Path) -> Trc:
-    """Read a TRC file.
+def read_trc(path: str | Path, pixels: bool = False) -> Trc:
+    """Read a TRC file; `pixels`: its numbers are taken as they are, whatever unit its header states.
 
     Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: not a TRC, other numbers of frames or markers than in its
     header, a row with too few or too many cells, a cell that is not a finite number, times that do not increase or
@@ -65,7 +65,7 @@ def read_trc(path: str | Path) -> Trc:
     if len(lines) < _HEADER_LINES or not lines[0].startswith("PathFileType"):
         raise _damaged("no header of a TRC file", "five lines, the first beginning with PathFileType", key=path)
     header = dict(zip(_cells(lines[1]), _cells(lines[2]), strict=False))
-    scale = _METRES.get(header.get("Units", "").lower())
+    scale = 1.0 if pixels else _METRES.get(header.get("Units", "").lower())
     if scale is None:
         raise _damaged(f"Units {header.get('Units', '')!r}", "mm, cm or m", key=path)
     names = tuple(n for n in _cells(lines[3])[2:] if n)
@@ -80,12 +80,13 @@ def read_trc(path: str | Path) -> Trc:
     time_s, xyz = table[:, 1], scale * table[:, 2:].reshape(len(rows), len(names), 3)
     if not np.isfinite(time_s).all() or np.any(np.diff(time_s) <= 0):
         raise _damaged("times that are missing, repeat or run backwards", "strictly increasing seconds", key=path)
-    zeros, origin = np.all(xyz == 0, axis=2), Origin([f"unit {header['Units']}"])
+    zeros, origin = np.all(xyz == 0, axis=2), Origin([] if pixels else [f"unit {header['Units']}"])
     if zeros.any():
         found = ", ".join(name for name, lost in zip(names, zeros.any(axis=0), strict=True) if lost)
         origin.assumed.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {found}")
     xyz[zeros] = np.nan
-    _check_unit(path, xyz, header["Units"])
+    if not pixels:
+        _check_unit(path, xyz, header["Units"])
     _check_rate(path, time_s, header.get("DataRate", ""))
     return Trc(time_s, names, xyz, origin)
 
@@ -122,9 +123,9 @@ def _check_unit(path: str | Path, xyz_m: np.ndarray, unit: str) -> None:
         return
     size = float(np.median(np.max(np.nanmax(whole, axis=1) - np.nanmin(whole, axis=1), axis=1)))
     if not _NARROWEST_M < size < _WIDEST_M:
-        raise _damaged(
-            f"markers that lie {size:.3g} m apart if Units {unit} is right", "the unit the numbers are in", key=path
-        )
+        flat = "" if np.nanmax(np.abs(xyz_m[..., 2])) else "; of pixels, _px in the file's name, as Sports2D writes it"
+        expected = f"the unit the numbers are in{flat}"
+        raise _damaged(f"markers that lie {size:.3g} m apart if Units {unit} is right", expected, key=path)
 
 
 def _check_rate(path: str | Path, time_s: np.ndarray, stated: str) -> None:

@@ -67,6 +67,7 @@ ORDER = (
     "camera_intrinsics_measured",
     "camera_orientation_known",
     "vertical_from_body",
+    "pelvis_turn_without_3d_deg",
     "facing_without_3d_deg",
     "keypoints_fields_assumed",
     "joints_not_observed",

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pbl_pipeline.errors import CODES, PblError
+from pbl_pipeline.errors import CODES, PblError, causes
 
 from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
 
@@ -34,8 +34,7 @@ def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
 
 def store_full(error: BaseException) -> PblError | None:
     """STORE_FULL if an error says that the store has no room, or came from one that does."""
-    seen: BaseException | None = error
-    while seen is not None:
+    for seen in causes(error):
         if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
             return PblError(
                 "STORE_FULL",
@@ -43,7 +42,6 @@ def store_full(error: BaseException) -> PblError | None:
                 expected="room for arrays and temporary files",
                 next_step="free space, or give the store's disk or bucket more; jobs that met it go on by themselves",
             )
-        seen = seen.__cause__ or seen.__context__
     return None
 
 

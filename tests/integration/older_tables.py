@@ -134,3 +134,8 @@ def undo_0008(cursor: Any) -> None:
     """Forget the errors of a visit's measures."""
     for column in ("session_measure_error", "session_measure_minimal_change"):
         cursor.execute(f"ALTER TABLE pbl_gdi.__session_gdi__measure DROP COLUMN {column}")
+
+
+def undo_0009(cursor: Any) -> None:
+    """Forget whether the feet show that a cycle of odd length is not one stride."""
+    cursor.execute("ALTER TABLE pbl_gait.__gait_cycle__cycle DROP COLUMN cycle_length_unproven")

@@ -160,7 +160,7 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     """Declare the tables and take the migrations from 0006 back."""
     pbl_schemas.activate()
     rows = everything()
-    _undo(older_tables.undo_0008, older_tables.undo_0007, older_tables.undo_0006)
+    _undo(older_tables.undo_0009, older_tables.undo_0008, older_tables.undo_0007, older_tables.undo_0006)
     return rows
 
 
@@ -319,6 +319,7 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert everything()["pbl_study.#clinical_instrument"] == rows
     assert "joint_normal_p" in validation.KinematicError.Joint.heading.names
     assert gdi.SessionGdi.Measure.heading.names[-2:] == ["session_measure_error", "session_measure_minimal_change"]
+    assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert migrations.migrate().steps == []
 
 

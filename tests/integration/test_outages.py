@@ -14,9 +14,10 @@ import pymysql
 import pytest
 
 import pbl_pipeline.video
+from pbl_pipeline.errors import causes
 from pbl_schemas import connection, fit, lab, review, session, tracking, video, worker
 from pbl_schemas.decisions import review_decisions
-from pbl_schemas.job_errors import error_code, of_server
+from pbl_schemas.job_errors import error_code, of_server, store_full
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import catalog
 from pbl_schemas.operations.orphans import orphans
@@ -227,6 +228,17 @@ def test_a_bucket_without_room_has_its_code():
     refused = OSError(errno.EIO, "An error occurred (XMinioStorageFull) when calling the PutObject operation")
     assert store_error(refused).code == "STORE_FULL"
     assert store_error(OSError(errno.EIO, "no route to host")).code == "STORE_UNAVAILABLE"
+
+
+@pytest.mark.parametrize("circle", [False, True])
+@pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "STORE_FULL"), (errno.EIO, None)])
+def test_a_store_is_found_among_the_causes_of_an_error(number: int, code: str | None, circle: bool):
+    first, last = ValueError("no array"), OSError(number, "the disk")
+    first.__cause__ = last
+    last.__cause__ = first if circle else None
+    assert list(causes(first)) == [first, last]
+    assert getattr(store_full(first), "code", None) == code
+    assert run_job.cause_outside(first) == f"STORE: OSError: {last}"
 
 
 class Killed(BaseException):

@@ -1,6 +1,7 @@
 """The documentation names every code, variable and command there is, and none that is not."""
 
 import ast
+import itertools
 import json
 import re
 import tomllib
@@ -35,8 +36,8 @@ DEPLOYED = ("workers/deploy/Dockerfile", "workers/deploy/kubernetes/kustomizatio
 
 def test_errors_page_lists_exactly_the_codes():
     text = (ROOT / "docs" / "errors.md").read_text()
-    listed = re.findall(r"^\| ([A-Z_]+) \|", text, re.MULTILINE)
-    assert sorted(listed) == sorted(CODES)
+    listed = re.findall(r"^\| ([A-Z_]+) \| (\w+) \|", text, re.MULTILINE)
+    assert sorted(listed) == sorted((name, code.cause) for name, code in CODES.items())
 
 
 def test_the_settings_page_lists_every_variable():
@@ -125,9 +126,8 @@ def test_no_link_of_a_page_is_dead(page: str):
 def test_the_page_of_licences_names_every_direct_dependency():
     project = tomllib.loads(pages.text("pyproject.toml"))["project"]
     extras = project["optional-dependencies"]
-    wanted = {
-        Requirement(r).name for r in [*project["dependencies"], *extras["s3"], *extras["export"], *extras["figures"]]
-    }
+    brought = [extras[name] for name in ("s3", "export", "figures", "h5")]
+    wanted = {Requirement(r).name for r in itertools.chain(project["dependencies"], *brought)}
     table = pages.text("docs/licences.md").partition("## Direct dependencies")[2]
     _, *rows = re.findall(r"^\| [^|]* \| (.*) \|$", table, re.MULTILINE)
     listed = [name for row in rows for name in row.split(", ")]
