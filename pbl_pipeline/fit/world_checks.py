@@ -136,8 +136,9 @@ def check_picture(trial: Keypoints, name: str, markers: MarkerSet) -> None:
             "pixels of the upright picture, from its upper left corner",
             "pass the size of the picture in which the keypoints were found",
         )
-    _check_steps(np.asarray(trial.time_s), name)
-    _check_strides(points, np.asarray(trial.time_s), name, markers)
+    refuse, time_s = functools.partial(_error, name), np.asarray(trial.time_s)
+    check_steps(time_s, refuse)
+    check_strides(_between_legs(points, markers), time_s, refuse)
 
 
 def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | None:
