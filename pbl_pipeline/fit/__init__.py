@@ -19,3 +19,4 @@ from .session_fit import (
     fit_session,
     fit_sessions,
 )
+from .world_checks import in_upright_world

@@ -60,6 +60,8 @@ def check_fit(
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
+    for trial, name in zip(session.trials, session.names, strict=True):
+        checks += trial.origin.checks(name) if isinstance(trial, WorldMarkers) else ()
     checks += _vertical(session)
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]

@@ -27,7 +27,7 @@ from .per_frame import start_of
 from .problem import pixels_alone
 from .results import SessionFit, TrialFit
 from .rotations import quat_wxyz
-from .session import Session, Trial, make_session
+from .session import CheckedTrial, Session, Trial, make_session
 from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
@@ -126,8 +126,8 @@ def check_trial(
     name: str,
     paramset: Method[Params] | Paramset | Params | str | None = None,
     markers: MarkerSet | None = None,
-) -> tuple[np.ndarray, float]:
-    """Frames (T,) bool of a trial that the fit would use, and the share of frames with the whole person in view.
+) -> CheckedTrial:
+    """Check a trial before a fit.
 
     Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN if the trial cannot be fitted.
     """

@@ -50,7 +50,15 @@ from .metrics import (
     legs_check,
     pool_trials,
 )
-from .motion import BodyPoses, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers, trial_poses
+from .motion import (
+    BodyPoses,
+    FootTrajectories,
+    check_feet,
+    feet_from_fit,
+    feet_from_keypoints,
+    feet_from_markers,
+    trial_poses,
+)
 from .normative import (
     BODY_ANGLES,
     DEFAULT_NORM,
@@ -63,6 +71,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .opensim import OpenSimMotion, read_motion, read_motion_feet, read_motion_trial
 from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measure, task_measures, task_motion
 from .types import (
     ACTIVITIES,

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import count_rows
 
 from .events import FOOT_DOWN, FOOT_UP, GaitEvent
@@ -35,7 +36,7 @@ _LABEL = re.compile(rf"(left|right|l|r)?({'|'.join(_WORDS)})(left|right|l|r)?")
 
 
 class C3dFile:
-    """One C3D file in memory. `notes` lists what was assumed and left out; ValueError for a damaged or ambiguous file.
+    """One C3D file in memory. `origin` lists what was assumed and left out; ValueError for a damaged or ambiguous file.
 
     `first_frame`, `n_frames`, `rate_hz`: the frames that the file holds. `labels`: the name of each point as written.
     """
@@ -43,7 +44,7 @@ class C3dFile:
     def __init__(self, data: bytes) -> None:
         import c3d
 
-        self.notes: list[str] = []
+        self.origin = Origin()
         #: The person of the points that were taken, if their names state it.
         self.person = ""
         self._data = data
@@ -171,7 +172,7 @@ class C3dFile:
             if end - begin + 1 == self.n_frames or (last - first + 1 - self.n_frames) % _WORD:
                 self.first_frame = int(begin)
             elif begin != first:
-                self.notes.append(f"first frame {first}, which fits the data; {begin:g} of TRIAL does not")
+                self.origin.assumed.append(f"first frame {first}, which fits the data; {begin:g} of TRIAL does not")
 
     def _words(self, first: int, shape: tuple[int, int]) -> np.ndarray:
         """Words (T, *shape) as they lie in the frames, from word `first` of each."""
@@ -198,7 +199,7 @@ class C3dFile:
         zeros = np.asarray(~values.any(axis=-1))
         if zeros.any():
             names = ", ".join(self.labels[c] for i, c in enumerate(columns) if zeros[:, i].any())
-            self.notes.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {names}")
+            self.origin.assumed.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {names}")
         missing = (values[..., 3] < 0) | ~np.isfinite(values).all(axis=-1) | zeros
         values[missing] = np.nan
         values *= self._scale
@@ -220,7 +221,7 @@ class C3dFile:
             if there < n:
                 raise ValueError(f"EVENT:{key} holds {there} of {n} events")
         if n < max(len(labels), len(times)):
-            self.notes.append(f"events beyond EVENT:USED ({n}) are deleted ones and not used")
+            self.origin.assumed.append(f"events beyond EVENT:USED ({n}) are deleted ones and not used")
         contexts, subjects = (self.texts(f"EVENT:{key}") for key in ("CONTEXTS", "SUBJECTS"))
         found, ignored = [], []
         rows = itertools.zip_longest(labels[:n], times[:n], contexts[:n], subjects[:n], fillvalue="")
@@ -236,7 +237,9 @@ class C3dFile:
             event = GaitEvent(float(time[0] * 60 + time[1]), sides.pop(), _WORDS[known.group(2)], 1.0)
             found.append((subject, event))
         if ignored:
-            self.notes.append(f"event labels that are not used: {', '.join(map(repr, dict.fromkeys(ignored)))}")
+            self.origin.assumed.append(
+                f"event labels that are not used: {', '.join(map(repr, dict.fromkeys(ignored)))}"
+            )
         return found
 
     def _minutes_seconds(self, piece: Any) -> np.ndarray:

@@ -282,9 +282,10 @@ def _none_used(cycles: Sequence[GaitCycle]) -> str:
 
 
 def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
-    if name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
+    missing = "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing}))
+    if not missing and name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
         return NO_WIDTH
-    return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
+    return missing or "not known"
 
 
 def measure_of(values: Sequence[tuple[str, float]], compared: bool = False) -> Measure:

@@ -13,7 +13,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
-from ._cycles import find_cycles, refused_cadence, with_cadence_accepted
+from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -292,7 +292,9 @@ def _trial(
     task: tuple[dict[str, Any], dict[str, str]] = {}, {}
     if isinstance(trial, LabTrial):
         events = trial.events
-        cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
+        about = {"trial": trial.name, "series": trial.series, "feet": trial.feet, "no_width": trial.no_width}
+        cycles = find_cycles(events, **about, keep_ends=True)
+        check_sides(cycles, trial.name)
     else:
         poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)

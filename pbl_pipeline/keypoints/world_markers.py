@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import MAX_SECONDS, MAX_TEXT, count_rows, read_bytes, span_s
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
@@ -43,6 +44,7 @@ class Trc:
     time_s: np.ndarray  # (T,)
     names: tuple[str, ...]  # J
     xyz_m: np.ndarray  # (T, J, 3) in the file's axes, NaN where a cell is empty or a marker's three numbers are 0
+    origin: Origin
 
 
 def read_trc(path: str | Path, pixels: bool = False) -> Trc:
@@ -78,11 +80,15 @@ def read_trc(path: str | Path, pixels: bool = False) -> Trc:
     time_s, xyz = table[:, 1], scale * table[:, 2:].reshape(len(rows), len(names), 3)
     if not np.isfinite(time_s).all() or np.any(np.diff(time_s) <= 0):
         raise _damaged("times that are missing, repeat or run backwards", "strictly increasing seconds", key=path)
-    xyz[np.all(xyz == 0, axis=2)] = np.nan
+    zeros, origin = np.all(xyz == 0, axis=2), Origin([] if pixels else [f"unit {header['Units']}"])
+    if zeros.any():
+        found = ", ".join(name for name, lost in zip(names, zeros.any(axis=0), strict=True) if lost)
+        origin.assumed.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {found}")
+    xyz[zeros] = np.nan
     if not pixels:
         _check_unit(path, xyz, header["Units"])
     _check_rate(path, time_s, header.get("DataRate", ""))
-    return Trc(time_s, names, xyz)
+    return Trc(time_s, names, xyz, origin)
 
 
 def _cells(line: str) -> list[str]:
@@ -156,6 +162,7 @@ class WorldMarkers:
     marker_set: str  # name of the marker set; for a laboratory's own, the stem of its table
     xyz_world_m: np.ndarray  # (T, J, 3) world: right-handed, z up, metres; origin and heading are the laboratory's
     confidence: np.ndarray  # (T, J) 0..1
+    origin: Origin = dataclasses.field(default_factory=Origin, compare=False)  # of a file's data; not saved
 
     def __post_init__(self) -> None:
         for field in ("time_s", "xyz_world_m", "confidence"):
@@ -236,9 +243,8 @@ class WorldMarkers:
         if up == "y":
             xyz = np.stack([xyz[..., 0], -xyz[..., 2], xyz[..., 1]], axis=-1)
         seen = np.asarray(np.isfinite(xyz).all(axis=2))
-        return _about(
-            path, trc.time_s, trc.names, marker_set, np.where(seen[..., None], xyz, np.nan), seen.astype(float)
-        )
+        xyz, confidence = np.where(seen[..., None], xyz, np.nan), seen.astype(float)
+        return _about(path, trc.time_s, trc.names, marker_set, xyz, confidence, trc.origin)
 
     def select(self, names: Sequence[str], marker_set: str | None = None) -> WorldMarkers:
         """Return the markers of `names` in that order; those that the trial lacks were never seen.
@@ -259,7 +265,7 @@ class WorldMarkers:
         confidence = np.zeros(xyz.shape[:2])
         source = [column[names[i]] for i in there]
         xyz[:, there], confidence[:, there] = self.xyz_world_m[:, source], self.confidence[:, source]
-        return WorldMarkers(self.time_s, tuple(names), marker_set or self.marker_set, xyz, confidence)
+        return WorldMarkers(self.time_s, tuple(names), marker_set or self.marker_set, xyz, confidence, self.origin)
 
 
 def _about(path: str | Path, *values) -> WorldMarkers:

@@ -73,6 +73,7 @@ ORDER = (
     "joints_not_observed",
     "sitting_trials_without_augmented_pelvis",
     "phone_clock_offset_s",
+    "input_assumptions",
     "walking",
     "double_support_present",
     "event_order_breaks",

@@ -66,7 +66,7 @@ class MarkerRecording(dj.Manual):
     ---
     recording_marker_set     : varchar(64)     # where on the body the markers sit: a shipped set, or the stem of marker_table_file
     marker_table_sha256=''   : varchar(64)     # of the bytes of marker_table_file, empty where the set ships
-    vertical_axis            : enum('y', 'z')  # of the file as it was given; z for .npz
+    vertical_axis            : enum('y', 'z')  # as stated for the file, z for .npz; fits turn a trial whose body stands along another axis
     recording_n_frames       : int32           # frames
     recording_n_markers      : int16           # markers of the set that the file has
     recording_duration       : float64         # (s) from the first to the last frame
