@@ -209,7 +209,12 @@ MARKERS = GaussNewtonParams(
     smooth_per_rad2=2.0,
     smooth_per_m2=200.0,
     cost=CostParams(
-        huber_3d_cm=3.0, weight_offset_per_m2=100.0, weight_pose=0.01, pose_prior_deg=POSE_PRIOR_DEG, weight_scale=0.01
+        huber_3d_cm=3.0,
+        weight_offset_per_m2=100.0,
+        weight_pose=0.01,
+        pose_prior_deg=POSE_PRIOR_DEG,
+        pose_prior="people-3",
+        weight_scale=0.01,
     ),
 )
 

@@ -17,6 +17,7 @@ from pbl_pipeline.body import MarkerSet, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import MOST_MISS_M, MultiView, WorldMarkers
 from pbl_pipeline.keypoints.multi_view import meeting_points
+from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.video import CameraPose
 
 from .standing import standing_markers
@@ -155,7 +156,7 @@ def _size(points: np.ndarray, markers: MarkerSet) -> float:
 
 
 def _check_steps(time_s: np.ndarray, name: str) -> None:
-    step = float(np.median(np.diff(time_s)))
+    step = interval_of(time_s)
     if STEPS_S[0] <= step <= STEPS_S[1]:
         return
     guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"

@@ -58,10 +58,11 @@ LEG_ANGLES = {
 
 
 def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
-    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
+    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has, NaN
+    if not observed."""
     from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
 
-    return _of_legs(joint_angles(fit.joint_names, fit.qpos))
+    return _of_legs(joint_angles(fit.joint_names, fit.observed_qpos))
 
 
 def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
@@ -89,6 +90,11 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     out = toes_out(feet.toe_m - feet.heel_m, forward)
     # The pelvis frame of the model is forward, up, right.
     tilt, obliquity, rotation = pelvis_angles(poses.rotation[:, poses.index("pelvis")], forward).T
+    if any(n.startswith("pelvis") for n in fit.not_observed):
+        tilt = obliquity = rotation = np.full(len(forward), np.nan)
+    for i, side in enumerate("lr"):
+        if not fit.not_observed.isdisjoint((f"ankle_angle_{side}", f"subtalar_angle_{side}")):
+            out[:, i] = np.nan
     legs, sides = leg_angles(fit), {}
     for i, (side, sign) in enumerate(((LEFT, -1.0), (RIGHT, 1.0))):
         sides[side] = {
