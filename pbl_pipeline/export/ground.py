@@ -76,8 +76,8 @@ def check_forces(trial: ExportTrial) -> None:
 
 def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
     """Names of the coordinates in the order of OpenSim's models and their values (T, up to 40): degrees, and metres of
-    the pelvis in OpenSim's ground. Joints that were not observed are left out, as OpenSim reads no NaN and holds a
-    coordinate that a file lacks at its default. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
+    the pelvis in OpenSim's ground. Joints that were not observed are left out: a program then holds them at their
+    default. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
     body, qpos = load_body(), np.asarray(trial.fit.qpos, float)
     column = {n: i for i, n in enumerate(trial.fit.joint_names)}
     names = (*PELVIS_TURNS, *SLIDES, *(n for n in body.joint_names if n not in (*PELVIS_TURNS, *SLIDES)))
