@@ -18,6 +18,9 @@ from pbl_pipeline.synthetic import SynthSpec, Truth, physique, synthesise, true_
 
 #: Joints whose angles are of the gait.
 GAIT = (*PELVIS_TURNS, "hip_", "knee_", "ankle_")
+#: Standard deviation (deg) from which on priors have a part in an angle: of hips seen as two points, and of their
+#: rotation without a foot. Then the error is within this fraction of it.
+HELD_DEG, HELD = 4.0, 0.6
 ANKLES = frozenset(f"{joint}_{side}" for joint in ("ankle_angle", "subtalar_angle", "mtp_angle") for side in "rl")
 
 
@@ -54,8 +57,10 @@ def without(name: str, *ends: str) -> MarkerSet:
 def check_set(name: str, seed: int) -> None:
     truth, fit = fitted(marker_set(name), seed, placed=False)
     limit = 1.0 if name == "bml_movi_87" else 2.0
-    found = errors(truth, fit.trials[0])
-    assert {n: e for n, (e, _) in found.items() if n.startswith(GAIT) and not abs(e) < limit} == {}
+    found = {n: (e, sd) for n, (e, sd) in errors(truth, fit.trials[0]).items() if n.startswith(GAIT)}
+    assert {n: e for n, (e, sd) in found.items() if not abs(e) < (limit if sd < HELD_DEG else HELD * sd)} == {}
+    if name in ("bml_movi_87", "opencap_35"):
+        assert max(sd for _, sd in found.values()) < HELD_DEG
     truth, fit = fitted(marker_set(name), seed, placed=True)
     assert {n: (e, sd) for n, (e, sd) in errors(truth, fit.trials[0]).items() if not abs(e) < 2.5 * sd + 0.5} == {}
 
