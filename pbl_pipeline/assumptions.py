@@ -13,6 +13,7 @@ import numpy as np
 
 from .errors import PblError
 from .qc import WARN, Check
+from .sampling import interval_of
 
 #: Size of the body relative to an adult's, seconds of a frame and of a stride.
 SIZES, STEPS_S, STRIDES_S = (0.45, 2.0), (1 / 5000, 0.25), (0.4, 8.0)
@@ -56,7 +57,7 @@ def check_size(size: float, refuse: Refusal) -> None:
 
 def check_steps(time_s: np.ndarray, refuse: Refusal) -> None:
     """Raise unless the frames of time_s (T,) are as far apart as those of a recording."""
-    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else STEPS_S[1]
+    step = interval_of(time_s) if len(time_s) > 1 else STEPS_S[1]
     if STEPS_S[0] <= step <= STEPS_S[1]:
         return
     guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"

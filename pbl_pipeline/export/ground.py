@@ -81,18 +81,20 @@ def check_forces(trial: ExportTrial) -> None:
 
 
 def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the coordinates in the order of OpenSim's models and their values (T, 40): degrees, and metres of the
-    pelvis in OpenSim's ground. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
+    """Names of the coordinates in the order of OpenSim's models and their values (T, up to 40): degrees, and metres of
+    the pelvis in OpenSim's ground. Joints that were not observed are left out: a program then holds them at their
+    default. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
     body, qpos = load_body(), np.asarray(trial.fit.qpos, float)
     column = {n: i for i, n in enumerate(trial.fit.joint_names)}
     names = (*PELVIS_TURNS, *SLIDES, *(n for n in body.joint_names if n not in (*PELVIS_TURNS, *SLIDES)))
+    names = tuple(n for n in names if n not in trial.fit.not_observed)
     rest = pelvis_rest_m(body)
     values = [qpos[:, column[n]] + rest[n] if n in SLIDES else np.degrees(qpos[:, column[n]]) for n in names]
     return names, np.column_stack(values)
 
 
 def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str) -> None:
-    """Write the 40 joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
+    """Write the observed joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SLIDES, stature_m
+from pbl_pipeline.body import stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
 
 from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
-from .results import TrialFit
+from .results import SD_WARN_DEG, TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
 from .solution import Solution
 from .world_checks import WRONG_DEG
@@ -29,8 +29,6 @@ LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
 #: is flat whatever happens; this fall is not. On the demo and on a synthetic walker, joint angles after a fall of 0.07
 #: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
 FALL_WARN, TRACE_NEEDED = 0.2, 8
-#: Median standard deviation of a joint angle from which on the joint counts as not observed.
-SD_WARN_DEG = 20.0
 CLOCK_WARN_S = 0.3
 #: Standard deviation of the focal length as a share of it, which is also that of depth and of the person's size.
 FOCAL_SD_WARN = 0.02
@@ -277,12 +275,8 @@ def _vertical(session: Session) -> list[Check]:
 
 
 def _observed(trials: Sequence[TrialFit]) -> Check:
-    names = trials[0].joint_names
-    turns = np.array([n not in SLIDES for n in names])
-    known = [np.isfinite(t.qpos_sd).all(axis=1) for t in trials]
-    sd = np.rad2deg(np.max([_median(t.qpos_sd[k]) for t, k in zip(trials, known, strict=True)], axis=0))
-    unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
-    advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}"
+    unseen = [n for n in trials[0].joint_names if any(n in t.not_observed for t in trials)]
+    advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more, angles withheld: {', '.join(unseen)}"
     return warn_if(unseen, "joints_not_observed", float(len(unseen)), 0.0, advice)
 
 

@@ -61,10 +61,11 @@ LEG_ANGLES = {
 
 
 def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
-    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
+    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has, NaN
+    if not observed."""
     from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
 
-    return legs_of(joint_angles(fit.joint_names, fit.qpos))
+    return legs_of(joint_angles(fit.joint_names, fit.observed_qpos))
 
 
 def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
@@ -88,7 +89,15 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     Raises `PblError` GAIT_INPUT (see `feet_from_fit`).
     """
     poses = poses or trial_poses(fit)
-    return series_of(leg_angles(fit), poses, feet_from_fit(fit, poses), leg_angles_sd(fit))
+    series = series_of(leg_angles(fit), poses, feet_from_fit(fit, poses), leg_angles_sd(fit))
+    for side, of_side in ((LEFT, series.left), (RIGHT, series.right)):
+        hidden = [
+            n for n in of_side if n.startswith("pelvis") and any(j.startswith("pelvis") for j in fit.not_observed)
+        ]
+        if not fit.not_observed.isdisjoint(f"{joint}_{side[0]}" for joint in ("ankle_angle", "subtalar_angle")):
+            hidden.append("foot_progression")
+        of_side.update((name, np.full(len(series.time_s), np.nan)) for name in hidden)
+    return series
 
 
 def series_of(

@@ -92,12 +92,12 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
     """
     out = list(cycles)
     for side in sorted({c.side for c in cycles}):
-        chosen = [
-            i for i, c in enumerate(out) if c.side == side and c.used and all(n in c.curves for n in CURVE_ANGLES)
-        ]
+        own = [i for i, c in enumerate(out) if c.side == side and c.used]
+        names = [n for n in CURVE_ANGLES if any(n in out[i].curves for i in own)]
+        chosen = [i for i in own if names and all(n in out[i].curves for n in names)]
         if len(chosen) < MIN_CURVES:
             continue
-        curves = np.array([[out[i].curves[n] for n in CURVE_ANGLES] for i in chosen])
+        curves = np.array([[out[i].curves[n] for n in names] for i in chosen])
         away = np.sqrt(np.mean((curves - np.median(curves, axis=0)) ** 2, axis=(1, 2)))
         usual = np.median(away)
         limit = max(CURVE_MIN_DEG, float(usual + CURVE_SD * 1.4826 * np.median(np.abs(away - usual))))
@@ -244,14 +244,16 @@ def find_cycles(
 
 
 def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -> tuple[dict[str, np.ndarray], str]:
-    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if missing.
+    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if some or
+    all are missing. An angle without any value is not observed and has none.
 
     Interpolation is monotone cubic (PCHIP) between the frames' own time stamps. Frames missing for longer than
     `MAX_CURVE_GAP_S` inside the cycle, or at its ends, give no curves.
     """
-    table = series.of_side(side)
+    table = {name: own for name, own in series.of_side(side).items() if np.isfinite(own).any()}
+    absent = [name for name in series.of_side(side) if name not in table]
     if not table:
-        return {}, f"no angles of the {side} side"
+        return {}, "no angle is observed" if absent else f"no angles of the {side} side"
     values = np.column_stack(list(table.values()))
     seen = np.all(np.isfinite(values), axis=1)
     time, values = series.time_s[seen], values[seen]
@@ -264,7 +266,7 @@ def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -
     part = slice(max(0, first - 2), last + 3)
     at = start_s + REPORT_PERCENT / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
-    return dict(zip(table, curves.T, strict=True)), ""
+    return dict(zip(table, curves.T, strict=True)), f"not observed: {', '.join(absent)}" if absent else ""
 
 
 #: Fractions of a cycle in which a leg swings and in which it stands, and least difference of the knee's flexion (deg).

@@ -19,6 +19,7 @@ from pbl_pipeline.bounded import MAX_SECONDS, MAX_TEXT, count_rows, read_bytes, 
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
+from pbl_pipeline.sampling import interval_of
 
 _SPELLED = ("er", "ers", "re", "res")
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -135,8 +136,8 @@ def _check_rate(path: str | Path, time_s: np.ndarray, stated: str) -> None:
         return
     if len(time_s) < 2 or not np.isfinite(rate) or rate <= 0:
         return
-    step = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
-    ratio = rate * min(step, float(np.median(np.diff(time_s))), key=lambda s: abs(rate * s - 1))
+    step = interval_of(time_s)
+    ratio = rate * step
     if abs(ratio - 1) > _SAME_RATE:
         guess = {1000: ": milliseconds", round(rate): ": frame numbers"}.get(round(ratio), "")
         raise _damaged(

@@ -72,6 +72,7 @@ REASONS = {
     "MOVING_CAMERA": FOLLOWS,
     "TREADMILL": SLIDES,
     "VERTICAL_UNKNOWN": "the tilt of the camera is not known: a level one may be off by more than 5 deg",
+    "NOT_OBSERVED": "a joint of the legs is not observed",
     "TOO_SHORT": "no stretch of a second without gaps",
     "AID": "a walking aid may carry a part of the weight",
     "UNCERTAIN": "the 90 % interval of every measure is wider than the range of healthy people",
@@ -164,6 +165,8 @@ def _code_against(fit: TrialFit, gait: Walk, aid: str) -> str:
         return "TREADMILL"
     if fit.orientation_source == "assumed: level":
         return "VERTICAL_UNKNOWN"
+    if any(n.startswith(("hip_flexion", "knee", "ankle")) for n in fit.not_observed):
+        return "NOT_OBSERVED"
     return "" if any(c.used for c in gait.cycles) else "NO_CYCLES"
 
 

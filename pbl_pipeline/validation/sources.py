@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import Y_UP_TO_Z_UP, joint_angles, joint_angles_sd, load_body
+from pbl_pipeline.body import Y_UP_TO_Z_UP, joint_angles, joint_angles_sd, joint_of, load_body
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
@@ -21,20 +21,21 @@ _PELVIS_PATH = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 
 
 def fit_angles(fit: TrialFit, convention: str = QPOS, poses: BodyPoses | None = None) -> dict[str, np.ndarray]:
-    """(T,) degrees per joint at the fit's time stamps, NaN where the person is out of view.
+    """(T,) degrees per joint at the fit's time stamps, NaN where the person is out of view or the
+    joint was not observed.
 
     Raises `PblError` REFERENCE_INPUT (unknown convention), GAIT_INPUT (a fit of another body, or without a frame).
     """
     check_convention(convention)
     if convention == QPOS:
-        return joint_angles(fit.joint_names, fit.qpos)
+        return joint_angles(fit.joint_names, fit.observed_qpos)
     poses = poses or trial_poses(fit)
     seen = np.flatnonzero(np.all(np.isfinite(poses.rotation), axis=(1, 2, 3)))
     turned = {n: Rotation.from_matrix(poses.rotation[seen, i]) for i, n in enumerate(poses.body.body_names)}
     out = {}
     for name, values in body_rotation_angles(turned).items():
         out[name] = np.full(len(fit.time_s), np.nan)
-        out[name][seen] = values
+        out[name][seen] = np.nan if joint_of(name)[0] in fit.not_observed else values
     return out
 
 

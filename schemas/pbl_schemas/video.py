@@ -127,7 +127,7 @@ class PhoneAttitude(dj.Manual):
     attitude_form           : varchar(32)      # format; docs/phone_capture.md
     attitude_device=''      : varchar(128)     # phone, as the log names it
     attitude_n              : int32            # orientations
-    attitude_rate           : float64          # (1/s) orientations per second, by the median interval
+    attitude_rate           : float64          # (1/s) orientations per second, by the sampling interval
     attitude_duration       : float64          # (s) from the first to the last
     attitude_start_utc=null : varchar(40)      # moment of the first, null where the log does not count in UTC
     attitude_sensors        : json             # other sensors in it: name to number of samples
@@ -178,7 +178,7 @@ class VideoInfo(dj.Computed):
     width                : int32               # (px) of the upright frame
     height               : int32               # (px) of the upright frame
     rotation             : int16               # (deg) rotation flag of the file
-    fps=null             : float64             # (1/s) 1 / median frame interval, a description only
+    fps=null             : float64             # (1/s) 1 / sampling interval, a description only
     duration=null        : float64             # (s) from the first frame to the end of the last
     n_frames             : int32               # frames that decode
     n_frames_announced   : int32               # frames the header claims, 0 when it says nothing

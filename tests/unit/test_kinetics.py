@@ -385,6 +385,13 @@ def test_what_cannot_have_forces_says_why(walk: TrialFit, change: dict, aid: str
     assert set(found.reasons) == set(MEASURES)
 
 
+def test_an_ankle_that_is_not_observed_has_no_forces(walk: TrialFit) -> None:
+    sd = np.full_like(walk.qpos, np.radians(2))
+    sd[:, BODY.joint_names.index("ankle_angle_l")] = np.radians(25)
+    found = kinetics_of(dataclasses.replace(walk, qpos_sd=sd))
+    assert (found.code, found.measures) == ("NOT_OBSERVED", {})
+
+
 def test_a_treadmill_has_no_forces(walk: TrialFit) -> None:
     still_standing = walk.qpos.copy()
     tz = BODY.joint_names.index("pelvis_tx")

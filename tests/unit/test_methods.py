@@ -31,7 +31,7 @@ SHIPPED = {
     ("fit", "paper-gauss-newton", 3): "bcd62f28a515f283",
     ("fit", "gauss-newton", 5): "45eee8dd5c125990",
     ("fit", "blazepose", 8): "ec7fb7ba10963d03",
-    ("fit", "markers", 2): "7769edabf4a895c6",
+    ("fit", "markers", 3): "82ac3d5aa4c22e5c",
     ("gait", "phase-transformer", 3): "74a0da658354ff09",
     ("gait", "zeni-2008", 1): "b29b1d5b52f512f4",
     ("gait", "oconnor-2007", 2): "818ff933a9a6365a",

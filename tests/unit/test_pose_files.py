@@ -15,7 +15,7 @@ import pytest
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, RecordingFacts, read_keypoints
-from pbl_pipeline.fit.lever_arms import OPEN_RAD, with_open_joints
+from pbl_pipeline.fit.lever_arms import OPEN_RAD, with_marker_places
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.keypoints.pose_files import read_poses
@@ -351,6 +351,7 @@ def test_arrays_in_another_order_are_packed_without_nan():
 class Solved:
     qpos: np.ndarray
     qpos_sd: np.ndarray
+    scale: np.ndarray
 
 
 def test_an_ankle_without_a_point_on_the_foot_is_open():
@@ -359,8 +360,8 @@ def test_an_ankle_without_a_point_on_the_foot_is_open():
         confidence = walk().confidence * (np.arange(26) < n_points)
         xy = np.where(confidence[..., None] > 0, walk().xy_px, np.nan)
         session = make_session([dataclasses.replace(walk(), confidence=confidence, xy_px=xy)], ["a"], PARAMS)
-        solved: Any = Solved(np.zeros((90, 40)), np.full((90, 40), 0.01))
-        sd = with_open_joints(session, solved).qpos_sd
+        solved: Any = Solved(np.zeros((90, 40)), np.full((90, 40), 0.01), np.zeros(8))
+        sd = with_marker_places(session, solved, PARAMS).qpos_sd
         assert sd is not None
         assert (sd[0, joints.index("ankle_angle_r")] >= OPEN_RAD) == is_open
         assert sd[0, joints.index("knee_angle_r")] < OPEN_RAD

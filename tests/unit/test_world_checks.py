@@ -12,7 +12,6 @@ from pbl_pipeline.body import MARKER_SETS, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, check_trial, read_markers
 from pbl_pipeline.fit.checks import _vertical
-from pbl_pipeline.fit.lever_arms import OPEN_RAD, PLACED_M, lever_arms_m
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.world_checks import in_upright_world
 from pbl_pipeline.gait import load_events
@@ -237,17 +236,6 @@ def test_names_as_their_programs_write_them(tmp_path: Path, name: str):
     # A file that has both has its own.
     both = read_markers(trc(tmp_path / "b.trc", trial, names=[table.names[0], names[0], *names[2:]]), table)
     assert both.unused == (names[0],)
-
-
-@pytest.mark.parametrize(("name", "is_open"), [("mpi_inf_3dhp_17", True), ("blazepose_33", False), ("halpe_26", False)])
-def test_ankles_without_a_marker_on_the_foot_are_left_open(name: str, is_open: bool):
-    session = make_session([markers(name)], ["walk"], PARAMS)
-    lever = lever_arms_m(session, walk()[0][::10])
-    joints = list(session.body.joint_names)
-    sd = PLACED_M / np.maximum(lever, 1e-9)
-    assert (sd[joints.index("ankle_angle_r")] > OPEN_RAD) == is_open
-    assert sd[[joints.index(n) for n in ("hip_flexion_r", "hip_rotation_l", "knee_angle_l")]].max() < OPEN_RAD
-    assert np.all(session.markers.weight_3d == 1)
 
 
 def test_a_disagreement_that_nothing_explains_is_not_its_own_cause():
