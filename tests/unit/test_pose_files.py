@@ -360,7 +360,7 @@ def test_an_ankle_without_a_point_on_the_foot_is_open():
         confidence = walk().confidence * (np.arange(26) < n_points)
         xy = np.where(confidence[..., None] > 0, walk().xy_px, np.nan)
         session = make_session([dataclasses.replace(walk(), confidence=confidence, xy_px=xy)], ["a"], PARAMS)
-        solved: Any = Solved(np.zeros((90, 40)), np.full((90, 40), 0.01), np.zeros(8))
+        solved: Any = Solved(np.zeros((90, 40)), np.full((90, 40), 0.01), np.ones(8))
         sd = with_marker_places(session, solved, PARAMS).qpos_sd
         assert sd is not None
         assert (sd[0, joints.index("ankle_angle_r")] >= OPEN_RAD) == is_open
