@@ -241,11 +241,11 @@ def _watch(path: Path, label: str, size_bytes: int) -> Iterator[None]:
         def look() -> None:
             drawn = 0
             while not over.wait(0.3):
-                sizes = (_size(file) for file in path.rglob("*"))
-                come = min(round(max(sizes, default=0) / 1e6), round(size_bytes / 1e6))
-                if come > drawn:
-                    update(come - drawn)
-                    drawn = come
+                with contextlib.suppress(OSError):  # the client removes its own files and folders meanwhile
+                    largest = max((file.stat().st_size for file in path.rglob("*")), default=0)
+                    come = min(round(largest / 1e6), round(size_bytes / 1e6))
+                    update(max(come - drawn, 0))
+                    drawn = max(come, drawn)
 
         watcher = threading.Thread(target=look, daemon=True)
         watcher.start()
@@ -254,10 +254,3 @@ def _watch(path: Path, label: str, size_bytes: int) -> Iterator[None]:
         finally:
             over.set()
             watcher.join()
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:  # the client removes its own files while we look
-        return 0

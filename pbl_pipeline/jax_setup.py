@@ -52,7 +52,7 @@ def configure() -> None:
     # here are as fast without any trial (H200, a batch of 64: 0.52 s and 6 s of compiling; tried: 0.52 s and 33 s;
     # neither: 0.98 s and 14 s). The networks have no convolutions (`models.tflite_jax`), which would need the trials.
     # On a CPU, XLA's newer compiler of fused operations takes longer, and its programs are not faster
-    # (docs/benchmarks.md). Read when the first device is asked for.
+    # (research/reports). Read when the first device is asked for.
     for flag in known_flags(jaxlib.version.__version__, importlib.util.find_spec("jax_plugins") is not None):
         given = os.environ.get("XLA_FLAGS", "")
         if flag.partition("=")[0] not in given:

@@ -59,6 +59,7 @@ MEASURES: dict[str, tuple[str, str, int]] = {
 TASKS: dict[str, tuple[str, str, int]] = {
     "five_rises_time_s": ("Time of five rises", "s", 2),
     "rise_count": ("Rises", "", 0),
+    "attempt_count": ("Attempts to rise", "", 0),
     "tug_time_s": ("Timed up and go", "s", 2),
     "squat_count": ("Squats", "", 0),
     "rise_time_s": ("Time of a rise", "s", 2),

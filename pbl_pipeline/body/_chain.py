@@ -1,7 +1,7 @@
 """Forward kinematics of the tree, level by level, compiled once.
 
 MuJoCo's kinematics in JAX (`mjx.kinematics`) returns the same numbers (a test compares them) at the same speed, but its
-program has some 9,000 operations and takes ten times as long to compile (docs/benchmarks.md), more than a short trial
+program has some 9,000 operations and takes ten times as long to compile (research/reports), more than a short trial
 takes to fit. Here all hinges turn at once, the turns of each body are multiplied at once, and the tree is then
 traversed level by level: a dozen batched products of 3x3 matrices. `_kinematics.py` has the derivative of both.
 """

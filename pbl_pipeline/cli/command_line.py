@@ -14,7 +14,7 @@ import click
 
 from pbl_pipeline import progress, temporary
 from pbl_pipeline.code_version import code_version
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODERS, PblError
 from pbl_pipeline.extras import absent
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
@@ -124,8 +124,10 @@ def _explain(error: Exception) -> None:
 
 
 def _unforeseen(error: Exception) -> PblError:
-    """Convert an error without a code: a full disk, a name too long and a package that cannot be imported have codes,
-    all others are INTERNAL."""
+    """Convert an error without a code: a full disk, a name too long, a package that cannot be imported and what
+    `errors.CODERS` know have codes, all others are INTERNAL."""
+    if known := next(filter(None, (coder(error) for coder in CODERS)), None):
+        return known
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
         return PblError(
             "FILE_UNWRITABLE",

@@ -14,9 +14,10 @@ from .options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
+    from pbl_pipeline.fit import RecordingFacts
     from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 
-_ENDS = (".npz", ".keypoints", ".markers")
+_ENDS = (".npz", ".keypoints", ".markers", ".csv", ".h5", ".hdf5", ".dlc", ".analysis")
 
 
 @click.command(epilog="Example: pbl fit walk1.keypoints.npz walk2.keypoints.npz --out results")
@@ -27,6 +28,12 @@ _ENDS = (".npz", ".keypoints", ".markers")
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option("--cameras", type=click.Path(path_type=Path), help="Calibration (TOML): FILES are views of one trial.")
 @click.option("--marker-set", help="Name of a marker set, or your own table (CSV); needed for .trc files.")
+@click.option("--video", type=click.Path(path_type=Path), multiple=True, help="Video of 2D keypoints; once a file.")
+@click.option("--fps", type=float, help="Frames a second of 2D keypoints, without --video.")
+@click.option("--width", type=int, help="Width (px) of the upright picture of 2D keypoints, without --video.")
+@click.option("--height", type=int, help="Its height (px).")
+@click.option("--camera", type=click.Path(path_type=Path), help="Calibration file of the camera of 2D keypoints.")
+@click.option("--person", multiple=True, metavar="NAME", help="Person or individual of 2D keypoints; once, or a file.")
 @HEIGHT
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
@@ -39,14 +46,22 @@ def fit(
     camera_motion: str | None,
     cameras: Path | None,
     marker_set: str | None,
+    video: tuple[Path, ...],
+    fps: float | None,
+    width: int | None,
+    height: int | None,
+    camera: Path | None,
+    person: tuple[str, ...],
     height_m: float | None,
     up: str,
 ) -> None:
     """Fit one body to FILES, the trials of one session.
 
-    FILES are keypoints.npz, or markers of a laboratory as .npz or .trc. With --cameras they are the views of one trial,
-    named like the cameras of the calibration or in its order. Writes <name>.fit.npz and <name>.angles.csv for each
-    trial, and session.json.
+    FILES are keypoints.npz, markers of a laboratory as .npz or .trc, or 2D keypoints of another program: a folder of
+    OpenPose's JSON, DeepLabCut's .csv or .h5, SLEAP's analysis .h5, Sports2D's .trc in pixels (docs/files.md). With
+    --cameras they are the views of one trial, named like the cameras of the calibration or in its order.
+
+    Writes <name>.fit.npz and <name>.angles.csv for each trial, and session.json.
     """
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import fit_session, points_of
@@ -57,7 +72,8 @@ def fit(
     check_out_folder(out)
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
     table = _marker_set(marker_set)
-    trials: Sequence[Any] = [_load(path, table, up) for path in files]
+    facts = _facts(len(files), video, fps, width, height, camera, person)
+    trials: Sequence[Any] = [_load(path, table, up, f) for path, f in zip(files, facts, strict=True)]
     paramset = fit_paramset(solver, params, points_of(trials))
     stems = [_stem(path) for path in files]
     if cameras:
@@ -90,14 +106,46 @@ def _marker_set(given: str | None) -> MarkerSet | None:
     return load_marker_set(Path(given)) if given.lower().endswith(".csv") else marker_set(given)
 
 
-def _load(path: Path, table: MarkerSet | None, up: str) -> Keypoints | WorldMarkers:
+def _facts(
+    n: int,
+    videos: Sequence[Path],
+    fps: float | None,
+    width: int | None,
+    height: int | None,
+    camera: Path | None,
+    people: Sequence[str],
+) -> list[RecordingFacts]:
+    """Facts of the recording of each of `n` files."""
+    from pbl_pipeline.fit import RecordingFacts
+
+    for option, values, allowed in (("--video", videos, (0, n)), ("--person", people, (0, 1, n))):
+        if len(values) not in allowed:
+            found, expected = f"{option} {len(values)} times, {n} files", "once for each file, in their order"
+            raise PblError("USAGE", found, expected, "see `pbl fit --help`")
+    for option, value in (("--fps", fps), ("--width", width), ("--height", height)):
+        if value is not None and not 0 < value < 1e5:
+            raise PblError("USAGE", f"{option} {value:g}", "a number above 0", "see `pbl fit --help`")
+    size = (width, height) if width and height else None
+    each = [[*values] * (n if len(values) == 1 else 1) or [None] * n for values in (videos, people)]
+    return [RecordingFacts(v, fps, size, camera, p) for v, p in zip(*each, strict=True)]
+
+
+def _load(path: Path, table: MarkerSet | None, up: str, facts: RecordingFacts) -> Keypoints | WorldMarkers:
     """Load one file as a trial; markers of a laboratory are sorted as in their marker set."""
     import dataclasses
 
     from pbl_pipeline.files import fields_of
-    from pbl_pipeline.fit import read_markers
-    from pbl_pipeline.keypoints import Keypoints
+    from pbl_pipeline.fit import read_keypoints, read_markers
+    from pbl_pipeline.keypoints import Keypoints, check_keypoints
+    from pbl_pipeline.keypoints.pose_files import is_pose_file
 
+    if is_pose_file(path):
+        trial, text = read_keypoints(path, facts, table)
+        click.echo(f"{path.name}: {text}\n  camera {trial.camera.source}")
+        for check in check_keypoints(trial):
+            if check.advice:
+                click.echo(f"  {check.outcome} {check.check} = {check.value:.3g}: {check.advice}")
+        return trial
     if path.suffix.lower() != ".trc" and "xyz_world_m" not in fields_of(path):
         keypoints = Keypoints.load(path)
         return keypoints if table is None else dataclasses.replace(keypoints, marker_set=table.name)
@@ -134,7 +182,7 @@ def _motion(trial: object) -> str:
 
 
 def _stem(path: Path) -> str:
-    stem = path.name
+    stem = path.name or path.resolve().name
     if path.suffix.lower() == ".trc":
         return path.stem
     for end in _ENDS:

@@ -13,6 +13,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
 from pbl_pipeline.video import SENSORS
 
+from . import plug_in_gait
 from .trial import EvenTrial, ExportTrial
 
 #: Labels and icon numbers of the events, as Vicon and Mokka write them.
@@ -33,8 +34,10 @@ _MOST_PER_FRAME = 20
 _SENSOR_GAP_S = 0.1
 
 
-def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: str = "") -> None:
+def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: str = "", names: str = "") -> None:
     """Write points (mm), 4x4 poses of the bodies, events, and the phone's sensors if the trial has its log.
+
+    The points are the fitted markers, or with `names` `plug_in_gait.NAMES` that model's markers and angles (deg).
 
     The axes are those of our world: z up. A C3D has one rate: frames at uneven times are interpolated to their median
     rate, as stated by the parameter PBL:TIMES. Unknown points and poses have residual -1 and NaN. `check_c3d` is
@@ -46,10 +49,10 @@ def write_c3d(trial: ExportTrial, path: Path, origin: Mapping[str, str], name: s
     even = trial.even
     file = _Parameters(ezc3d)
     # In this order: ezc3d accepts no further channel once it knows the rate of the points.
-    for marker in trial.fit.marker_names:
-        file.low.point(marker)
+    for point in _point_names(trial, names):
+        file.low.point(point)
     analogs = _sensors(file, trial, even)
-    points, residuals = _points(file, even)
+    points, residuals = _points(file, trial, names)
     poses = _poses(file, trial, even)
     _events(file, trial, name)
     file.add("MANUFACTURER", "COMPANY", ["pbl-pipeline"])
@@ -87,10 +90,14 @@ class _Parameters:
         self.low.parameter(group, made)
 
 
-def check_c3d(trial: ExportTrial, name: str = "") -> None:
+def _point_names(trial: ExportTrial, names: str) -> tuple[str, ...]:
+    return (*plug_in_gait.MARKERS, *plug_in_gait.ANGLES) if names else trial.fit.marker_names
+
+
+def check_c3d(trial: ExportTrial, name: str = "", names: str = "") -> None:
     """Raise `PblError` EXPORT_INPUT if frames, events or names of markers do not fit into the fields of a C3D."""
-    even, markers = trial.even, trial.fit.marker_names
-    n, first, longest = len(even.markers_m), even.first, max(map(len, markers))
+    even, markers = trial.even, _point_names(trial, names)
+    n, first, longest = len(even.time_s), even.first, max(map(len, markers))
     events = 0 if trial.measured is None else len(trial.measured.events.events)
     most = max(0, _MOST_BYTES - len(markers) * longest) // (_EVENT_BYTES + len(name))
     for wrong, found, expected, next_step in (
@@ -117,11 +124,16 @@ def check_c3d(trial: ExportTrial, name: str = "") -> None:
             raise PblError("EXPORT_INPUT", found=found, expected=expected, next_step=next_step, key=trial.name)
 
 
-def _points(file: _Parameters, even: EvenTrial) -> tuple[np.ndarray, np.ndarray]:
-    """(4, J, N) points in mm and (1, J, N) residuals."""
-    xyz = 1e3 * even.markers_m.transpose(2, 1, 0)
-    file.add("POINT", "RATE", np.array([even.rate_hz]))
+def _points(file: _Parameters, trial: ExportTrial, names: str) -> tuple[np.ndarray, np.ndarray]:
+    """(4, J, N) points in mm (angles: deg) and (1, J, N) residuals."""
+    xyz = 1e3 * (plug_in_gait.markers_m(trial) if names else trial.even.markers_m)
+    file.add("POINT", "RATE", np.array([trial.even.rate_hz]))
     file.add("POINT", "UNITS", ["mm"])
+    if names:
+        xyz = np.concatenate([xyz, plug_in_gait.angles_deg(trial)], axis=1)
+        file.add("POINT", "ANGLES", list(plug_in_gait.ANGLES))
+        file.add("POINT", "ANGLE_UNITS", ["deg"])
+    xyz = xyz.transpose(2, 1, 0)
     file.add("POINT", "X_SCREEN", ["+X"])
     file.add("POINT", "Y_SCREEN", ["+Z"])
     points = np.concatenate([xyz, np.ones((1, *xyz.shape[1:]))])
@@ -172,10 +184,13 @@ def _sensors(file: _Parameters, trial: ExportTrial, even: EvenTrial) -> np.ndarr
     """The phone's sensors as analog channels, interpolated to a multiple of the frames' rate; NaN outside the log."""
     log = trial.log
     if log is None or not log.sensors:
+        # Programs that cut a recording by events want a rate and a unit, also of no channel.
+        file.add("ANALOG", "RATE", np.array([even.rate_hz]))
+        file.add("ANALOG", "UNITS", ["V"])
         return np.zeros((1, 0, 0))
     wanted = max(len(s.time_s) / max(float(np.ptp(s.time_s)), 1e-9) for s in log.sensors.values() if len(s.time_s) > 1)
     ratio = min(max(1, math.ceil(wanted / even.rate_hz - 0.05)), _MOST_PER_FRAME)
-    at = (even.first + np.arange(len(even.markers_m) * ratio) / ratio) / even.rate_hz
+    at = (even.first + np.arange(len(even.time_s) * ratio) / ratio) / even.rate_hz
     labels, units, channels = [], [], []
     for sensor, samples in log.sensors.items():
         time = samples.time_s + trial.log_shift_s

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage
+from scipy.signal import savgol_filter
 
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Y_UP_TO_Z_UP, load_body
 from pbl_pipeline.errors import PblError
@@ -44,10 +44,16 @@ def write_forces(trial: ExportTrial, path: Path, origin: Mapping[str, str], titl
             columns += list(values.T)
             axes = {"force": "v", "point": "p", "torque": ""}[what]
             names += [f"ground_{'torque' if what == 'torque' else 'force'}_{side}_{axes}{x}" for x in "xyz"]
-    table = np.column_stack(columns)[known]
+    units = "units: N, m, Nm; ground with y up; r is the right foot, l the left"
+    _write_motion(path, title, origin, units, names, np.column_stack(columns)[known])
+
+
+def _write_motion(
+    path: Path, title: str, origin: Mapping[str, str], units: str, names: Sequence[str], table: np.ndarray
+) -> None:
+    """Write columns with a header of OpenSim, without an empty line (pyomeca stops at one)."""
     head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
-    head += [f"{name}={text}" for name, text in origin.items()]
-    head += ["units: N, m, Nm; ground with y up; r is the right foot, l the left", "endheader", "\t".join(names)]
+    head += [*(f"{name}={text}" for name, text in origin.items()), units, "endheader", "\t".join(names)]
     path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
 
 
@@ -75,32 +81,31 @@ def check_forces(trial: ExportTrial) -> None:
 
 
 def coordinates(trial: ExportTrial) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names of the coordinates in the order of OpenSim's models and their values (T, 40): degrees, and metres of the
-    pelvis in OpenSim's ground. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
+    """Names of the coordinates in the order of OpenSim's models and their values (T, up to 40): degrees, and metres of
+    the pelvis in OpenSim's ground. Joints that were not observed are left out: a program then holds them at their
+    default. Our pelvis moves from its position in the MJCF, OpenSim's from the origin."""
     body, qpos = load_body(), np.asarray(trial.fit.qpos, float)
     column = {n: i for i, n in enumerate(trial.fit.joint_names)}
     names = (*PELVIS_TURNS, *SLIDES, *(n for n in body.joint_names if n not in (*PELVIS_TURNS, *SLIDES)))
+    names = tuple(n for n in names if n not in trial.fit.not_observed)
     rest = pelvis_rest_m(body)
     values = [qpos[:, column[n]] + rest[n] if n in SLIDES else np.degrees(qpos[:, column[n]]) for n in names]
     return names, np.column_stack(values)
 
 
 def write_mot(trial: ExportTrial, path: Path, origin: Mapping[str, str], title: str) -> None:
-    """Write the 40 joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
+    """Write the observed joint values with OpenSim's names: angles in degrees with the joints' signs (knee negative in
     flexion), pelvis_tx, ty, tz in metres in OpenSim's ground. Frames without a pose are omitted."""
     names, values = coordinates(trial)
     table = np.column_stack([np.asarray(trial.fit.time_s, float), values])[trial.known]
-    head = [title, "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
-    head += [f"{name}={text}" for name, text in origin.items()]
-    head += ["units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up", "endheader"]
-    head.append("\t".join(["time", *names]))
-    path.write_bytes(("\n".join(head) + "\n").encode("ascii") + lines([number_cells(table, 6)], "\t"))
+    units = "units: angles in degrees, pelvis_tx/ty/tz in metres; ground with y up"
+    _write_motion(path, title, origin, units, ("time", *names), table)
 
 
 #: Largest distance (m) of the lowest sole from a floor in `_OF_FRAMES` of the frames.
 FLOOR_WITHIN_M = 0.03
 _OF_FRAMES = 0.8
-#: Window of the running median, about two strides (s).
+#: Window in which the floor is a line, about two strides (s).
 _WINDOW_S = 2.0
 #: Largest rise of the floor as a fraction of the path, plus an error (m): more is a stair or a ramp.
 _STEEPEST, _ERROR_M = 0.1, 0.05
@@ -111,10 +116,11 @@ _VERTICAL = "pelvis_ty"
 def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
     """Return (T,) heights (m) of the floor under the person in the fit's world, NaN without a pose; None: none found.
 
-    At least one foot is on the floor in every frame of a walk, so the floor is the running median of the lowest point
-    of both soles. A level floor may rise or sink in the world of one camera: an error of the vertical of 1 deg makes
-    10 cm over 6 m, and the distance from the camera has errors. No floor is found if the lowest point does not stay
-    within `FLOOR_WITHIN_M` (a jump, a poor fit) or if the floor is too steep (stairs).
+    At least one foot is on the floor in every frame of a walk, so the floor is the lowest point of both soles, smoothed
+    by the line through each window; at the ends the first and the last line go on, because a mean or median of half a
+    window lags where the floor rises. A level floor may rise or sink in the world of one camera: an error of the
+    vertical of 1 deg makes 10 cm over 6 m, and the distance from the camera has errors. No floor is found if the lowest
+    point does not stay within `FLOOR_WITHIN_M` (a jump, a poor fit) or if the floor is too steep (stairs).
     """
     poses, known = trial.poses, trial.known
     soles = []
@@ -123,8 +129,10 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
         soles.append(poses.position_m[known, at] + poses.rotation[known, at] @ local)
     lowest = np.stack(soles)[..., 2].min(axis=0)
     times = np.asarray(trial.fit.time_s, float)[known]
-    size = 1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)) if len(times) > 1 else 1
-    followed = ndimage.uniform_filter1d(ndimage.median_filter(lowest, size, mode="nearest"), size, mode="nearest")
+    if len(times) < 3:
+        return None
+    size = min(1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)), len(times))
+    followed = np.asarray(savgol_filter(lowest, size, 1), float)
     pelvis = poses.position_m[known, poses.index("pelvis"), :2]
     path = float(np.linalg.norm(np.ptp(pelvis, axis=0)))
     close = np.mean(np.abs(lowest - followed) <= FLOOR_WITHIN_M) >= _OF_FRAMES

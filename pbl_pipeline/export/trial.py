@@ -94,6 +94,11 @@ class EvenTrial:
     position_m: np.ndarray  # (N, B, 3) of the bodies
     rotation: np.ndarray  # (N, B, 3, 3) body to world
 
+    @property
+    def time_s(self) -> np.ndarray:
+        """(N,) on the video's clock."""
+        return (self.first + np.arange(len(self.markers_m))) / self.rate_hz
+
 
 def wanted_markers(trial: ExportTrial) -> MarkerSet:
     """Positions of the fit's markers on the body.
@@ -161,8 +166,8 @@ def _even(trial: ExportTrial) -> EvenTrial:
     rate = 1.0 / interval_of(time)
     first, last = int(np.ceil(time[0] * rate - 1e-6)), int(np.floor(time[-1] * rate + 1e-6))
     at = np.arange(first, last + 1) / rate
-    poses = trial_poses(dataclasses.replace(fit, qpos=_interpolated(time, np.asarray(fit.qpos, float), at)))
-    markers = _interpolated(time, np.asarray(fit.markers_world_m, float).reshape(len(time), -1), at)
+    poses = trial_poses(dataclasses.replace(fit, qpos=interpolated(time, np.asarray(fit.qpos, float), at)))
+    markers = interpolated(time, np.asarray(fit.markers_world_m, float).reshape(len(time), -1), at)
     return EvenTrial(rate, first, True, markers.reshape(len(at), -1, 3), poses.position_m, poses.rotation)
 
 
@@ -178,7 +183,7 @@ def _rate(time: np.ndarray) -> float:
     return (len(time) - 1) / float(time[-1] - time[0])
 
 
-def _interpolated(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
+def interpolated(time: np.ndarray, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     """(N, C) of (T, C) at the times `at`: cubic splines over known frames that are not further apart than `MAX_GAP_S`,
     NaN elsewhere."""
     out = np.full((len(at), values.shape[1]), np.nan)

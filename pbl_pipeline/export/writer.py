@@ -31,6 +31,7 @@ from .columns import dictionary, write_csv, write_parquet
 from .ground import check_forces, on_floor, taken_off, write_forces, write_mot
 from .keypoints_csv import write_keypoints_csv
 from .osim import write_osim, write_trc
+from .plug_in_gait import NAMES
 from .trial import ExportTrial, wanted_markers, with_body_points
 from .visit_tables import session_tables
 
@@ -116,6 +117,7 @@ class ExportOptions:
     body_points: bool = True  # three further markers on every body in `.trc` and `.osim`
     allow_failed: bool = False  # also export a fit with a failed check
     overwrite: bool = False  # write into a folder with files
+    names: str = ""  # of the points of a C3D: "plug-in-gait" for that model's; "": the fitted markers
     #: Folder of the data set and labels of the visit for `bids`; None: one of the visit alone, in the folder `bids`.
     bids: tuple[Path, Labels] | None = None
 
@@ -131,6 +133,13 @@ def check_export(formats: Sequence[str], out: Path, options: ExportOptions) -> N
             found=f"--to {', '.join(unknown)}",
             expected=f"one or several of {', '.join(FORMATS)}",
             next_step="pass --to once for each format",
+        )
+    if options.names and (options.names != NAMES or "c3d" not in formats):
+        raise PblError(
+            "USAGE",
+            found=f"--names {options.names} with --to {', '.join(formats)}",
+            expected=f"--names {NAMES} with --to c3d",
+            next_step="add --to c3d, or leave out --names: the other formats have the fitted markers",
         )
     check_label("--name", options.name, _LONGEST_NAME)
     if not options.name.isascii():
@@ -224,7 +233,7 @@ def _writers(
         "mot": lambda path: write_mot(trial, path, origin, name or "coordinates"),
         "forces": lambda path: write_forces(trial, path, origin, name or "forces", floor),
         "osim": lambda path: write_osim(full, path, origin, name or "pbl_body"),
-        "c3d": lambda path: write_c3d(trial, path, origin, name),
+        "c3d": lambda path: write_c3d(trial, path, origin, name, options.names),
         "dlc": lambda path: write_keypoints_csv(trial, path),
     }
     return {FORMATS[f]: every[f] for f in formats if f in every}
@@ -306,7 +315,7 @@ def _check_trial(trial: ExportTrial, formats: Sequence[str], options: ExportOpti
     if "forces" in formats:
         check_forces(trial)
     if "c3d" in formats:
-        check_c3d(trial, options.name)
+        check_c3d(trial, options.name, options.names)
     if GAIT_FORMATS & set(formats) and trial.measured is not None:
         _check_gait(trial.measured, formats)
     if ascii_only := [f for f in formats if f in _OF_LABORATORIES]:

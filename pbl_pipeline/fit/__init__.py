@@ -1,5 +1,6 @@
 """The session fit: keypoints of 1..N trials to joint angles, one body for all."""
 
+from .keypoint_files import RecordingFacts, read_keypoints
 from .marker_files import MarkerFile, read_markers
 from .method_choice import Points, default_fit, points_of, unsuited
 from .methods import METHODS
@@ -18,3 +19,4 @@ from .session_fit import (
     fit_session,
     fit_sessions,
 )
+from .world_checks import in_upright_world

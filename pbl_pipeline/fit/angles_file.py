@@ -18,7 +18,8 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
     """One row per frame: `time_s`, then one column per joint under its OpenSim name, in the order of `qpos`.
 
     Angles in degrees, `pelvis_tx/ty/tz` in metres (world frame, origin at the camera). OpenSim's knee is negative in
-    flexion; `knee_flexion_r/_l`, positive, stands beside `knee_angle_r/_l`. NaN where the person is out of view.
+    flexion; `knee_flexion_r/_l`, positive, stands beside `knee_angle_r/_l`. NaN where the person is out of view, and
+    for joints that were not observed (`TrialFit.not_observed`).
 
     Raises `PblError` FILE_FORMAT when times, joint names and `qpos` do not belong together.
     """
@@ -33,7 +34,7 @@ def angles_table(fit: TrialFit) -> pd.DataFrame:
             key=fit.name,
         )
     columns: dict[str, np.ndarray] = {"time_s": np.asarray(fit.time_s, float)}
-    angles = joint_angles(fit.joint_names, qpos)
+    angles = joint_angles(fit.joint_names, fit.observed_qpos)
     for joint, values in zip(fit.joint_names, qpos.T, strict=True):
         name, sign = angle_of(joint)
         columns[joint] = sign * angles[name] if name in angles else values

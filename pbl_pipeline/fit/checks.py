@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.body import SLIDES, stature_m
+from pbl_pipeline.body import stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
 
 from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
-from .results import TrialFit
+from .results import SD_WARN_DEG, TrialFit
 from .session import GAIT, LEVEL, Session, has_3d
 from .solution import Solution
 from .world_checks import WRONG_DEG
@@ -29,8 +29,6 @@ LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
 #: is flat whatever happens; this fall is not. On the demo and on a synthetic walker, joint angles after a fall of 0.07
 #: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
 FALL_WARN, TRACE_NEEDED = 0.2, 8
-#: Median standard deviation of a joint angle from which on the joint counts as not observed.
-SD_WARN_DEG = 20.0
 CLOCK_WARN_S = 0.3
 #: Standard deviation of the focal length as a share of it, which is also that of depth and of the person's size.
 FOCAL_SD_WARN = 0.02
@@ -40,6 +38,9 @@ FOCAL_SD_WARN = 0.02
 #: mean error of hips, knees and ankles with and without 3D was 3.6 and 4.0 deg from the side, 3.9 and 4.8 at 42 to 52
 #: deg; from the front 4.2 and 12.1 (knees 10 to 21), from the front at an equal distance 4.0 and 4.8 (knees 6 to 10).
 FACING_FAIL_DEG = 30.0
+#: A turn of the pelvis (deg) within a time (s) that no person makes. Without 3D points, and points on the feet, a part
+#: of a walk may be fitted facing the other way.
+TURN_FAIL_DEG, TURN_S = 90.0, 0.2
 
 
 def check_fit(
@@ -57,6 +58,8 @@ def check_fit(
     if not isinstance(session.trials[0], WorldMarkers):
         checks = [_residual_2d(session, trials), *checks, _intrinsics(trials), _orientation(trials)]
         checks += [*_depth(session, trials), *_assumed(session)]
+    for trial, name in zip(session.trials, session.names, strict=True):
+        checks += trial.origin.checks(name) if isinstance(trial, WorldMarkers) else ()
     checks += _vertical(session)
     if solution.qpos_sd is not None:
         checks += [_observed(trials)]
@@ -117,19 +120,28 @@ def _residual_3d(session: Session, trials: Sequence[TrialFit], metre: float) -> 
 
 def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
     """Check the view of trials of one camera whose detector has no 3D points; empty if there are none."""
-    facing = []
+    facing, turns = [], []
     for trial, fit in zip(session.trials, trials, strict=True):
         known = np.isfinite(fit.qpos[:, 0])
         if not isinstance(trial, Keypoints) or has_3d(trial) or not known.any():
             continue
-        forward = pelvis_path(session.body, np.asarray(fit.qpos[known], float))[1][:, :, 0].mean(axis=0)
+        way = pelvis_path(session.body, np.asarray(fit.qpos[known], float))[1][:, :, 0]
+        heading, time = np.unwrap(np.arctan2(way[:, 1], way[:, 0])), np.asarray(fit.time_s)[known]
+        turns.append(float(np.rad2deg(np.max(np.abs(np.interp(time + TURN_S, time, heading) - heading)))))
+        forward = way.mean(axis=0)
         axis = Rotation.from_quat(fit.phone_quat_wxyz[known], scalar_first=True).apply([0.0, 0.0, 1.0]).mean(axis=0)
         across = np.linalg.norm(np.cross(forward, axis)) / (np.linalg.norm(forward) * np.linalg.norm(axis))
         facing.append(float(np.rad2deg(np.arcsin(min(across, 1.0)))))
     if not facing:
         return []
-    value = min(facing)
+    value, turn = min(facing), max(turns)
+    advice = (
+        "the fitted pelvis turns faster than a person can: one view without 3D points, and without points on the feet, "
+        "does not always show which way a person faces; use a model with feet, or with 3D"
+    )
+    fast = Check("pelvis_turn_without_3d_deg", FAIL, turn, TURN_FAIL_DEG, advice)
     return [
+        *[fast] * (turn > TURN_FAIL_DEG),
         Check(
             "facing_without_3d_deg",
             WARN if value >= FACING_FAIL_DEG else FAIL,
@@ -137,7 +149,7 @@ def _depth(session: Session, trials: Sequence[TrialFit]) -> list[Check]:
             FACING_FAIL_DEG,
             "the keypoint model gives pixels only, and one camera then tells nothing of depth: film from the side, or "
             "use a model with 3D, or several cameras; from the front knee angles come out wrong by 6 to 21 deg",
-        )
+        ),
     ]
 
 
@@ -263,12 +275,8 @@ def _vertical(session: Session) -> list[Check]:
 
 
 def _observed(trials: Sequence[TrialFit]) -> Check:
-    names = trials[0].joint_names
-    turns = np.array([n not in SLIDES for n in names])
-    known = [np.isfinite(t.qpos_sd).all(axis=1) for t in trials]
-    sd = np.rad2deg(np.max([_median(t.qpos_sd[k]) for t, k in zip(trials, known, strict=True)], axis=0))
-    unseen = [n for n, d, turn in zip(names, sd, turns, strict=True) if turn and not d < SD_WARN_DEG]
-    advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more: {', '.join(unseen)}"
+    unseen = [n for n in trials[0].joint_names if any(n in t.not_observed for t in trials)]
+    advice = f"standard deviation of {SD_WARN_DEG:.0f} deg and more, angles withheld: {', '.join(unseen)}"
     return warn_if(unseen, "joints_not_observed", float(len(unseen)), 0.0, advice)
 
 

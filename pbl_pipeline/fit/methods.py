@@ -15,4 +15,4 @@ METHODS.register("paper-2025", 2, PAPER_2025, "pbl_pipeline.fit.implicit:solve_s
 METHODS.register("gauss-newton", 5, GAUSS_NEWTON, solve_per_frame)
 METHODS.register("paper-gauss-newton", 3, PAPER_GAUSS_NEWTON)
 METHODS.register("blazepose", 8, BLAZEPOSE)
-METHODS.register("markers", 2, MARKERS)
+METHODS.register("markers", 3, MARKERS)

@@ -158,7 +158,7 @@ PAPER_2025 = ImplicitAdamParams(cost=CostParams(pixel="1080x1920"))
 #: The paper's costs unchanged, for comparison: the optimum of `paper-2025` found by `gauss-newton`.
 PAPER_GAUSS_NEWTON = GaussNewtonParams(smooth_per_rad2=30.0, smooth_per_m2=3_000.0, cost=CostParams(pixel="1080x1920"))
 #: For 87 points of MeTRAbs. Pixels count more against 3D than in the paper, and depth less than what lies across the
-#: line of sight, because it errs more and together (docs/benchmarks.md). Tuned on the synthetic walker, with temporally
+#: line of sight, because it errs more and together (research/reports). Tuned on the synthetic walker, with temporally
 #: correlated and with independent pixel noise. With a gain of 1e-5 as the end, wrists were 0.1 deg short of where one
 #: step more, or other padding, had them.
 GAUSS_NEWTON = GaussNewtonParams(
@@ -204,12 +204,19 @@ BLAZEPOSE = GaussNewtonParams(
         weight_scale=0.1,
     ),
 )
-#: For markers of a laboratory, known to millimetres but placed by hand; a marker that jumped counts little.
+#: For markers of a laboratory, known to millimetres but placed by hand; a marker that jumped counts little. Postures of
+#: people hold what few markers leave open, such as the tilt of a pelvis seen as two hip centres. The neutral angle of
+#: the toes is the mean of a walk; with 0, ankles of feet with one marker on the toes were 1 deg further dorsiflexed.
 MARKERS = GaussNewtonParams(
     smooth_per_rad2=2.0,
     smooth_per_m2=200.0,
     cost=CostParams(
-        huber_3d_cm=3.0, weight_offset_per_m2=100.0, weight_pose=0.01, pose_prior_deg=POSE_PRIOR_DEG, weight_scale=0.01
+        huber_3d_cm=3.0,
+        weight_offset_per_m2=100.0,
+        weight_pose=0.01,
+        pose_prior_deg=(*POSE_PRIOR_DEG, ("mtp_angle", 10.0, 20.0)),
+        pose_prior="people-3",
+        weight_scale=0.01,
     ),
 )
 

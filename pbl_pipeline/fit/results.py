@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
 
-from pbl_pipeline.body import SCALE_NAMES
+from pbl_pipeline.body import SCALE_NAMES, SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
 from pbl_pipeline.video import Camera, check_lens
+
+#: Median standard deviation of a joint angle from which on the joint counts as not observed.
+SD_WARN_DEG = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +58,19 @@ class TrialFit:
     loss: float
     seconds: float
     height_m: float = float("nan")
+
+    @functools.cached_property
+    def not_observed(self) -> frozenset[str]:
+        """Joints whose standard deviation is `SD_WARN_DEG` and more in the median over the frames: something must hold
+        them in `qpos`, but their angles are not measured."""
+        sd = np.rad2deg(self.qpos_sd[np.isfinite(self.qpos_sd).all(axis=1)])
+        unknown = ~(np.median(sd, axis=0) < SD_WARN_DEG) if len(sd) else np.zeros(len(self.joint_names), bool)
+        return frozenset(n for n, u in zip(self.joint_names, unknown, strict=True) if u and n not in SLIDES)
+
+    @property
+    def observed_qpos(self) -> np.ndarray:
+        """`qpos` (T, 40) with NaN for joints that were not observed: for all that gives out angles."""
+        return np.where([n in self.not_observed for n in self.joint_names], np.nan, np.asarray(self.qpos, float))
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -94,12 +95,12 @@ def make_session(
     if len(motions) != len(trials) or not set(motions) <= {"static", "handheld"}:
         raise _input_error(f"camera motions {', '.join(motions)}", "'static' or 'handheld' for each trial")
     checked = [check_trial(t, n, params.view, table) for t, n in zip(trials, names, strict=True)]
-    worlds = [in_upright_world(t, n, table) for t, n in zip(trials, names, strict=True) if not isinstance(t, Keypoints)]
+    worlds = [c.world for c in checked if c.world is not None]
     trials = [w.trial for w in worlds] or trials
     table = _measured(table) if isinstance(trials[0], WorldMarkers) else table
     arrays, orientation = [], []
-    for trial, name, motion, (used, _) in zip(trials, names, motions, checked, strict=True):
-        packed, source = _arrays(trial, name, motion, used, cost.pixel)
+    for trial, name, motion, seen in zip(trials, names, motions, checked, strict=True):
+        packed, source = _arrays(trial, name, motion, seen.used, cost.pixel)
         arrays.append(packed)
         orientation.append(source)
     body, metre = load_body(), 1.0
@@ -112,7 +113,7 @@ def make_session(
         names=tuple(names),
         trials=tuple(trials),
         arrays=tuple(arrays),
-        in_view_share=tuple(share for _, share in checked),
+        in_view_share=tuple(c.whole_share for c in checked),
         orientation=tuple(orientation),
         problem=pack(arrays, body, table),
         metre=metre,
@@ -127,10 +128,17 @@ def _measured(markers: MarkerSet) -> MarkerSet:
     return dataclasses.replace(markers, weight_3d=np.ones(len(markers))) if included else markers
 
 
-def check_trial(
-    trial: Trial, name: str, view: ViewParams, markers: MarkerSet | None = None
-) -> tuple[np.ndarray, float]:
-    """Frames (T,) bool of a trial that a fit would use, and the share of frames with the whole person in view.
+class CheckedTrial(NamedTuple):
+    """Frames (T,) bool of a trial that a fit would use, the share of frames with the whole person in view, and the
+    trial in a world whose z is up (None for one camera)."""
+
+    used: np.ndarray
+    whole_share: float
+    world: Turned | None
+
+
+def check_trial(trial: Trial, name: str, view: ViewParams, markers: MarkerSet | None = None) -> CheckedTrial:
+    """Check a trial before a fit.
 
     Raises `PblError` FIT_INPUT, VIEWS_DISAGREE, MARKER_SET_UNKNOWN or PHONE_LOG if the trial cannot be fitted.
     """
@@ -151,7 +159,7 @@ def check_trial(
         shown = visibility(trial, view.min_confidence, view.max_gap_s, view.max_blind_s)
         used = _long_enough(shown.counts, trial.time_s, name, view)
         _check_phone(trial, name, used)
-        return used, shown.whole_share
+        return CheckedTrial(used, shown.whole_share, None)
     if isinstance(trial, MultiView):
         for k in trial.views:
             _check_finite(name, k.confidence, k.xy_px)
@@ -168,8 +176,8 @@ def check_trial(
     enough = np.mean(confidence > 0, axis=1) >= SEEN_SHARE
     in_view = enough & (_mean_seen(confidence) >= view.min_confidence)
     used = bridge_gaps(in_view, trial.time_s, view.max_gap_s) & ~blind_runs(enough, trial.time_s, view.max_blind_s)
-    in_upright_world(trial, name, table)  # raises
-    return _long_enough(used, trial.time_s, name, view), float(np.mean(in_view))
+    world = in_upright_world(trial, name, table)
+    return CheckedTrial(_long_enough(used, trial.time_s, name, view), float(np.mean(in_view)), world)
 
 
 def _long_enough(used: np.ndarray, time_s: np.ndarray, name: str, view: ViewParams) -> np.ndarray:
@@ -264,7 +272,7 @@ def _view(trial: Keypoints) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     c = np.asarray(trial.confidence, float)
     seen = c > 0
     known = seen & _finite(trial.xyz_cam_m)
-    xy, x_cam = np.array(trial.xy_px), np.array(trial.xyz_cam_m)
+    xy, x_cam = np.array(trial.xy_px, order="C"), np.array(trial.xyz_cam_m, order="C")  # views are written below
     for x, known_there in ((xy, seen), (x_cam, known)):
         x.reshape(-1, x.shape[-1])[np.flatnonzero(~known_there)] = 0.0
     return undistort_px(xy, trial.camera), c, x_cam, np.where(known, c, 0.0)

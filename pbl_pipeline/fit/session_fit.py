@@ -19,7 +19,7 @@ from pbl_pipeline.video import Camera
 
 from .checks import check_fit
 from .known_height import in_metres
-from .lever_arms import with_open_joints
+from .lever_arms import with_marker_places
 from .many_sessions import Packed, Work
 from .methods import METHODS
 from .params import Params
@@ -27,7 +27,7 @@ from .per_frame import start_of
 from .problem import pixels_alone
 from .results import SessionFit, TrialFit
 from .rotations import quat_wxyz
-from .session import Session, Trial, make_session
+from .session import CheckedTrial, Session, Trial, make_session
 from .session import check_trial as _check_trial
 from .solution import Solution
 from .vertical import upright
@@ -109,7 +109,7 @@ def fit_sessions(
         return Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
 
     def finish(packed: Packed, solution: Solution) -> SessionFit:
-        return _session_fit(packed, solution, method.paramset, sessions[packed.index])
+        return _session_fit(packed, solution, method, sessions[packed.index])
 
     load_body()  # before the threads, each of which would load its own body and compile for it
     most, threads = max(batch or (1 if on_cpu else len(sessions)), 1), threads or THREADS
@@ -126,16 +126,16 @@ def check_trial(
     name: str,
     paramset: Method[Params] | Paramset | Params | str | None = None,
     markers: MarkerSet | None = None,
-) -> tuple[np.ndarray, float]:
-    """Frames (T,) bool of a trial that the fit would use, and the share of frames with the whole person in view.
+) -> CheckedTrial:
+    """Check a trial before a fit.
 
     Raises `PblError` FIT_INPUT, VIEWS_DISAGREE or MARKER_SET_UNKNOWN if the trial cannot be fitted.
     """
     return _check_trial(trial, name, METHODS.find(paramset).params.view, markers)
 
 
-def _session_fit(packed: Packed, solution: Solution, paramset: Paramset, given: SessionInput) -> SessionFit:
-    begin, session, motions = time.perf_counter(), packed.session, _motions(given)
+def _session_fit(packed: Packed, solution: Solution, method: Method[Params], given: SessionInput) -> SessionFit:
+    begin, session, motions, paramset = time.perf_counter(), packed.session, _motions(given), method.paramset
     used = np.asarray(session.problem.weight) > 0
     finite = np.all(np.isfinite(solution.qpos[used])) and np.all(np.isfinite(solution.scale))
     if not finite or not np.isfinite(solution.loss_trace[-1, 1]) or np.any(solution.scale <= 0):
@@ -148,7 +148,7 @@ def _session_fit(packed: Packed, solution: Solution, paramset: Paramset, given: 
         )
     solution, sources = upright(session, solution)
     solution, taller = in_metres(session, solution, given.height_m)
-    solution = with_open_joints(session, solution)
+    solution = with_marker_places(session, solution, method.params)
     seconds = packed.seconds + solution.seconds + time.perf_counter() - begin
     fits = tuple(
         _trial_fit(session, i, solution, sources[i], paramset, motions[i], seconds, given.height_m)

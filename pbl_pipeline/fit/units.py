@@ -4,7 +4,7 @@ A detector cuts the person out of the picture, looks at the crop at a fixed size
 in pixels of the file the same error is four times as large at 4K as at 540p, or when the person is four times nearer.
 So residuals of the picture, their weight and their Huber width are in pixels of a crop of 256 pixels, frame by frame.
 On recordings with a truth, at several sizes each, that unit predicts the error as well as the person's box or distance
-does, and far better than the file's pixel (docs/benchmarks.md); it needs neither depth nor focal length.
+does, and far better than the file's pixel (research/reports); it needs neither depth nor focal length.
 
 In the same way the metres of a single camera's 3D points depend on the body size that the detector assumes. They are
 scaled to the size of the unscaled body, so that a detector that assumes a taller person yields the same angles.

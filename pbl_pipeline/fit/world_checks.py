@@ -1,36 +1,36 @@
-"""Checks of the world of laboratory markers and calibrated cameras against the body that moves in it.
+"""Checks of the world of laboratory markers and calibrated cameras, and of the picture of another program's keypoints,
+against the body that moves in it.
 
-A file states its vertical axis, its unit and its times, or a reader assumes them; a body shows them. Assumed of the
-person: 0.75 to 3.4 m tall; in a trial as a whole the head is above the feet, as in walking, standing, sitting and
-squatting, not in lying; a stride takes 0.4 to 8 s.
+Assumed of the person, beyond `assumptions`: in a trial as a whole the head is above the feet, as in walking, standing,
+sitting and squatting, not in lying.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Generic, TypeVar
 
 import numpy as np
 
+from pbl_pipeline.assumptions import SIZES, UNITS, check_size, check_steps, check_strides
 from pbl_pipeline.body import MarkerSet, load_body
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.keypoints import MOST_MISS_M, MultiView, WorldMarkers
+from pbl_pipeline.keypoints import MOST_MISS_M, SEEN_SHARE, Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.keypoints.multi_view import meeting_points
 from pbl_pipeline.video import CameraPose
 
 from .standing import standing_markers
 from .units import body_metres
 
-#: Size of the body relative to the unscaled one, seconds of a frame and of a stride.
-SIZES, STEPS_S, STRIDES_S = (0.45, 2.0), (1 / 5000, 0.25), (0.4, 8.0)
 #: Beyond this angle from z the vertical is wrong; within `NEAR_DEG` of another axis it is that one.
 WRONG_DEG, NEAR_DEG, STEADY = 60.0, 40.0, 0.8
-#: Least standard deviation (m) of the markers' heights on the standing body that shows a direction, and least
-#: amplitude (m) of the distance between the feet that shows strides.
-_SPREAD_M, _SWING_M = 0.15, 0.15
-_UNITS = {"metres": 1.0, "feet": 0.3048, "inches": 0.0254, "centimetres": 0.01, "millimetres": 0.001}
+#: Least standard deviation (m) of the markers' heights on the standing body that shows a direction.
+_SPREAD_M = 0.15
 _LEGS = ("tibia", "talus", "calcn", "toes")
+#: Least size of a body in a picture (px); largest fraction of the points outside the picture.
+_LEAST_PX, _MOST_OUTSIDE = 20.0, 0.05
 
 
 World = TypeVar("World", bound=MultiView | WorldMarkers)
@@ -52,8 +52,9 @@ def in_upright_world(trial: World, name: str, markers: MarkerSet) -> Turned[Worl
     Raises `PblError` FIT_INPUT: times, size or strides that no person has, or a vertical that is wrong and unclear.
     """
     points = _points(trial)
-    _check_steps(np.asarray(trial.time_s), name)
-    check_size(points, name, markers)
+    refuse, time_s = functools.partial(_error, name), np.asarray(trial.time_s)
+    check_steps(time_s, refuse)
+    check_size(_size(points, markers), refuse)
     up, steady = body_axis(points, markers)
     off, turn, label = float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))), np.eye(3), ""
     if off > WRONG_DEG:
@@ -61,8 +62,7 @@ def in_upright_world(trial: World, name: str, markers: MarkerSet) -> Turned[Worl
         axis = np.sign(up[number]) * np.eye(3)[number]
         near, label = float(np.degrees(np.arccos(axis @ up))), "-+"[int(axis[number] > 0)] + "xyz"[number]
         if near > NEAR_DEG or steady < STEADY:
-            raise _error(
-                name,
+            raise refuse(
                 f"the body's head lies {off:.0f} deg off z, seen from its feet, and along no axis "
                 f"(nearest {label}: {near:.0f} deg)",
                 "a person whose head is above the feet along z, the vertical",
@@ -70,23 +70,8 @@ def in_upright_world(trial: World, name: str, markers: MarkerSet) -> Turned[Worl
             )
         turn = _to_z(axis)
     points = points @ turn.T
-    _check_strides(points, np.asarray(trial.time_s), name, markers)
+    check_strides(_between_legs(points, markers), time_s, refuse)
     return Turned(_turned(trial, turn) if label else trial, name, off, label)
-
-
-def check_size(points: np.ndarray, name: str, markers: MarkerSet) -> None:
-    """Raise `PblError` FIT_INPUT unless points (T, J, 3) in metres are of a body of a person's size."""
-    size = _size(points, markers)
-    if SIZES[0] <= size <= SIZES[1]:
-        return
-    names = ((own, read) for own in _UNITS for read in ("metres", "centimetres", "millimetres"))
-    own, read = min(names, key=lambda n: abs(np.log(size * _UNITS[n[0]] / _UNITS[n[1]])))
-    raise _error(
-        name,
-        f"a body {_times(size)} that of an adult, such as {own} read as {read}",
-        f"{SIZES[0]:g} to {SIZES[1]:g} times an adult's size",
-        "correct the unit: Units of a .trc, xyz_world_m and translations of a calibration in metres",
-    )
 
 
 def body_axis(points: np.ndarray, markers: MarkerSet) -> tuple[np.ndarray, float]:
@@ -107,6 +92,55 @@ def body_axis(points: np.ndarray, markers: MarkerSet) -> tuple[np.ndarray, float
     return (mean / steady, steady) if steady > 0 else (np.array([0.0, 0.0, 1.0]), 0.0)
 
 
+def check_picture(trial: Keypoints, name: str, markers: MarkerSet) -> None:
+    """Check pixels against the body and the picture, which is taken as a level view of it.
+
+    Raises `PblError` FIT_INPUT: a body upside down or on its side, points outside the picture, coordinates that are
+    fractions of it, times or strides that no person has.
+    """
+    xy = np.where((trial.confidence > 0)[..., None], np.asarray(trial.xy_px, float), np.nan)
+    extent = np.nanmax(xy, axis=1, initial=-np.inf) - np.nanmin(xy, axis=1, initial=np.inf)
+    seen = np.isfinite(xy).all(axis=2).mean(axis=1) >= SEEN_SHARE * np.isfinite(xy).all(axis=2).any(axis=0).mean()
+    if not seen.any():
+        raise _error(name, "no frame with most of the points", "a person in view", "look at the file")
+    size, picture = float(np.median(extent[seen].max(axis=1))), "x".join(map(str, trial.image_size_px))
+    if size < _LEAST_PX:
+        raise _error(
+            name,
+            f"a body of {size:.3g} px",
+            f"pixels of the picture, at least {_LEAST_PX:g} for a body",
+            "write pixels, not fractions of the picture (OpenPose: --keypoint_scale 0)",
+        )
+    points = np.stack([xy[..., 0], np.zeros(xy.shape[:2]), -xy[..., 1]], axis=-1)
+    points *= np.ptp(standing_markers(load_body(), markers)[:, 2]) / size
+    up = body_axis(points, markers)[0]
+    if np.degrees(np.arccos(np.clip(up[2], -1, 1))) > WRONG_DEG:
+        upside = abs(up[2]) > abs(up[0])
+        raise _error(
+            name,
+            "a person who is upside down: y points up, or the picture is turned by 180 deg"
+            if upside
+            else "a person who lies on the side: the picture is turned by 90 deg",
+            "a person who stands or sits upright in the picture, y down from its upper edge",
+            "write y as height - 1 - y" if upside else "find the keypoints in the upright picture",
+        )
+    width, height = trial.image_size_px
+    known = xy[np.isfinite(xy).all(axis=2)]
+    outside = float(np.mean(np.any((known < -0.5) | (known > np.array([width, height]) - 0.5), axis=1)))
+    if outside > _MOST_OUTSIDE:
+        low, high = known.min(axis=0), known.max(axis=0)
+        raise _error(
+            name,
+            f"{outside:.0%} of the points outside the picture of {picture} px: x {low[0]:.0f} to {high[0]:.0f}, "
+            f"y {low[1]:.0f} to {high[1]:.0f}",
+            "pixels of the upright picture, from its upper left corner",
+            "pass the size of the picture in which the keypoints were found",
+        )
+    refuse, time_s = functools.partial(_error, name), np.asarray(trial.time_s)
+    check_steps(time_s, refuse)
+    check_strides(_between_legs(points, markers), time_s, refuse)
+
+
 def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | None:
     """Return VIEWS_DISAGREE with what is wrong with the calibration, where another reading of it makes the cameras
     agree: poses the other way round, camera axes of computer graphics, another unit. None if no reading does."""
@@ -118,9 +152,9 @@ def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | Non
             R, p = (R.T, -R.T @ p) if inverse else (R, p)
             poses.append(CameraPose(R @ flip if graphics else R, p))
         miss, points = meeting_points(dataclasses.replace(trial, poses=tuple(poses)))
-        unit = min(_UNITS, key=lambda u: abs(np.log(_size(points, markers) * _UNITS[u])))
-        size = _size(points, markers) * _UNITS[unit]
-        if not (SIZES[0] <= size <= SIZES[1] and np.nanmax(miss) * _UNITS[unit] <= MOST_MISS_M):
+        unit = min(UNITS, key=lambda u: abs(np.log(_size(points, markers) * UNITS[u])))
+        size = _size(points, markers) * UNITS[unit]
+        if not (SIZES[0] <= size <= SIZES[1] and np.nanmax(miss) * UNITS[unit] <= MOST_MISS_M):
             continue
         wrong = [
             text
@@ -134,7 +168,7 @@ def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | Non
         return PblError(
             "VIEWS_DISAGREE",
             found=f"trial {name}: {', '.join(wrong)}: read so, the cameras agree within "
-            f"{100 * np.nanmax(miss) * _UNITS[unit]:.0f} cm",
+            f"{100 * np.nanmax(miss) * UNITS[unit]:.0f} cm",
             expected="x_camera = R x_world + t with y down and z forward, t in metres",
             next_step="convert rotation and translation in the calibration (docs/files.md, section Several cameras)",
             key=name,
@@ -154,46 +188,13 @@ def _size(points: np.ndarray, markers: MarkerSet) -> float:
     return 1 / body_metres(load_body(), markers, [known], [seen[:, None]])
 
 
-def _check_steps(time_s: np.ndarray, name: str) -> None:
-    step = float(np.median(np.diff(time_s)))
-    if STEPS_S[0] <= step <= STEPS_S[1]:
-        return
-    guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"
-    raise _error(
-        name,
-        f"{step:.3g} s from frame to frame, such as {guess} read as seconds",
-        f"{STEPS_S[0]:g} to {STEPS_S[1]:g} s",
-        "write the time of each frame in seconds",
-    )
-
-
-def _check_strides(points: np.ndarray, time_s: np.ndarray, name: str, markers: MarkerSet) -> None:
-    """The distance between the legs along the way changes its sign twice a stride."""
+def _between_legs(points: np.ndarray, markers: MarkerSet) -> np.ndarray:
+    """Horizontal distance (T, 2) from the markers of the left leg, below the knee, to those of the right one."""
     legs = [np.array([b.endswith(end) and b.startswith(_LEGS) for b in markers.body_names]) for end in ("_r", "_l")]
     seen = np.isfinite(points).all(axis=2) & np.stack(legs)[:, None]
-    known = np.all([s.any(axis=1) for s in seen], axis=0)
-    if known.sum() < 3:
-        return
-    both = [
-        np.einsum("tj,tja->ta", s[known] / s[known].sum(axis=1, keepdims=True), np.nan_to_num(points[known, :, :2]))
-        for s in seen
-    ]
-    apart = both[0] - both[1]
-    apart -= apart.mean(axis=0)
-    along = apart @ np.linalg.eigh(apart.T @ apart)[1][:, -1]
-    far = np.abs(along) > max(0.3 * np.percentile(np.abs(along), 90), 0.3 * _SWING_M)
-    side, at = np.sign(along[far]), time_s[known][far]
-    change = at[1:][np.diff(side) != 0]
-    if len(change) < 3 or np.percentile(np.abs(along), 90) < _SWING_M:
-        return
-    stride = 2 * float(np.median(np.diff(change)))
-    if not STRIDES_S[0] <= stride <= STRIDES_S[1]:
-        raise _error(
-            name,
-            f"strides of {stride:.2g} s",
-            f"{STRIDES_S[0]:g} to {STRIDES_S[1]:g} s",
-            "correct the times of the frames, in seconds (the rate of the recording)",
-        )
+    n = np.where(seen.any(axis=2), seen.sum(axis=2), np.nan)[..., None]
+    right, left = np.einsum("stj,tja->sta", seen, np.nan_to_num(points[..., :2])) / n
+    return right - left
 
 
 def _to_z(axis: np.ndarray) -> np.ndarray:
@@ -208,10 +209,6 @@ def _turned(trial: World, turn: np.ndarray) -> World:
         return dataclasses.replace(trial, xyz_world_m=trial.xyz_world_m @ turn.T)
     poses = tuple(CameraPose(turn @ p.R_nc, turn @ p.p_nc) for p in trial.poses)
     return dataclasses.replace(trial, poses=poses)
-
-
-def _times(ratio: float) -> str:
-    return f"{ratio:.3g} times" if ratio > 1 else f"1/{1 / ratio:.3g} of"
 
 
 def _error(name: str, found: str, expected: str, next_step: str) -> PblError:

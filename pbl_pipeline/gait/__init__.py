@@ -40,7 +40,7 @@ from .events import METHODS as EVENT_METHODS
 from .events import EventParams, GaitEvent, GaitEvents, apply_correction, check_correction, detect_events, load_events
 from .ground import cycle_lengths
 from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
-from .measurement import IMPORTANT_CHANGE, Chances, chances, change_sd
+from .measurement import IMPORTANT_CHANGE, MEASURES_REMAIN, REMAINS, Chances, chances, change_sd
 from .metrics import (
     GaitMetrics,
     GaitParams,
@@ -49,9 +49,18 @@ from .metrics import (
     TrialMetrics,
     cycle_checks,
     gait_metrics,
+    legs_check,
     pool_trials,
 )
-from .motion import BodyPoses, FootTrajectories, feet_from_fit, feet_from_keypoints, feet_from_markers, trial_poses
+from .motion import (
+    BodyPoses,
+    FootTrajectories,
+    check_feet,
+    feet_from_fit,
+    feet_from_keypoints,
+    feet_from_markers,
+    trial_poses,
+)
 from .normative import (
     BODY_ANGLES,
     DEFAULT_NORM,
@@ -64,6 +73,7 @@ from .normative import (
     norm_names,
     offset_deg,
 )
+from .opensim import OpenSimMotion, read_motion, read_motion_feet, read_motion_trial
 from .tasks import TASK_MEASURES, TRIAL_MEASURES, TaskMotion, task_measure, task_measures, task_motion
 from .types import (
     ACTIVITIES,

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.errors import PblError
+
 from .events import LEFT, RIGHT, SIDES
-from .motion import BodyPoses, feet_from_fit, trial_poses
+from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
 from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:
@@ -58,20 +61,22 @@ LEG_ANGLES = {
 
 
 def leg_angles(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
-    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has."""
+    """Side -> name -> (T,) degrees: the body's own angles of hip, knee and ankle; those that the fit's body has, NaN
+    if not observed."""
     from pbl_pipeline.body import joint_angles  # JAX loads only where a fit is read
 
-    return _of_legs(joint_angles(fit.joint_names, fit.qpos))
+    return legs_of(joint_angles(fit.joint_names, fit.observed_qpos))
 
 
 def leg_angles_sd(fit: TrialFit) -> dict[str, dict[str, np.ndarray]]:
     """The standard deviation (deg) of each of `leg_angles`, NaN where the fit has none."""
     from pbl_pipeline.body import joint_angles_sd
 
-    return _of_legs(joint_angles_sd(fit.joint_names, fit.qpos_sd))
+    return legs_of(joint_angles_sd(fit.joint_names, fit.qpos_sd))
 
 
-def _of_legs(angles: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+def legs_of(angles: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Side -> name -> the angles of that leg, of angles by the names of the body (`body.joint_angles`)."""
     return {
         side: {ours: angles[f"{own}_{side[0]}"] for ours, own in LEG_ANGLES.items() if f"{own}_{side[0]}" in angles}
         for side in SIDES
@@ -84,12 +89,29 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
     Raises `PblError` GAIT_INPUT (see `feet_from_fit`).
     """
     poses = poses or trial_poses(fit)
-    feet = feet_from_fit(fit, poses)
+    series = series_of(leg_angles(fit), poses, feet_from_fit(fit, poses), leg_angles_sd(fit))
+    for side, of_side in ((LEFT, series.left), (RIGHT, series.right)):
+        hidden = [
+            n for n in of_side if n.startswith("pelvis") and any(j.startswith("pelvis") for j in fit.not_observed)
+        ]
+        if not fit.not_observed.isdisjoint(f"{joint}_{side[0]}" for joint in ("ankle_angle", "subtalar_angle")):
+            hidden.append("foot_progression")
+        of_side.update((name, np.full(len(series.time_s), np.nan)) for name in hidden)
+    return series
+
+
+def series_of(
+    legs: Mapping[str, Mapping[str, np.ndarray]],
+    poses: BodyPoses,
+    feet: FootTrajectories,
+    sd: dict[str, dict[str, np.ndarray]] | None = None,
+) -> AngleSeries:
+    """Angles of both legs (side -> name -> (T,) degrees), and those of pelvis and feet of the poses against the way."""
     forward = feet.forward
     out = toes_out(feet.toe_m - feet.heel_m, forward)
     # The pelvis frame of the model is forward, up, right.
     tilt, obliquity, rotation = pelvis_angles(poses.rotation[:, poses.index("pelvis")], forward).T
-    legs, sides = leg_angles(fit), {}
+    sides = {}
     for i, (side, sign) in enumerate(((LEFT, -1.0), (RIGHT, 1.0))):
         sides[side] = {
             **legs[side],
@@ -98,7 +120,35 @@ def angle_series(fit: TrialFit, poses: BodyPoses | None = None) -> AngleSeries:
             "pelvis_rotation": sign * rotation,
             "foot_progression": -out[:, i],
         }
-    return AngleSeries(np.asarray(fit.time_s, float), sides[LEFT], sides[RIGHT], sd=leg_angles_sd(fit))
+    return AngleSeries(np.asarray(feet.time_s, float), sides[LEFT], sides[RIGHT], sd=sd or {})
+
+
+#: Beyond the limits of the body's joints by this angle (deg) no joint of a person is for long.
+_BEYOND_DEG = 30.0
+
+
+def check_ranges(series: AngleSeries, name: str) -> None:
+    """Check the angles of hip, knee and ankle (1st and 99th percentile) against the limits of the body's joints, and
+    that knees bend in flexion. Raises `PblError` GAIT_INPUT."""
+    from pbl_pipeline.body import joint_angles, load_body
+
+    limits = legs_of(joint_angles(load_body().joint_names, load_body().joint_range_rad.T))
+    for side in SIDES:
+        for angle, values in series.of_side(side).items():
+            known = values[np.isfinite(values)]
+            if angle not in LEG_ANGLES or not len(known):
+                continue
+            low, high = np.percentile(known, [1, 99])
+            least, most = sorted(limits[side][angle])
+            least, most = least - _BEYOND_DEG, most + _BEYOND_DEG
+            if low < least or high > most or (angle == "knee_flexion" and -low > max(high, _BEYOND_DEG)):
+                raise PblError(
+                    "GAIT_INPUT",
+                    found=f"{angle.replace('_', ' ')} of the {side} side from {low:.0f} to {high:.0f} deg",
+                    expected=f"{least:.0f} to {most:.0f} deg ({ANGLE_NAMES[angle]})",
+                    next_step="correct sign and zero of this angle in the program that wrote it, and export again",
+                    key=name,
+                )
 
 
 def pelvis_angles(R_world_pelvis: np.ndarray, forward: np.ndarray) -> np.ndarray:

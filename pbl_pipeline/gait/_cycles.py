@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import CADENCE, Check, failed
 
 from ._angles import AngleSeries, angle_series
@@ -17,7 +18,7 @@ from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
-from .normative import BODY_ANGLES
+from .normative import BODY_ANGLES, THREE_ANGLES
 from .types import NO_POSITIONS, Exclusion, GaitCycle, Lengths
 
 if TYPE_CHECKING:
@@ -91,12 +92,12 @@ def without_odd_curves(cycles: Sequence[GaitCycle]) -> list[GaitCycle]:
     """
     out = list(cycles)
     for side in sorted({c.side for c in cycles}):
-        chosen = [
-            i for i, c in enumerate(out) if c.side == side and c.used and all(n in c.curves for n in CURVE_ANGLES)
-        ]
+        own = [i for i, c in enumerate(out) if c.side == side and c.used]
+        names = [n for n in CURVE_ANGLES if any(n in out[i].curves for i in own)]
+        chosen = [i for i in own if names and all(n in out[i].curves for n in names)]
         if len(chosen) < MIN_CURVES:
             continue
-        curves = np.array([[out[i].curves[n] for n in CURVE_ANGLES] for i in chosen])
+        curves = np.array([[out[i].curves[n] for n in names] for i in chosen])
         away = np.sqrt(np.mean((curves - np.median(curves, axis=0)) ** 2, axis=(1, 2)))
         usual = np.median(away)
         limit = max(CURVE_MIN_DEG, float(usual + CURVE_SD * 1.4826 * np.median(np.abs(away - usual))))
@@ -150,6 +151,7 @@ def find_cycles(
     series: AngleSeries | None = None,
     feet: FootTrajectories | None = None,
     keep_ends: bool = False,
+    no_width: str = "",
 ) -> tuple[GaitCycle, ...]:
     """All cycles whose inner events are complete and in order, with curves and lengths if a fit is given.
 
@@ -168,7 +170,7 @@ def find_cycles(
     stride, and a slow stride belongs to the spread. Nor is one whose curves are far from the others'.
 
     `series` and `feet` replace the fit's angles and feet if there is no fit (a laboratory's recording; positions in
-    metres in a fixed world).
+    metres in a fixed world). `no_width`: the reason if these do not tell the step width.
 
     If one of `fit_checks`, the checks of the session fit, FAILs, no cycle is used (`pbl_pipeline.qc.failed`). Nor is
     one of a fit whose cadence is too high for walking (`with_cadence_accepted` takes that back).
@@ -201,10 +203,14 @@ def find_cycles(
             if series is not None:
                 curves, missing = cycle_curves(series, start.side, start.time_s, end.time_s)
                 curves_sd = _curves_sd(series, start, end) if curves else {}
+                absent = [angle.replace("_", " ") for angle in THREE_ANGLES if angle not in curves]
+                missing = missing or ", ".join(f"no {angle}" for angle in absent)
             lengths, slide = Lengths(missing=no_lengths), None
             if feet is not None and not no_lengths:
-                times = (start.time_s, inner[1].time_s, end.time_s)
-                lengths, slide = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=metric)
+                times, width = (start.time_s, inner[1].time_s, end.time_s), metric and not no_width
+                lengths, slide = cycle_lengths(feet, start.side, *times, metric=metric or stated, width=width)
+                if no_width and not lengths.missing:
+                    lengths = dataclasses.replace(lengths, missing=no_width)
             cycle = GaitCycle(
                 trial=name,
                 number=0,
@@ -238,12 +244,16 @@ def find_cycles(
 
 
 def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -> tuple[dict[str, np.ndarray], str]:
-    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if missing.
+    """Curves of one side at `REPORT_PERCENT` of the time from `start_s` to `end_s`, in degrees; the reason if some or
+    all are missing. An angle without any value is not observed and has none.
 
     Interpolation is monotone cubic (PCHIP) between the frames' own time stamps. Frames missing for longer than
     `MAX_CURVE_GAP_S` inside the cycle, or at its ends, give no curves.
     """
-    table = series.of_side(side)
+    table = {name: own for name, own in series.of_side(side).items() if np.isfinite(own).any()}
+    absent = [name for name in series.of_side(side) if name not in table]
+    if not table:
+        return {}, "no angle is observed" if absent else f"no angles of the {side} side"
     values = np.column_stack(list(table.values()))
     seen = np.all(np.isfinite(values), axis=1)
     time, values = series.time_s[seen], values[seen]
@@ -256,7 +266,26 @@ def cycle_curves(series: AngleSeries, side: str, start_s: float, end_s: float) -
     part = slice(max(0, first - 2), last + 3)
     at = start_s + REPORT_PERCENT / 100.0 * (end_s - start_s)
     curves = PchipInterpolator(time[part], values[part], axis=0)(at)
-    return dict(zip(table, curves.T, strict=True)), ""
+    return dict(zip(table, curves.T, strict=True)), f"not observed: {', '.join(absent)}" if absent else ""
+
+
+#: Fractions of a cycle in which a leg swings and in which it stands, and least difference of the knee's flexion (deg).
+_SWINGS, _STANDS, _LESS_DEG = (0.62, 0.88), (0.12, 0.38), 8.0
+
+
+def check_sides(cycles: Sequence[GaitCycle], name: str) -> None:
+    """Check that each knee bends more in swing than in stance. Raises `PblError` GAIT_INPUT."""
+    knees = np.array([c.curves["knee_flexion"] for c in cycles if "knee_flexion" in c.curves])
+    phase = REPORT_PERCENT / 100.0
+    mean = [knees[:, (phase >= a) & (phase <= b)].mean() if len(knees) else 0.0 for a, b in (_SWINGS, _STANDS)]
+    if mean[0] < mean[1] - _LESS_DEG:
+        raise PblError(
+            "GAIT_INPUT",
+            found=f"knees bent by {mean[0]:.0f} deg in what the events call swing, by {mean[1]:.0f} deg in stance",
+            expected="events and angles of the same leg under the same side",
+            next_step="exchange left and right of the events, or of the angles, in the program that wrote them",
+            key=name,
+        )
 
 
 def _curves_sd(series: AngleSeries, start: GaitEvent, end: GaitEvent) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import count_rows
 
 from .events import FOOT_DOWN, FOOT_UP, GaitEvent
@@ -35,7 +36,7 @@ _LABEL = re.compile(rf"(left|right|l|r)?({'|'.join(_WORDS)})(left|right|l|r)?")
 
 
 class C3dFile:
-    """One C3D file in memory. `notes` lists what was assumed and left out; ValueError for a damaged or ambiguous file.
+    """One C3D file in memory. `origin` lists what was assumed and left out; ValueError for a damaged or ambiguous file.
 
     `first_frame`, `n_frames`, `rate_hz`: the frames that the file holds. `labels`: the name of each point as written.
     """
@@ -43,7 +44,7 @@ class C3dFile:
     def __init__(self, data: bytes) -> None:
         import c3d
 
-        self.notes: list[str] = []
+        self.origin = Origin()
         #: The person of the points that were taken, if their names state it.
         self.person = ""
         self._data = data
@@ -110,10 +111,14 @@ class C3dFile:
             return self._floats(piece.bytes)
         return np.frombuffer(piece.bytes, {1: np.uint8, 2: self._types.uint16}[piece.bytes_per_element]).astype(float)
 
+    def numbers(self, key: str) -> np.ndarray:
+        """All numbers of a parameter, whose first dimension runs fastest; none where it is absent."""
+        piece = self._get(key)
+        return self._numbers(piece) if piece else np.zeros(0)
+
     def number(self, key: str) -> float:
         """A number; one of two 16-bit words has the low word first. NaN where it is absent."""
-        piece = self._get(key)
-        values = self._numbers(piece) if piece else np.zeros(0)
+        piece, values = self._get(key), self.numbers(key)
         if len(values) == 2 and piece.bytes_per_element == 2:
             return float(values[0] + _WORD * values[1])
         return float(values[0]) if len(values) else math.nan
@@ -167,22 +172,34 @@ class C3dFile:
             if end - begin + 1 == self.n_frames or (last - first + 1 - self.n_frames) % _WORD:
                 self.first_frame = int(begin)
             elif begin != first:
-                self.notes.append(f"first frame {first}, which fits the data; {begin:g} of TRIAL does not")
+                self.origin.assumed.append(f"first frame {first}, which fits the data; {begin:g} of TRIAL does not")
+
+    def _words(self, first: int, shape: tuple[int, int]) -> np.ndarray:
+        """Words (T, *shape) as they lie in the frames, from word `first` of each."""
+        kind = {2: self._types.int16, 4: "<u4" if self._types.is_dec else self._types.float32}[self._bytes]
+        steps = (self._size, shape[1] * self._bytes, self._bytes)
+        return np.ndarray((self.n_frames, *shape), kind, self._data, self._start + first * self._bytes, steps)
+
+    def _decoded(self, words: np.ndarray) -> np.ndarray:
+        if self._types.is_dec and self._bytes == 4:
+            return self._floats(words.tobytes()).reshape(words.shape)
+        return words.astype(float)
+
+    def analogs(self) -> np.ndarray:
+        """Signed analog samples (T, samples per frame, channels) in the units of ANALOG:UNITS."""
+        used = int(self.number("ANALOG:USED"))
+        words = self._words(4 * self._points, ((self._size // self._bytes - 4 * self._points) // used, used))
+        scale, offset = (self.numbers(f"ANALOG:{key}")[:used] for key in ("SCALE", "OFFSET"))
+        return (self._decoded(words) - offset) * scale * self.number("ANALOG:GEN_SCALE")
 
     def points(self, columns: Collection[int]) -> np.ndarray:
         """Coordinates (T, P, 3) in the file's unit. NaN where a point is missing: its residual is negative, a number is
         not finite, or all four are 0."""
-        formats = {2: self._types.int16, 4: "<u4" if self._types.is_dec else self._types.float32}
-        steps = (self._size, 4 * self._bytes, self._bytes)
-        shape = (self.n_frames, self._points, 4)
-        words = np.ndarray(shape, formats[self._bytes], self._data, self._start, steps)[:, list(columns)]
-        if self._types.is_dec and self._bytes == 4:
-            words = self._floats(words.tobytes()).reshape(words.shape)
-        values = words.astype(float)
+        values = self._decoded(self._words(0, (self._points, 4))[:, list(columns)])
         zeros = np.asarray(~values.any(axis=-1))
         if zeros.any():
             names = ", ".join(self.labels[c] for i, c in enumerate(columns) if zeros[:, i].any())
-            self.notes.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {names}")
+            self.origin.assumed.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {names}")
         missing = (values[..., 3] < 0) | ~np.isfinite(values).all(axis=-1) | zeros
         values[missing] = np.nan
         values *= self._scale
@@ -204,7 +221,7 @@ class C3dFile:
             if there < n:
                 raise ValueError(f"EVENT:{key} holds {there} of {n} events")
         if n < max(len(labels), len(times)):
-            self.notes.append(f"events beyond EVENT:USED ({n}) are deleted ones and not used")
+            self.origin.assumed.append(f"events beyond EVENT:USED ({n}) are deleted ones and not used")
         contexts, subjects = (self.texts(f"EVENT:{key}") for key in ("CONTEXTS", "SUBJECTS"))
         found, ignored = [], []
         rows = itertools.zip_longest(labels[:n], times[:n], contexts[:n], subjects[:n], fillvalue="")
@@ -220,7 +237,9 @@ class C3dFile:
             event = GaitEvent(float(time[0] * 60 + time[1]), sides.pop(), _WORDS[known.group(2)], 1.0)
             found.append((subject, event))
         if ignored:
-            self.notes.append(f"event labels that are not used: {', '.join(map(repr, dict.fromkeys(ignored)))}")
+            self.origin.assumed.append(
+                f"event labels that are not used: {', '.join(map(repr, dict.fromkeys(ignored)))}"
+            )
         return found
 
     def _minutes_seconds(self, piece: Any) -> np.ndarray:

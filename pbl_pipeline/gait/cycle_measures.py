@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -57,6 +58,27 @@ def mostly(names: np.ndarray) -> str:
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
+#: Usual standard deviation between the cycles of a side, in the unit of the measure: what nine of ten recorded people
+#: do not exceed (`python -m research.corpus.spread`; single support as swing, which it is of the other foot). They are
+#: healthy: of times and percentages twice that.
+CYCLE_SPREAD = {
+    "cadence_steps_per_min": 3.8,
+    "stride_time_s": 0.029,
+    "step_time_s": 0.034,
+    "stance_time_s": 0.019,
+    "swing_time_s": 0.021,
+    "stance_percent": 1.2,
+    "swing_percent": 1.2,
+    "single_support_percent": 1.2,
+    "double_support_percent": 1.5,
+    "double_support_time_s": 0.018,
+    "speed_m_per_s": 0.055,
+    "stride_length_m": 0.034,
+    "step_length_m": 0.047,
+}
+#: As many degrees of freedom the usual spread counts for where a person's own is larger: of smaller numbers, three
+#: cycles of a person with twice the usual spread would have a larger error than two, whose spread is not known.
+USUAL_FREEDOM = 6
 #: Measures in the order of metrics.json; the unit is in the name.
 MEASURES = tuple(words.MEASURES)
 #: Measures that need the positions of the feet on the floor.
@@ -76,6 +98,18 @@ CADENCE_PER_MIN = (60.0, 150.0)
 #: Key in `Spatiotemporal.reasons` of the reason why the measures have no spread.
 SPREAD = "spread"
 NO_WIDTH = "one camera does not tell it: on synthetic walkers it comes out up to 4 cm too wide"
+
+
+def sampling_sd(usual: float, n: int, own: float | None = None, freedom: int = 0) -> float:
+    """Return the standard deviation of a mean over n cycles by their spread: the `usual` one, or more if that of the
+    person (`own`, with `freedom` degrees of freedom) is larger.
+
+    The excess counts by its degrees of freedom (as in a posterior mean with a scaled inverse chi-square prior; Gelman
+    et al. 2013, Bayesian Data Analysis, section 2.6). A smaller spread does not count, because by chance a few cycles
+    of anyone are alike: so fewer cycles never have a smaller error, up to a spread that is larger than usual.
+    """
+    excess = 0.0 if own is None else max(own**2 - usual**2, 0.0) * freedom / (USUAL_FREEDOM + freedom)
+    return math.sqrt((usual**2 + excess) / n)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,9 +282,10 @@ def _none_used(cycles: Sequence[GaitCycle]) -> str:
 
 
 def _no_length(name: str, used: Sequence[GaitCycle]) -> str:
-    if name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
+    missing = "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing}))
+    if not missing and name == "step_width_m" and any(c.lengths.stride_length_m is not None for c in used):
         return NO_WIDTH
-    return "; ".join(sorted({c.lengths.missing for c in used if c.lengths.missing})) or "not known"
+    return missing or "not known"
 
 
 def measure_of(values: Sequence[tuple[str, float]], compared: bool = False) -> Measure:

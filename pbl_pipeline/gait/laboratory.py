@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import MIB, read_bytes
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import EMPTY, PASS, WARN, Check
+from pbl_pipeline.qc import EMPTY, PASS
 
-from ._angles import AngleSeries
+from ._angles import AngleSeries, check_ranges
 from .c3d_file import C3dFile
 from .events import (
+    METHODS,
     GaitEvent,
     GaitEvents,
     check_preconditions,
@@ -25,7 +27,7 @@ from .events import (
     load_events,
     no_events,
 )
-from .motion import FootTrajectories, feet_from_markers
+from .motion import FootTrajectories, check_feet, feet_from_markers
 from .normative import PLUG_IN_GAIT, check_degrees
 
 #: Of a recording, unpacked (bytes).
@@ -56,13 +58,14 @@ _damaged = functools.partial(PblError, "FILE_FORMAT", next_step="export the reco
 
 @dataclasses.dataclass(frozen=True)
 class LabTrial:
-    """One recording: `series` of nine angles per side (Plug-in Gait's, degrees), `events`, and `feet` where the markers
-    are there (metres)."""
+    """One recording: `series` of angles per side (degrees), `events`, and `feet` where markers or coordinates place
+    them on the floor (metres). `no_width`: why they do not tell the step width."""
 
     name: str
     series: AngleSeries
     events: GaitEvents
     feet: FootTrajectories | None
+    no_width: str = ""
 
 
 def read_lab_trial(
@@ -74,8 +77,8 @@ def read_lab_trial(
     (`pbl events`), else the recording's labels (`C3dFile.events`), else found from the markers of the legs by
     `method` (`detect_events`). Whatever their source, there are none if the markers show a person who lies or walks
     backwards, or a world whose vertical is not z. A missing sample is NaN (`C3dFile.points`). `person`: whose points
-    (their prefix) and events (their subject) are read, where the file has several persons. The check `c3d_assumptions`
-    lists what was assumed and left out.
+    (their prefix) and events (their subject) are read, where the file has several persons. The check
+    `input_assumptions` lists what was assumed and left out.
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (not a C3D, a point is missing or there twice), ANGLE_UNITS (not
     degrees), GAIT_INPUT (neither labels nor foot markers; markers upside down or mirrored; several persons).
@@ -95,12 +98,17 @@ def read_lab_trial(
         check_degrees(np.concatenate(list(by_name.values())), f"{path.name}, side {letter}")
     feet = _feet(path, points, labels, time, table) if all(m in column for m in _FOOT_MARKERS) else None
     series = AngleSeries(time, angles["L"], angles["R"], PLUG_IN_GAIT)
+    check_ranges(series, path.name)
     name = path.name.removesuffix(".gz").removesuffix(".c3d")
-    events = _events(path, table, feet, events_csv, method)
-    if table.notes:
-        check = Check("c3d_assumptions", WARN, float(len(table.notes)), 0.0, f"{path.name}: {'; '.join(table.notes)}")
-        events = dataclasses.replace(events, qc=(*events.qc, check))
-    return LabTrial(name, series, events, feet)
+    missing = PblError(
+        "GAIT_INPUT",
+        found="neither event labels nor the markers " + ", ".join(_FOOT_MARKERS),
+        expected="labels Foot Strike and Foot Off with their sides, or foot markers",
+        next_step="pass events with --events",
+        key=str(path),
+    )
+    labelled = functools.partial(_labelled, path, table)
+    return LabTrial(name, series, trial_events(path, feet, events_csv, method, missing, table.origin, labelled), feet)
 
 
 def read_lab_feet(path: str | Path, person: str | None = None) -> FootTrajectories:
@@ -124,7 +132,9 @@ def read_lab_feet(path: str | Path, person: str | None = None) -> FootTrajectori
 def _feet(path: Path, points: np.ndarray, labels: list[str], time: np.ndarray, table: C3dFile) -> FootTrajectories:
     there = [*_FOOT_MARKERS, *(m for m in _LEG_MARKERS if m in labels)]
     xyz = points[:, [labels.index(m) for m in there]] * _metres(table, path)
-    return feet_from_markers(time, there, "plug_in_gait", xyz)
+    feet = feet_from_markers(time, there, "plug_in_gait", xyz)
+    check_feet(feet, str(path))
+    return feet
 
 
 @contextmanager
@@ -175,16 +185,30 @@ def _metres(file: C3dFile, path: Path) -> float:
     with _reading(path):
         text = next(iter(file.texts("POINT:UNITS")), "").lower()
     if not text:
-        file.notes.append("no unit of points: mm is assumed")
+        file.origin.assumed.append("no unit of points: mm is assumed")
     factors = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
     if (text or "mm") not in factors:
         raise _format_error(f"points in {text!r}", "mm, cm or m", key=path)
     return factors[text or "mm"]
 
 
-def _events(
-    path: Path, file: C3dFile, feet: FootTrajectories | None, events_csv: str | Path | None, method: Any
+def trial_events(
+    path: Path,
+    feet: FootTrajectories | None,
+    events_csv: str | Path | None,
+    method: Any,
+    missing: PblError,
+    origin: Origin,
+    labelled: Callable[[], tuple[GaitEvent, ...]] = tuple,
 ) -> GaitEvents:
+    """Events of a recording: those of `events_csv`, else its labels, else found from the feet; none if these show a
+    person who lies or walks backwards. Raises `PblError` `missing` if there is none of them. With the check of `origin`
+    (of the data of the file)."""
+    events = _events(path, feet, events_csv, method, missing, origin, labelled)
+    return dataclasses.replace(events, qc=(*events.qc, *origin.checks(path.name)))
+
+
+def _events(path: Path, feet: FootTrajectories | None, events_csv, method, missing, origin, labelled) -> GaitEvents:
     if feet is not None:
         try:
             grid, reason, advice = check_preconditions(feet, 0.0)
@@ -194,25 +218,26 @@ def _events(
             return no_events("none", "", feet.source, reason, advice)
     if events_csv is not None:
         return _given(load_events(events_csv), "given", Path(events_csv).name)
+    if found := labelled():
+        return _given(found, "labels", "labels of the recording")
+    if feet is None:
+        raise missing
+    origin.computed.append(f"events by {METHODS.find(method).name}")
+    return detect_events(feet, method)
+
+
+def _labelled(path: Path, file: C3dFile) -> tuple[GaitEvent, ...]:
     with _reading(path):
         labelled = file.events()
     found = sorted(_of_person(path, file, labelled), key=lambda e: e.time_s)
     frames = [e.time_s * file.rate_hz + 1 - file.first_frame for e in found]
     if outside := sum(not -1 <= frame <= file.n_frames for frame in frames):
-        file.notes.append(f"{outside} of {len(found)} events are outside of the recording, whose frame 1 is at 0 s")
-    if found:
-        return _given(tuple(found), "labels", "labels of the recording")
-    if feet is None:
-        raise PblError(
-            "GAIT_INPUT",
-            found="neither event labels nor the markers " + ", ".join(_FOOT_MARKERS),
-            expected="labels Foot Strike and Foot Off with their sides, or foot markers",
-            next_step="pass events with --events",
-            key=str(path),
+        file.origin.assumed.append(
+            f"{outside} of {len(found)} events are outside of the recording, whose frame 1 is at 0 s"
         )
-    if labelled or file.texts("EVENT:LABELS"):
-        file.notes.append("no event label is used: events are found from the markers")
-    return detect_events(feet, method)
+    if not found and (labelled or file.texts("EVENT:LABELS")):
+        file.origin.assumed.append("no event label is used: events are found from the markers")
+    return tuple(found)
 
 
 def _of_person(path: Path, file: C3dFile, events: list[tuple[str, GaitEvent]]) -> list[GaitEvent]:
@@ -226,7 +251,7 @@ def _of_person(path: Path, file: C3dFile, events: list[tuple[str, GaitEvent]]) -
             raise _several_persons(subjects, "events", path)
         return [event for _, event in events]
     if others := [name for key, name in subjects.items() if key != person]:
-        file.notes.append(f"events of other persons are left out: {', '.join(others)}")
+        file.origin.assumed.append(f"events of other persons are left out: {', '.join(others)}")
     return [event for subject, event in events if _key(subject) in (person, "")]
 
 

@@ -27,17 +27,20 @@ from scipy.special import gammaincc
 
 from pbl_pipeline.shipped import shipped_model
 
-from .cycle_measures import Z90
+from .cycle_measures import CYCLE_SPREAD, Z90, sampling_sd
 from .events import LEFT, RIGHT
 from .normative import NormativeSet
 
 #: Minimal important change of the index: half a standard deviation of healthy people, which is 10 points. A convention
 #: (Norman, Sloan & Wyrwich 2003, Medical Care 41:582-592), not measured with patients.
 IMPORTANT_CHANGE = 5.0
-#: Fraction of the variance of two visits' common errors that does not cancel when the gait has changed: the one of 0,
-#: 0.1 ... with the least logarithmic loss of the two probabilities over pairs of walks of tuning persons
-#: (`research.corpus.measurement`).
-REMAINS = 0.3
+#: Fraction of the variance of two visits' common errors that does not cancel when the gait has changed
+#: (`research.corpus.measurement`). Of the index: the one of 0, 0.1 ... with the least logarithmic loss of the two
+#: probabilities over pairs of walks of tuning persons. Of gait measures: 1 less the products of the errors of two walks
+#: of a person by those of one walk at two visits; 0.02 to 0.07 where the common error is the larger part of a measure.
+REMAINS, MEASURES_REMAIN = 0.3, 0.1
+#: Mean absolute change of the true index between two walks of one tuning person (`research.corpus.measurement`).
+USUAL_CHANGE = 11.0
 
 
 class Chances(NamedTuple):
@@ -48,8 +51,8 @@ class Chances(NamedTuple):
     important: float | None
 
 
-def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float]) -> float:
-    """Return the standard deviation of a true change about the measured one, between two visits filmed alike.
+def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float], remains: float = REMAINS) -> float:
+    """Return the standard deviation of the error of a change between two visits filmed alike.
 
     Parameters
     ----------
@@ -57,16 +60,34 @@ def change_sd(minimal_changes: tuple[float, float], sds: tuple[float, float]) ->
         Minimal detectable change (90 %) of each visit, from its new error.
     sds
         Standard deviation of the whole error of each.
+    remains
+        `REMAINS` or `MEASURES_REMAIN`.
     """
     anew = sum(c**2 for c in minimal_changes) / (2.0 * Z90**2)
     whole = sum(s**2 for s in sds)
-    return math.sqrt(anew + REMAINS * max(whole - anew, 0.0))
+    return math.sqrt(anew + remains * max(whole - anew, 0.0))
 
 
 def chances(by: float, sd: float, important: float | None = None) -> Chances:
-    """Return the probabilities of a true change, normal about the measured one `by` with standard deviation `sd`."""
-    beyond = [0.5 * math.erfc((limit - abs(by)) / (math.sqrt(2.0) * sd)) for limit in (0.0, important or 0.0)]
-    return Chances(beyond[0], None if important is None else beyond[1])
+    """Return the probabilities of a true change, from the measured one `by` whose error is normal with standard
+    deviation `sd`.
+
+    A change of the index, which has an `important` one, is a priori double exponential with the mean absolute value
+    `USUAL_CHANGE`; the posterior is the two normal tails of Bayes' theorem. One of a measure is a priori uniform.
+    """
+    size, least = abs(by), important or 0.0
+    rate = 0.0 if important is None else 1.0 / USUAL_CHANGE
+
+    def beyond(limit: float) -> float:
+        return math.exp(-rate * size) * _tail((limit - size) / sd + rate * sd)
+
+    real = beyond(0.0)
+    whole = real + math.exp(rate * size) * _tail(size / sd + rate * sd)
+    return Chances(real / whole, None if important is None else beyond(least) / whole)
+
+
+def _tail(z: float) -> float:
+    return 0.5 * math.erfc(z / math.sqrt(2.0))
 
 
 #: Draws of the scores for an expected index, and of two visits' errors for the index's own error.
@@ -113,7 +134,7 @@ class View:
 
 class MeasureError(NamedTuple):
     """Root mean squares, in its unit, of the parts of a gait measure's error: `lasting` at all visits of a person
-    (with the bias), `visit` in all passes of one visit, `anew` in each pass."""
+    (with the bias), `visit` the same in all passes of one visit, `anew` drawn in each pass."""
 
     lasting: float
     visit: float
@@ -246,9 +267,8 @@ def unshrunk_index(model: MeasurementModel, passes: Sequence[Pass], norm: Normat
         return (_index(scores, norm) + 5.0 / norm.ln_sd * np.clip(longer, 0.0, MOST_LONGER)).mean(axis=-1)
 
     likely = estimate(model, passes)
-    true, new = (np.random.default_rng(i).standard_normal((N_DRAWS, len(model.mean))) for i in (2, 3))
-    true = likely.mean + true @ _root(likely.covariance).T
-    errors = index(true + new @ _root(covariance).T) - _index(true, norm).mean(axis=-1)
+    true = likely.mean + _drawn(likely.covariance, N_DRAWS, 2)
+    errors = index(true + _drawn(covariance, N_DRAWS, 3)) - _index(true, norm).mean(axis=-1)
     found = index((model.mean + covariance @ (weighed.T @ off))[None])
     return float(found[0]), model.widening * float(errors.std())
 
@@ -290,12 +310,8 @@ def _apart(model: MeasurementModel, passes: Sequence[Pass]) -> list[tuple[float,
 def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1.0) -> ExpectedIndex:
     """Return the index of scores with an error: its expectation, not the index of the expected scores, because an
     error in any direction lengthens a short distance from the norm."""
-    # The same draws at each call, and each with its opposite: an index changes only with its scores.
-    half = np.random.default_rng(0).standard_normal((N_DRAWS // 2, len(posterior.mean)))
-    spread = np.concatenate([half, -half]) @ _root(posterior.covariance).T
+    spread, visits = _drawn(posterior.covariance, N_DRAWS, 0), _drawn(posterior.anew, N_VISITS, 1)
     sides = _index(posterior.mean + spread, norm)
-    visits = np.random.default_rng(1).standard_normal((N_VISITS // 2, len(posterior.mean)))
-    visits = np.concatenate([visits, -visits]) @ _root(posterior.anew).T
     anew = _index(posterior.mean + visits[:, None] + spread[None, ::4], norm).mean(axis=(1, 2))
     left, right = sides.mean(axis=0)
     return ExpectedIndex(
@@ -307,20 +323,22 @@ def expected_index(posterior: Posterior, norm: NormativeSet, widening: float = 1
     )
 
 
-def measure_error(model: MeasurementModel, name: str, cycles: Mapping[str, int]) -> tuple[float, float] | None:
-    """Return the standard deviation of the error of a gait measure, and of the part that is new at another visit, both
-    in its unit; None if it was not measured in a view.
+def measure_error(
+    model: MeasurementModel, name: str, n: int, own: float | None = None, freedom: int = 0
+) -> tuple[float, float] | None:
+    """Return the standard deviation of the error of a gait measure that is the mean over n cycles of a visit, and of
+    the part that is new at another visit, both in its unit; None if it was not measured in all views.
 
-    cycles: number of used cycles of both sides by the leg behind the other. The lasting part is the same in all views.
+    Views count alike, so that neither gets smaller when cycles or passes are left out. `own` is the spread of the
+    cycles within a side, with `freedom` degrees of freedom: a larger one than is usual counts by `sampling_sd`.
     """
-    total, lasting, anew = sum(cycles.values()), 0.0, 0.0
-    for far_leg, n in cycles.items():
-        error = model.measures[LEFT if far_leg else ""].get(name)
-        if error is None:
-            return None
-        lasting += n / total * error.lasting
-        anew += (n / total) ** 2 * (error.visit**2 + error.anew**2 * model.pass_cycles / n)
-    return float(np.sqrt(lasting**2 + anew)), float(np.sqrt(anew))
+    errors = [of_view[name] for of_view in model.measures.values() if name in of_view]
+    if len(errors) < len(model.measures):
+        return None
+    lasting, visit, anew = np.sqrt(np.mean(np.square(errors), axis=0))
+    usual = float(np.hypot(CYCLE_SPREAD.get(name, 0.0), anew * np.sqrt(model.pass_cycles)))
+    new = math.hypot(visit, sampling_sd(usual, n, own, freedom))
+    return math.hypot(lasting, new), new
 
 
 def with_one_more(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> dict[str, float]:
@@ -348,6 +366,14 @@ def _doubted(seen: Pass) -> np.ndarray:
 
 def _index(scores: np.ndarray, norm: NormativeSet) -> np.ndarray:
     return norm.index_of_scores(scores.reshape(*scores.shape[:-1], 2, -1))
+
+
+def _drawn(covariance: np.ndarray, n: int, seed: int) -> np.ndarray:
+    """Normal draws (n, 2K) of this covariance, the same at each call and each with its opposite and its mirror image:
+    an index changes only with its scores, and mirrored scores have the mirrored index."""
+    own = np.random.default_rng(seed).standard_normal((n // 4, len(covariance)))
+    both = np.concatenate([own, np.roll(own, len(covariance) // 2, axis=1)])
+    return np.concatenate([both, -both]) @ _root(covariance).T
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

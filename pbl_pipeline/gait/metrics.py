@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
 
-from ._cycles import find_cycles, refused_cadence, with_cadence_accepted
+from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
     GDI_MODEL,
@@ -278,15 +277,13 @@ def with_errors(measures: Spatiotemporal, cycles: Sequence[GaitCycle], events: P
     if len(names) != 1 or "" in names or (model := load_model(names.pop())).events != events.hash:
         return measures
     metric = any(c.lengths.metric for c in used)
-    views = Counter(c.far_leg for c in used)
     found = dict(measures.measures)
     for name, m in found.items():
-        error = measure_error(model, name, views)
+        # One mean of each side is known, so n - 2 degrees of freedom.
+        error = None if m is None else measure_error(model, name, m.n, m.variability, m.n - 2)
         if m is None or error is None or (metric and name in LENGTHS):
             continue
-        chance = 0.0 if m.variability is None else m.variability / math.sqrt(m.n)
-        sd, anew = (math.hypot(e, chance) for e in error)
-        found[name] = dataclasses.replace(m, error_sd=sd, minimal_change=minimal_change_of(anew))
+        found[name] = dataclasses.replace(m, error_sd=error[0], minimal_change=minimal_change_of(error[1]))
     return dataclasses.replace(measures, measures=found)
 
 
@@ -301,7 +298,9 @@ def _trial(
     task: tuple[dict[str, Any], dict[str, str]] = {}, {}
     if isinstance(trial, LabTrial):
         events = trial.events
-        cycles = find_cycles(events, trial=trial.name, series=trial.series, feet=trial.feet, keep_ends=True)
+        about = {"trial": trial.name, "series": trial.series, "feet": trial.feet, "no_width": trial.no_width}
+        cycles = find_cycles(events, **about, keep_ends=True)
+        check_sides(cycles, trial.name)
     else:
         poses, events = _events(trial, event_method)
         cycles = find_cycles(events, trial, poses=poses, fit_checks=fit_checks)
@@ -348,13 +347,7 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
     few = "few cycles: film a longer stretch, or several passes"
     checks = [warn_if(n < 4, "cycles_used", float(n), 4.0, few), lengths, curves]
     if any(c.used for c in cycles):
-        far = far_leg_of(cycles)
-        near = "left" if far == "right" else "right"
-        advice = (
-            f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
-            "not to be compared. Film a pass in each direction"
-        )
-        checks.append(warn_if(far, "legs_seen_alike", None, None, advice))
+        checks.append(legs_check(cycles))
     checks += cadence
     if measures["stride_length_m"] is not None:
         guessed = any(c.used and c.lengths.stride_length_m is not None and not c.lengths.metric for c in cycles)
@@ -364,6 +357,17 @@ def cycle_checks(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple
         )
         checks.append(warn_if(guessed, "lengths_scale", None, None, advice))
     return tuple(checks)
+
+
+def legs_check(cycles: Sequence[GaitCycle]) -> Check:
+    """Check that one camera saw both legs alike in the used cycles: else left and right are not compared."""
+    far = far_leg_of(cycles)
+    near = "left" if far == "right" else "right"
+    advice = (
+        f"the {far} leg was behind the {near} one: its curves and measures are less certain, and the sides are "
+        "not to be compared. Film a pass in each direction"
+    )
+    return warn_if(far, "legs_seen_alike", None, None, advice)
 
 
 def _cadence_check(measures: Spatiotemporal, cycles: Sequence[GaitCycle]) -> tuple[Check, ...]:

@@ -198,8 +198,8 @@ class GaitCycle:
     longer or shorter than the others and not one stride (`odd_length`) or whose curves are far from the others'
     (`odd_curves`), and for all of a recording of which a check failed; `exclusion` has the reason, `excluded` in words.
     `curves` maps names of `ANGLE_NAMES` to (51,) degrees at 0, 2, ..., 100 % of the cycle; empty without a fit or if
-    frames are missing (`curves_missing`: the reason); `curves_sd` maps them to their standard deviation (deg), if it is
-    known. `angle_model`: the definition of the angles.
+    frames are missing (`curves_missing`: the reason, also for absent angles); `curves_sd` maps them to their standard
+    deviation (deg), if it is known. `angle_model`: the definition of the angles.
     `lengths` are those on the floor, None with the reason if they are not known. `far_leg`: "left" or "right" if one
     camera saw that leg behind the other, else empty. `error_model`: the measured model of the error of such curves
     (`measurement.model_names`), empty if there is none.

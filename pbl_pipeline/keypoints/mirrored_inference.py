@@ -1,7 +1,7 @@
 """Inference of a picture and of its mirror image, combined into one result.
 
 The errors of the two are partly independent, and if one prefers one side of the body the mirrored one prefers the
-other: their mean is better than either (docs/benchmarks.md). Half their difference changes slowly, so frames that
+other: their mean is better than either (research/reports). Half their difference changes slowly, so frames that
 follow each other closely can share the two inferences: one is seen as it is, the next mirrored, and half the difference
 is taken from the frames around. That takes one inference per frame instead of two.
 """

@@ -181,7 +181,7 @@ class Keypoints:
         distortion, source = data.get("distortion", np.zeros(5)), _NO_SOURCE
         if "camera_source" in data:
             source = text_of(path, data, "camera_source")
-        box_px = data["box_px"] if "box_px" in data else _box(data["xy_px"], data["confidence"])
+        box_px = data["box_px"] if "box_px" in data else box_of_points(data["xy_px"], data["confidence"])
         return cls(
             time_s=data["time_s"].astype(np.float64),
             names=texts_of(path, data, "names"),
@@ -205,7 +205,7 @@ class Keypoints:
         )
 
 
-def _box(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+def box_of_points(xy_px: np.ndarray, confidence: np.ndarray) -> np.ndarray:
     """(T, 4) x0, y0, x1, y1 around the points seen in each frame, NaN without any."""
     seen = (confidence > 0)[..., None] & np.isfinite(xy_px)
     low, high = (np.where(seen, xy_px, fill).astype(float) for fill in (np.inf, -np.inf))

@@ -14,10 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import MAX_SECONDS, MAX_TEXT, count_rows, read_bytes, span_s
 from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.files import check_numbers, load_npz, text_of, texts_of
 from pbl_pipeline.names import is_plain
+from pbl_pipeline.sampling import interval_of
 
 _SPELLED = ("er", "ers", "re", "res")
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -43,10 +45,11 @@ class Trc:
     time_s: np.ndarray  # (T,)
     names: tuple[str, ...]  # J
     xyz_m: np.ndarray  # (T, J, 3) in the file's axes, NaN where a cell is empty or a marker's three numbers are 0
+    origin: Origin
 
 
-def read_trc(path: str | Path) -> Trc:
-    """Read a TRC file.
+def read_trc(path: str | Path, pixels: bool = False) -> Trc:
+    """Read a TRC file; `pixels`: its numbers are taken as they are, whatever unit its header states.
 
     Raises `PblError` FILE_MISSING: no such file. FILE_FORMAT: not a TRC, other numbers of frames or markers than in its
     header, a row with too few or too many cells, a cell that is not a finite number, times that do not increase or
@@ -63,7 +66,7 @@ def read_trc(path: str | Path) -> Trc:
     if len(lines) < _HEADER_LINES or not lines[0].startswith("PathFileType"):
         raise _damaged("no header of a TRC file", "five lines, the first beginning with PathFileType", key=path)
     header = dict(zip(_cells(lines[1]), _cells(lines[2]), strict=False))
-    scale = _METRES.get(header.get("Units", "").lower())
+    scale = 1.0 if pixels else _METRES.get(header.get("Units", "").lower())
     if scale is None:
         raise _damaged(f"Units {header.get('Units', '')!r}", "mm, cm or m", key=path)
     names = tuple(n for n in _cells(lines[3])[2:] if n)
@@ -78,10 +81,15 @@ def read_trc(path: str | Path) -> Trc:
     time_s, xyz = table[:, 1], scale * table[:, 2:].reshape(len(rows), len(names), 3)
     if not np.isfinite(time_s).all() or np.any(np.diff(time_s) <= 0):
         raise _damaged("times that are missing, repeat or run backwards", "strictly increasing seconds", key=path)
-    xyz[np.all(xyz == 0, axis=2)] = np.nan
-    _check_unit(path, xyz, header["Units"])
+    zeros, origin = np.all(xyz == 0, axis=2), Origin([] if pixels else [f"unit {header['Units']}"])
+    if zeros.any():
+        found = ", ".join(name for name, lost in zip(names, zeros.any(axis=0), strict=True) if lost)
+        origin.assumed.append(f"points of three zeros count as missing ({int(zeros.sum())} samples): {found}")
+    xyz[zeros] = np.nan
+    if not pixels:
+        _check_unit(path, xyz, header["Units"])
     _check_rate(path, time_s, header.get("DataRate", ""))
-    return Trc(time_s, names, xyz)
+    return Trc(time_s, names, xyz, origin)
 
 
 def _cells(line: str) -> list[str]:
@@ -116,9 +124,9 @@ def _check_unit(path: str | Path, xyz_m: np.ndarray, unit: str) -> None:
         return
     size = float(np.median(np.max(np.nanmax(whole, axis=1) - np.nanmin(whole, axis=1), axis=1)))
     if not _NARROWEST_M < size < _WIDEST_M:
-        raise _damaged(
-            f"markers that lie {size:.3g} m apart if Units {unit} is right", "the unit the numbers are in", key=path
-        )
+        flat = "" if np.nanmax(np.abs(xyz_m[..., 2])) else "; of pixels, _px in the file's name, as Sports2D writes it"
+        expected = f"the unit the numbers are in{flat}"
+        raise _damaged(f"markers that lie {size:.3g} m apart if Units {unit} is right", expected, key=path)
 
 
 def _check_rate(path: str | Path, time_s: np.ndarray, stated: str) -> None:
@@ -128,8 +136,8 @@ def _check_rate(path: str | Path, time_s: np.ndarray, stated: str) -> None:
         return
     if len(time_s) < 2 or not np.isfinite(rate) or rate <= 0:
         return
-    step = (time_s[-1] - time_s[0]) / (len(time_s) - 1)
-    ratio = rate * min(step, float(np.median(np.diff(time_s))), key=lambda s: abs(rate * s - 1))
+    step = interval_of(time_s)
+    ratio = rate * step
     if abs(ratio - 1) > _SAME_RATE:
         guess = {1000: ": milliseconds", round(rate): ": frame numbers"}.get(round(ratio), "")
         raise _damaged(
@@ -155,6 +163,7 @@ class WorldMarkers:
     marker_set: str  # name of the marker set; for a laboratory's own, the stem of its table
     xyz_world_m: np.ndarray  # (T, J, 3) world: right-handed, z up, metres; origin and heading are the laboratory's
     confidence: np.ndarray  # (T, J) 0..1
+    origin: Origin = dataclasses.field(default_factory=Origin, compare=False)  # of a file's data; not saved
 
     def __post_init__(self) -> None:
         for field in ("time_s", "xyz_world_m", "confidence"):
@@ -235,9 +244,8 @@ class WorldMarkers:
         if up == "y":
             xyz = np.stack([xyz[..., 0], -xyz[..., 2], xyz[..., 1]], axis=-1)
         seen = np.asarray(np.isfinite(xyz).all(axis=2))
-        return _about(
-            path, trc.time_s, trc.names, marker_set, np.where(seen[..., None], xyz, np.nan), seen.astype(float)
-        )
+        xyz, confidence = np.where(seen[..., None], xyz, np.nan), seen.astype(float)
+        return _about(path, trc.time_s, trc.names, marker_set, xyz, confidence, trc.origin)
 
     def select(self, names: Sequence[str], marker_set: str | None = None) -> WorldMarkers:
         """Return the markers of `names` in that order; those that the trial lacks were never seen.
@@ -258,7 +266,7 @@ class WorldMarkers:
         confidence = np.zeros(xyz.shape[:2])
         source = [column[names[i]] for i in there]
         xyz[:, there], confidence[:, there] = self.xyz_world_m[:, source], self.confidence[:, source]
-        return WorldMarkers(self.time_s, tuple(names), marker_set or self.marker_set, xyz, confidence)
+        return WorldMarkers(self.time_s, tuple(names), marker_set or self.marker_set, xyz, confidence, self.origin)
 
 
 def _about(path: str | Path, *values) -> WorldMarkers:

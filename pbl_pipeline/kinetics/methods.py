@@ -9,4 +9,4 @@ from .types import KineticsParams
 
 #: The function takes fits, their gait and the `Method`, and returns `Kinetics` (`visit_kinetics`).
 METHODS: Stage[KineticsParams] = Stage("kinetics", "family", "newton-euler")
-METHODS.register("newton-euler", 4, KineticsParams(), visit_kinetics)
+METHODS.register("newton-euler", 5, KineticsParams(), visit_kinetics)

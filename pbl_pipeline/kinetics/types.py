@@ -58,10 +58,11 @@ class Walk(Protocol):
 class KineticMeasure:
     """Means over the used cycles of each side and over both sides, with their standard deviations (None: not known).
 
-    The error is that of the fit, by sampling, that of the method, by force plates, and of one camera what its fit loses
-    in any walk, by synthetic walkers; `interval` is the 90 % interval of `mean`. `asymmetry_percent` is 100 (right -
-    left) / ((right + left) / 2), None for what is not a measure of one leg and where its standard deviation is more
-    than `compute.MAX_ASYMMETRY_SD`.
+    The error is that of the fit, by sampling, that of the method, by force plates, of one camera what its fit loses in
+    any walk, by known walks, and the spread of the cycles; `interval` is the 90 % interval of `mean`.
+    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for what is not a measure of one leg, where
+    one camera saw the same leg behind the other, and where its standard deviation is more than
+    `compute.MAX_ASYMMETRY_SD`.
     """
 
     left: float | None

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import CapsuleShapes, body_frames, capsule_shapes, capsules, load_body
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.fit.checks import SD_WARN_DEG
+from pbl_pipeline.fit.results import SD_WARN_DEG
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.render.drawing import side_of
 from pbl_pipeline.render.overlay import check_body

@@ -264,7 +264,7 @@ class Strip:
 
     def _draw_knees(self, fit: TrialFit, time: np.ndarray) -> None:
         top, bottom = self._plot
-        angles = joint_angles(fit.joint_names, fit.qpos)
+        angles = joint_angles(fit.joint_names, fit.observed_qpos)
         curves = {s: angles[f"knee_flexion_{s[0]}"] for s in ("left", "right") if f"knee_flexion_{s[0]}" in angles}
         seen = np.concatenate([c[np.isfinite(c)] for c in curves.values()] or [np.zeros(0)])
         high = max(70.0, float(seen.max(initial=0.0)))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,32 +71,28 @@ def load_camera_poses(path: str | Path) -> dict[str, CameraPose]:
     `translation`, or values that are not three finite numbers.
     """
     path = Path(path)
-    try:
-        content = read_toml(path)
-    except OSError as error:
-        raise _invalid_pose(f"the file cannot be read ({error.strerror})", "a TOML calibration", key=path) from error
-    except ValueError as error:
-        raise _invalid_pose(f"the text cannot be parsed ({error})", "a TOML calibration", key=path) from error
-    cameras = {name: table for name, table in content.items() if isinstance(table, dict) and "matrix" in table}
+    cameras = _cameras(_content(path, read_toml, "a TOML calibration", _invalid_pose))
     if not cameras:
         raise _invalid_pose("no table with a camera matrix", "a table for each camera", key=path)
-    return {name: _pose(path, name, table) for name, table in cameras.items()}
+    poses = {}
+    for name, table in cameras.items():
+        about = f"{path} [{name}]"
+        R_cn = Rotation.from_rotvec(_array(about, table, "rotation", (3,), _invalid_pose)).as_matrix()
+        poses[name] = CameraPose(R_cn.T, -R_cn.T @ _array(about, table, "translation", (3,), _invalid_pose))
+    return poses
 
 
-def _pose(path: Path, name: str, table: Mapping[str, Any]) -> CameraPose:
-    vectors = []
-    for field in ("rotation", "translation"):
-        try:
-            vector = np.asarray(table[field], np.float64)
-        except (KeyError, TypeError, ValueError, OverflowError):
-            vector = np.full(3, np.nan)
-        if vector.shape != (3,) or not np.isfinite(vector).all():
-            raise _invalid_pose(
-                f"[{name}] {field} = {table.get(field)!r}"[:200], f"{field}: 3 finite numbers", key=path
-            )
-        vectors.append(vector)
-    R_cn = Rotation.from_rotvec(vectors[0]).as_matrix()
-    return CameraPose(R_cn.T, -R_cn.T @ vectors[1])
+def _content(path: Path, read: Callable[[Path], Any], expected: str, invalid: Callable[..., PblError]) -> Any:
+    try:
+        return read(path)
+    except OSError as error:
+        raise invalid(f"the file cannot be read ({error.strerror})", expected, key=path) from error
+    except ValueError as error:
+        raise invalid(f"the text cannot be parsed ({error})", expected, key=path) from error
+
+
+def _cameras(content: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    return {name: table for name, table in content.items() if isinstance(table, dict) and "matrix" in table}
 
 
 #: Focal length over the longer side of the picture: median, least and most of the 78 iPhone calibrations (38 models,
@@ -166,12 +162,8 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
     width, height = _array(path, fields, "size", (2,)).tolist()
     if fields.get("fisheye"):
         raise _invalid("a fisheye model", "a pinhole camera with k1 k2 p1 p2 k3 distortion", key=path)
-    if min(width, height) <= 0 or not (0 <= matrix[0, 2] <= width and 0 <= matrix[1, 2] <= height):
-        raise _invalid(
-            f"principal point ({matrix[0, 2]:g}, {matrix[1, 2]:g}) of a {width:g}x{height:g} px picture",
-            "a principal point inside the picture",
-            key=path,
-        )
+    if min(width, height) <= 0:
+        raise _invalid(f"a picture of {width:g}x{height:g} px", "width and height above 0", key=path)
     distortion = np.concatenate([distortion, np.zeros(5 - len(distortion))])
     check_lens(matrix, distortion, (width, height), path)
     rel_sd, spread = math.nan, ""
@@ -186,19 +178,15 @@ def load_camera(path: str | Path, image_size_px: tuple[int, int], name: str | No
 
 def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
     """The label of the camera and its fields under the names matrix, distortion, size, fisheye."""
-    try:
-        content = read_toml(path) if path.suffix.lower() == ".toml" else read_json(path)
-    except OSError as error:
-        raise _invalid(f"the file cannot be read ({error.strerror})", "a calibration file", key=path) from error
-    except ValueError as error:
-        raise _invalid(f"the text cannot be parsed ({error})", "a TOML or JSON calibration", key=path) from error
+    read = read_toml if path.suffix.lower() == ".toml" else read_json
+    content = _content(path, read, "a TOML or JSON calibration", _invalid)
     if not isinstance(content, dict):
         raise _invalid("no named fields", "a table of fields", key=path)
-    if path.suffix.lower() != ".toml":
+    if read is read_json:
         names = {"camera_matrix": "matrix", "distortion": "distortion", "image_size_px": "size", "fisheye": "fisheye"}
         names["focal_sd_px"] = "focal_sd"
         return path.name, {new: content[old] for old, new in names.items() if old in content}
-    cameras = {key: value for key, value in content.items() if isinstance(value, dict) and "matrix" in value}
+    cameras = _cameras(content)
     if name is None and len(cameras) != 1:
         found = f"{len(cameras)} cameras" + (f" ({', '.join(cameras)})" if cameras else "")
         raise _invalid(found, "one camera, or the name of one of them", key=path)
@@ -210,16 +198,22 @@ def _read(path: Path, name: str | None) -> tuple[str, Mapping[str, Any]]:
     return f"{path.name} [{key}]", camera | fields
 
 
-def _array(path: Path, fields: Mapping[str, Any], name: str, lengths: tuple[int, ...]) -> np.ndarray:
+def _array(
+    key: object,
+    fields: Mapping[str, Any],
+    name: str,
+    lengths: tuple[int, ...],
+    invalid: Callable[..., PblError] = _invalid,
+) -> np.ndarray:
     expected = f"{name}: {' or '.join(map(str, lengths))} finite numbers"
     if name not in fields:
-        raise _invalid(f"no field {name}", expected, key=path)
+        raise invalid(f"no field {name}", expected, key=key)
     try:
         value = np.asarray(fields[name], dtype=np.float64).ravel()
     except (TypeError, ValueError, OverflowError):
         value = np.array([])
     if len(value) not in lengths or not np.isfinite(value).all():
-        raise _invalid(f"{name} = {repr(fields[name])[:200]}", expected, key=path)
+        raise invalid(f"{name} = {repr(fields[name])[:200]}", expected, key=key)
     return value
 
 

@@ -2,7 +2,7 @@
 
 MP4, MOV and MKV store a length before each unit, and no coded slice contains three zero bytes in a row (ITU-T H.264,
 7.4.1; H.265, 7.4.2). Zeros where a part of a file is missing always break one of these rules, other bytes often.
-FFmpeg and the decoder of a GPU draw most such pictures without an error. Figures: docs/benchmarks.md, On a GPU.
+FFmpeg and the decoder of a GPU draw most such pictures without an error. Figures: research/reports.
 """
 
 from __future__ import annotations

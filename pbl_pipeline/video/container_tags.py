@@ -12,6 +12,7 @@ whose writer never knew the length (a live WebM, MPEG-TS) cannot be checked.
 from __future__ import annotations
 
 import dataclasses
+import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -178,18 +179,10 @@ def _moov(path: Path) -> memoryview:
 
 def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
     """Names and contents of the boxes in `data`; ends at an impossible length."""
-    at = 0
-    while at + 8 <= len(data):
-        length, name = struct.unpack_from(">I4s", data, at)
-        head = 8
-        if length == 1 and at + 16 <= len(data):
-            (length,), head = struct.unpack_from(">Q", data, at + 8), 16
-        elif length == 0:
-            length = len(data) - at
-        if length < head or at + length > len(data):
+    for name, at, length, head in top_boxes(io.BytesIO(data), len(data)):
+        if at + length > len(data):
             return
         yield name, data[at + head : at + length]
-        at += length
 
 
 def _find(data: memoryview, *names: bytes) -> memoryview:

@@ -29,8 +29,11 @@ from .container_tags import family, missing_end, photo_format
 _CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv,ogg,mxf,ivf,h264,hevc"
 #: FFmpeg's names of the containers whose length counts from 0, wherever the first stamp is: fragments of MP4, Matroska.
 _FROM_ZERO = ("mov", "matroska")
-#: Errors that reading a file can raise. Memory: a header with wrong sizes asks for more than there is.
+#: Errors that reading a file can raise. Memory: a header with wrong sizes asks for more than there is, or this machine
+#: has too little (`check_memory`).
 FFMPEG_ERRORS = (FFmpegError, MemoryError)
+#: Memory that every video that is read here can be decoded in (bytes).
+_ENOUGH = 1 << 30
 #: Largest decoded picture (bytes): 4K in 10 bits, 5.3K in 8. A decoder keeps up to 16 reference pictures, and one for
 #: each thread; 16 of 5.3K with 5 threads take 760 MiB.
 _MAX_PICTURE, _MAX_IN_THREADS = 26 << 20, 128 << 20
@@ -138,7 +141,8 @@ class Decoder:
                 continue
             try:
                 frames = self.stream.decode(packet)
-            except FFMPEG_ERRORS:
+            except FFMPEG_ERRORS as error:
+                check_memory(error, self.path)
                 # Before the first picture this is a recording whose start an editor cut off: nothing is lost.
                 if self.n_frames:
                     self._n_damaged += 1
@@ -160,6 +164,7 @@ class Decoder:
             try:
                 packet = next(packets, None)
             except FFMPEG_ERRORS as error:
+                check_memory(error, self.path)
                 self._demux_error = _words(error)
                 packet = None
             if packet is None:
@@ -272,6 +277,7 @@ class Decoder:
             try:
                 n_stored = _count_packets(self.path, self.stream.index)
             except FFMPEG_ERRORS as error:
+                check_memory(error, self.path)
                 return f"the container announces {self.n_announced} frames and cannot be read for them: {_words(error)}"
             if n_stored < self.n_announced:
                 return f"the container announces {self.n_announced} frames and holds {n_stored}"
@@ -359,6 +365,22 @@ def _words(error: BaseException) -> str:
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 
+def check_memory(error: BaseException, path: Path) -> None:
+    """Raise `PblError` MACHINE_SHORT for an error of memory on a machine, or in a process, that has too little: it says
+    nothing about the file."""
+    if isinstance(error, MemoryError):
+        try:
+            bytearray(_ENOUGH)
+        except MemoryError:
+            raise PblError(
+                "MACHINE_SHORT",
+                found="no memory left to decode the video",
+                expected=f"{_ENOUGH / 2**30:g} GiB for this process",
+                next_step="try again; if it stays so, give the machine more memory, or fewer processes",
+                key=path,
+            ) from error
+
+
 def _open(path: Path) -> InputContainer:
     photo = photo_format(path)
     if photo is not None:
@@ -372,6 +394,7 @@ def _open(path: Path) -> InputContainer:
     try:
         return av.open(str(path), options=_OPTIONS, **_TEXTS)
     except FFMPEG_ERRORS as error:
+        check_memory(error, path)
         lost = missing_end(path) if family(path) else None
         if lost is None:
             raise PblError(

@@ -139,15 +139,14 @@ def _read_csv(path: Path, text: str) -> PhoneLog:
 
 
 def _read_json(path: Path, text: str) -> PhoneLog:
+    expected = "an object with " + ", ".join(_COLUMNS)
     try:
         content = bounded.parse_json(text)
     except ValueError as error:
-        raise log_error(f"not JSON ({error})", "an object with " + ", ".join(_COLUMNS), key=path) from error
-    if not isinstance(content, dict):
-        raise log_error("JSON that is not an object", "an object with " + ", ".join(_COLUMNS), key=path)
-    orientation = content.get("orientation", content)
+        raise log_error(f"not JSON ({error})", expected, key=path) from error
+    orientation = content.get("orientation", content) if isinstance(content, dict) else None
     if not isinstance(orientation, dict):
-        raise log_error("an orientation that is not an object", "an object with " + ", ".join(_COLUMNS), key=path)
+        raise log_error("JSON or an orientation that is not an object", expected, key=path)
     _check_names(path, list(orientation))
     columns = _lists(path, orientation, _COLUMNS)
     sensors = {}

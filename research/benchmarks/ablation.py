@@ -8,10 +8,10 @@ Every row has the same people, walks and random numbers as the default where it 
 rate), so rows are compared person by person. Errors are of the first trial of a session. The table is sorted by what
 costs most; `+-` is the standard error of the change over people.
 
-Columns: `all` and `main`: mean over joints of the median absolute error over frames, as in docs/benchmarks.md;
+Columns: `all` and `main`: mean over joints of the median absolute error over frames, as in research/reports;
 `bias`: mean over joints of the size of the mean error of a trial; `sd`: of the remainder; `bias share`: of
 the mean square error; `RTE`: mean distance of the pelvis to its true path after rotation about the vertical and shift;
-`in 90 %`: share of the samples within 1.645 standard deviations of the fit. docs/ablation.md says what was found.
+`in 90 %`: share of the samples within 1.645 standard deviations of the fit. `research/reports` says what was found.
 """
 
 from __future__ import annotations

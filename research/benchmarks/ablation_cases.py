@@ -1,6 +1,6 @@
 """Factors of the ablation, changed one at a time, and its walks.
 
-A `Setup` says how a session is observed and fitted; `Setup()` is the benchmark's default (docs/benchmarks.md). A
+A `Setup` says how a session is observed and fitted; `Setup()` is the benchmark's default (research/reports). A
 `Factor` is a setup that differs from it in one thing.
 """
 

@@ -1,4 +1,4 @@
-"""The session fit of both solvers, of a standing and a held phone, and of long walks: tables of docs/benchmarks.md.
+"""The session fit of both solvers, of a standing and a held phone, and of long walks: tables of research/reports.
 
     python -m research.benchmarks.fit --quick                # about a minute on two cores; few steps of implicit-adam
     python -m research.benchmarks.fit --json fit.json        # with the paper's 25,000 steps: hours on a CPU, use a GPU

@@ -1,4 +1,4 @@
-"""Sessions a second of the fit, in one process or in several that share a GPU: figures of docs/benchmarks.md.
+"""Sessions a second of the fit, in one process or in several that share a GPU: figures of research/reports.
 
     python -m research.benchmarks.fit_processes
     python -m research.benchmarks.fit_processes --method blazepose --points blazepose_33 --processes 1,2,3

@@ -17,12 +17,9 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
-import io
 import sys
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import click
@@ -33,6 +30,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS as FIT_METHODS
 from pbl_pipeline.fit import TrialFit, fit_session
 from pbl_pipeline.gait import find_cycles
+from pbl_pipeline.gait.c3d_file import C3dFile
 from pbl_pipeline.gait.events import SIDES, GaitEvent
 from pbl_pipeline.gait.laboratory import read_lab_trial
 from pbl_pipeline.keypoints import WorldMarkers
@@ -80,9 +78,6 @@ BARS: dict[str, float | None] = {
 }
 
 
-_PARAMETERS = ("PROCESSING:BODYMASS", "FORCE_PLATFORM:CORNERS", "FORCE_PLATFORM:ORIGIN")
-
-
 @dataclasses.dataclass(frozen=True)
 class Plate:
     """A plate at the times of the markers: force (T, 3) N/kg and moment about the world's origin (T, 3) Nm/kg."""
@@ -123,29 +118,15 @@ class Step:
 
 def read_walk(path: Path) -> Walk:
     """Return a walk. Raises `PblError` FILE_FORMAT where the plates' forces are not those of the person's weight."""
-    import c3d
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        reader = c3d.Reader(io.BytesIO(gzip.decompress(path.read_bytes())))
-        names = [
-            str(s).strip()
-            for key in ("POINT:LABELS", "POINT:LABELS2", "POINT:LABELS3")
-            if (values := reader.get(key)) is not None
-            for s in np.ravel(values.string_array)
-        ]
-        frames = list(reader.read_frames(copy=True))
-    points, analog = np.array([f[1] for f in frames]), np.array([f[2] for f in frames])
+    file = C3dFile(gzip.decompress(path.read_bytes()))
     table = load_marker_set(TABLE)
-    xyz = points[:, [names.index(n) for n in table.names]]
-    seen = (xyz[..., 3] >= 0) & np.any(xyz[..., :3] != 0, axis=-1)
-    time = (reader.first_frame - 1 + np.arange(len(points))) / reader.point_rate
-    metres = np.where(seen[..., None], 1e-3 * xyz[..., :3], np.nan)
-    numbers: Any = {n: np.ravel(reader.get(n).float_array) for n in _PARAMETERS}  # pyright: ignore
-    mass = float(numbers["PROCESSING:BODYMASS"][0])
-    corners = 1e-3 * numbers["FORCE_PLATFORM:CORNERS"].reshape(-1, 4, 3)
-    origins = 1e-3 * numbers["FORCE_PLATFORM:ORIGIN"].reshape(-1, 3)
-    mean = analog.mean(axis=2)  # over the samples of a frame
+    metres = 1e-3 * file.points([file.labels.index(n) for n in table.names])
+    seen = np.isfinite(metres).all(axis=-1)
+    time = (file.first_frame - 1 + np.arange(file.n_frames)) / file.rate_hz
+    mass = file.number("PROCESSING:BODYMASS")
+    corners = 1e-3 * file.numbers("FORCE_PLATFORM:CORNERS").reshape(-1, 4, 3)
+    origins = 1e-3 * file.numbers("FORCE_PLATFORM:ORIGIN").reshape(-1, 3)
+    mean = file.analogs().mean(axis=1)  # over the samples of a frame
     plates = tuple(_plate(mean[:, 6 * k : 6 * k + 6] / mass, corners[k], origins[k]) for k in range(len(corners)))
     check_plates(path, plates)
     return Walk(

@@ -1,4 +1,4 @@
-"""Keypoints of video files in many processes at once, on a GPU if one is visible: docs/benchmarks.md.
+"""Keypoints of video files in many processes at once, on a GPU if one is visible: research/reports.
 
     python -m research.benchmarks.many_videos                      # the demo recording at 1080p, 64 times
     python -m research.benchmarks.many_videos VIDEO ... --copies 8 --processes 2 --device cpu

@@ -1,4 +1,4 @@
-"""BlazePose's heavy network in MediaPipe's own pose solution and here, in turns on two cores: docs/benchmarks.md.
+"""BlazePose's heavy network in MediaPipe's own pose solution and here, in turns on two cores: research/reports.
 
     python -m venv mp && mp/bin/pip install mediapipe==0.10.21
     python -m research.benchmarks.mediapipe_pose mp/bin/python [VIDEO]

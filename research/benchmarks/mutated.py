@@ -288,6 +288,7 @@ def kinds() -> list[Kind]:
         Kind("walk.truth.npz", m.truth, m.use_reference, _npz),
         Kind("walk.reference.npz", m.reference, m.use_reference, _npz),
         Kind("lab.trc", m.trc, m.use_trc, _text("\t")),
+        Kind("walkDLC.csv", m.pose_table, m.use_poses, _text(",")),
         Kind("walk.mot", m.mot, m.use_reference, _text("")),
         Kind("bodies.json", m.bodies, m.use_reference, _json),
         Kind("bodies.json.gz", m.bodies, m.use_reference, _gz(_json)),

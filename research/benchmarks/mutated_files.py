@@ -129,6 +129,21 @@ def use_trc(path: Path) -> None:
     WorldMarkers.from_trc(path, "lab").select(["Hip", "Head"])
 
 
+def pose_table(path: Path) -> None:
+    seen = _synthetic().keypoints
+    values = np.concatenate([seen.xy_px, seen.confidence[..., None]], axis=2).reshape(len(seen.time_s), -1)
+    columns = [("dlc", n, c) for n in seen.names for c in ("x", "y", "likelihood")]
+    heads = [",".join([h, *(c[i] for c in columns)]) for i, h in enumerate(("scorer", "bodyparts", "coords"))]
+    rows = [",".join([str(t), *("" if np.isnan(v) else f"{v:.2f}" for v in row)]) for t, row in enumerate(values)]
+    path.write_text("\n".join([*heads, *rows]) + "\n")
+
+
+def use_poses(path: Path) -> None:
+    from pbl_pipeline.fit import RecordingFacts, read_keypoints
+
+    read_keypoints(path, RecordingFacts(rate_hz=FPS, size_px=_synthetic().keypoints.image_size_px))
+
+
 def marker_set(path: Path) -> None:
     names = ["name,body,x,y,z,weight_3d", *(f"m{i},{b},0.01,0.0{i},0,1" for i, b in enumerate(["pelvis", "femur_r"]))]
     path.write_text("\n".join(["# a table", *names]) + "\n")

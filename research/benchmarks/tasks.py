@@ -26,7 +26,7 @@ import numpy as np
 from pbl_pipeline.body.model import Y_UP_TO_Z_UP
 from pbl_pipeline.fit import METHODS, SessionInput, fit_session, fit_sessions
 from pbl_pipeline.gait import TaskMotion, task_measures, task_motion
-from pbl_pipeline.gait.tasks import sitting_moves
+from pbl_pipeline.gait.tasks import stands
 from pbl_pipeline.synthetic import SynthSpec, Truth, synthesise
 from pbl_pipeline.validation.sources import load_bodies
 from research.benchmarks.real_clips import keypoints_of
@@ -116,7 +116,7 @@ def main(seeds: tuple[int, int], clip: bool) -> None:
             click.echo(line(f"clip, {measure}", [value.mean - wanted.mean] if value and wanted else []))
             if measure == "five_rises_time_s" and not (value and wanted and abs(value.mean - wanted.mean) <= BAR_S):
                 missed.append("clip five_rises_time_s")
-        pairs = list(zip(sitting_moves(mine), sitting_moves(mocap), strict=True))
+        pairs = list(zip(stands(mine).moves, stands(mocap).moves, strict=True))
         for word, direction in (("rises", -1), ("sittings", 1)):
             each = [(a.end_s - a.begin_s) - (b.end_s - b.begin_s) for a, b in pairs if a.direction == direction]
             click.echo(line(f"clip, single {word} (s)", each))

@@ -8,7 +8,7 @@ The others are `../shared/data/real`'s walk and cam01 (README there: source and 
 its frames are made worse on the way to the landmark network, along the same track and crops. Prints, for each change:
 what `check_keypoints` measures of the picture and how it judges, the median way of the points against the clean
 recording in % of the trunk, and the shares of points that moved by more than 20 % of it or were not found any more. The
-thresholds of `keypoints/quality_checks.py` were read from this table (docs/confidence.md).
+thresholds of `keypoints/quality_checks.py` were read from this table (research/reports).
 
 `--index` prints another table: of each clip, darkened as a file and detected by the default methods, the brightness,
 how the check judges it, and the index.

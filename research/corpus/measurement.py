@@ -16,7 +16,6 @@ from typing import Any
 import click
 import numpy as np
 import pandas as pd
-from scipy.stats import norm as normal
 
 from pbl_pipeline.fit import METHODS
 from pbl_pipeline.gait import MEASURES, Z90, GaitCycle, load_norm, passes_of, score_gdi
@@ -47,7 +46,7 @@ RIDGE = 300.0
 #: Least variance (deg^2) of a pass' error in any direction.
 LEAST = 1.0
 #: Groups of persons who are left out in turn.
-FOLDS = 16
+FOLDS = 5
 #: How a pass was fitted.
 ALONE, TOGETHER = "fitted alone", "fitted together"
 
@@ -435,16 +434,20 @@ def change_pairs(frame: pd.DataFrame) -> pd.DataFrame:
 
 def remains_table(pairs: pd.DataFrame) -> pd.DataFrame:
     """Logarithmic loss of both probabilities by how much of what two visits have in common does not cancel
-    (`gait.measurement.REMAINS`), over pairs that were filmed alike and that changed."""
+    (`gait.measurement.REMAINS`), over pairs that were filmed alike and that changed, and their mean absolute true
+    change (`USUAL_CHANGE`)."""
     own = pairs[(pairs["kind"] != "left, then front") & ~pairs["unchanged"]]
     rows = []
     for share in np.arange(0.0, 1.01, 0.1):
         sd = np.sqrt(own["anew"] ** 2 + share * (own["whole"] ** 2 - own["anew"] ** 2))
         losses = {}
-        for limit in (0.0, IMPORTANT_CHANGE):
-            p = np.clip(normal.cdf((own["found"] - limit) / sd), 1e-9, 1 - 1e-9)
-            losses[f"beyond {limit:.0f}"] = -np.log(np.where(own["true"] > limit, p, 1 - p)).mean()
-        rows.append({"remains": share, **losses, "sum": sum(losses.values())})
+        said = np.array([chances(*v, IMPORTANT_CHANGE) for v in zip(own["found"], sd, strict=True)])
+        for column, limit in enumerate((0.0, IMPORTANT_CHANGE)):
+            p = np.clip(said[:, column], 1e-9, 1 - 1e-9)
+            real = own["true"] * np.sign(own["found"]) > limit
+            losses[f"beyond {limit:.0f}"] = -np.log(np.where(real, p, 1 - p)).mean()
+        changed = float(np.mean(np.abs(own["true"])))
+        rows.append({"remains": share, **losses, "sum": sum(losses.values()), "mean change": changed})
     return pd.DataFrame(rows)
 
 
@@ -506,10 +509,8 @@ def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame
             held, within, sds = [], [], []
             visits: dict[tuple, dict[int, tuple[float, float]]] = {}
             for s in own:
-                stated, off = (
-                    measure_error(model, name, {far_leg: len(s.cycles)}),
-                    s.measures[0, k] - s.measures[1, k],
-                )
+                stated = measure_error(model, name, len(s.cycles))
+                off = s.measures[0, k] - s.measures[1, k]
                 if stated is None or not np.isfinite(off):
                     continue
                 held.append(abs(off) <= Z90 * stated[0])
@@ -524,6 +525,31 @@ def stated_errors(seen: Sequence[Seen], model: MeasurementModel) -> pd.DataFrame
                     {"measure": name, "from": title, "n": len(held), "mean sd": np.mean(sds), "in 90 %": np.mean(held),
                      "unchanged within": np.mean(within) if within else np.nan}
                 )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def common_errors(seen: Sequence[Seen]) -> pd.DataFrame:
+    """Parts that the errors of two passes of each gait measure have in common, as standard deviations: of one walk at
+    one visit and at two, in one view and in two, and of two walks of a person at two visits in one view, with the
+    fraction of the part of one walk that does not cancel between walks (`gait.measurement.MEASURES_REMAIN`)."""
+    products: dict[tuple[str, str], list[np.ndarray]] = {}
+    people: dict[str, list[Seen]] = {}
+    for s in seen:
+        people.setdefault(s.person, []).append(s)
+    for own in people.values():
+        for a, b in itertools.combinations(own, 2):
+            about = (
+                "walk" if a.walk == b.walk else "person",
+                f"{1 + (a.visit != b.visit)} visit, {1 + (a.view != b.view)} view",
+            )
+            products.setdefault(about, []).append(np.prod([s.measures[0] - s.measures[1] for s in (a, b)], axis=0))
+    columns = {k: pd.DataFrame(v).mean() for k, v in products.items()}
+    rows = []
+    for k, name in enumerate(MEASURES):
+        parts = {what: columns[of, what][k] for of, what in sorted(columns) if of == "walk"}
+        other = columns["person", "2 visit, 1 view"][k]
+        roots = {what: np.sign(v) * np.sqrt(abs(v)) for what, v in {**parts, "other walk": other}.items()}
+        rows.append({"measure": name, **roots, "remains": 1.0 - other / parts["2 visit, 1 view"]})
     return pd.DataFrame(rows)
 
 
@@ -622,7 +648,11 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
 @click.option("--norm", default=DEFAULT_NORM, show_default=True, help="Normative set.")
 @click.option("--fit", default="blazepose", show_default=True, help="Method the passes were fitted with.")
 @click.option("--model", "stored", help="Judge this stored model of passes fitted alone instead of the estimated one.")
-@click.option("--write", type=click.Path(path_type=Path), help="Write the model there.")
+@click.option(
+    "--write",
+    type=click.Path(path_type=Path),
+    help="Write the model there; with --model that one, its gait measures anew.",
+)
 def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | None) -> None:
     """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
     basis, method = load_norm(norm), METHODS[fit]
@@ -646,7 +676,9 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
                 out = left_out_in_turn(parts["tuning", ALONE], own, basis)
                 _echo_left_out(out, models[ALONE].widening, people[1])
     if stored is not None:
-        models[ALONE] = load_model(stored)
+        own = models[ALONE]
+        parts_anew = {"events": own.events, "pass_cycles": own.pass_cycles, "measures": own.measures}
+        models[ALONE] = dataclasses.replace(load_model(stored), **parts_anew)
     for (title, fitted), part in parts.items():
         if not part:
             continue
@@ -657,6 +689,7 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
             _echo(f"{about}, by the model of passes fitted alone", error_table(judged(part, models[ALONE], basis)))
         else:
             _echo(f"{about}: gait measures", measure_errors(part), 3)
+            _echo(f"{about}: parts of the gait measures' errors that two passes have in common", common_errors(part), 4)
             _echo(f"{about}: angles", angle_errors(part), 1)
             _echo(f"{about}: stated", stated_errors(part, models[ALONE]), 3)
         pairs = change_pairs(frame)
@@ -666,7 +699,8 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
         model = dataclasses.replace(models[ALONE], name=write.stem)
-        write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons")
+        index = f"; index of {load_model(stored).name}" if stored else ""
+        write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons{index}")
         click.echo(f"\n{write}")
 
 

@@ -79,19 +79,19 @@ def _calibrate(args: argparse.Namespace) -> None:
     """Fit the probability on scenes of other seeds and on the solved motions that training held out."""
     import numpy as np
 
-    from pbl_pipeline.gait.events import PhaseParams
+    from pbl_pipeline.gait.events import METHODS
     from pbl_pipeline.gait.events.network.transformer import load_model, save_model
 
     from . import _calibrate as calibration
     from . import _corpus
 
-    params = PhaseParams(str(args.calibrate), "")
+    params = dataclasses.replace(METHODS["phase-transformer"].params, model=str(args.calibrate), model_sha256="")
     fresh = _corpus.scenes(args.seed + 1000, args.calibrate_scenes, args.workers, _say)
-    found = list(calibration.cases(fresh, np.arange(len(fresh.start)), params.model, args.seed))
+    found = list(calibration.cases(fresh, np.arange(len(fresh.start)), params, args.seed))
     if args.solved:
         solved = _corpus.load(args.solved)
         for draw in range(4):
-            found += list(calibration.cases(solved, calibration.held_out(solved), params.model, args.seed + 1 + draw))
+            found += list(calibration.cases(solved, calibration.held_out(solved), params, args.seed + 1 + draw))
     curve, measured = calibration.calibrate(found, params, _say)
     kinds = sorted({c.kind.split()[0] for c in found})
     parts = {k: [c for c in found if c.kind.split()[0] == k] for k in kinds}
@@ -99,6 +99,10 @@ def _calibrate(args: argparse.Namespace) -> None:
     for kind, values in scores.items():
         _say(f"{kind}: " + "  ".join(f"{k} {v:.4g}" for k, v in values.items()))
     model, about = load_model(args.calibrate)
+    if "probability" in about:
+        x, real = calibration.evidence(found, params)
+        kept = calibration.reliability(calibration.probability(x, about["probability"]), real)
+        _say(f"by the curve in the file: Brier {kept['brier']:.4f}, expected error {kept['expected_error']:.4f}")
     path = args.out / "phase_transformer_calibrated.npz"
     save_model(path, model, {**about, "probability": curve, "reliability": measured, "held_out": scores})
     _say(f"written: {path}")

@@ -40,9 +40,9 @@ class Case:
     kind: str
 
 
-def cases(corpus: Corpus, numbers: np.ndarray, model: str, seed: int) -> Iterator[Case]:
-    """Sequences `numbers` of the corpus, augmented by `seed`, with the network's phases. Those in which hips and feet
-    are hardly seen are left out, as detection refuses them."""
+def cases(corpus: Corpus, numbers: np.ndarray, p: PhaseParams, seed: int) -> Iterator[Case]:
+    """Sequences `numbers` of the corpus, augmented by `seed`, with the network's phases as the method takes them. Those
+    in which hips and feet are hardly seen are left out, as detection refuses them."""
     see = jax.jit(seen_joints)
     for number in numbers:
         # Few different lengths: each is compiled.
@@ -58,7 +58,7 @@ def cases(corpus: Corpus, numbers: np.ndarray, model: str, seed: int) -> Iterato
         seen: np.ndarray = np.logical_and.reduce(grid.known[:, 0], axis=1)
         true = tuple(_wraps(phase[:, k], time) for k in range(4))
         near = tuple(t[seen[np.clip(np.round(t * GRID_HZ).astype(int), 0, len(seen) - 1)]] for t in true)
-        yield Case(grid, predict(grid, model), near, str(corpus.kind[number]))
+        yield Case(grid, predict(grid, p.model, p.mirrored), near, str(corpus.kind[number]))
 
 
 def held_out(corpus: Corpus) -> np.ndarray:

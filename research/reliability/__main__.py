@@ -46,7 +46,7 @@ def main(
     bins: int,
     out: Path | None,
 ) -> None:
-    """Stated confidence of the points in KEYPOINTS against their measured error (docs/confidence.md).
+    """Stated confidence of the points in KEYPOINTS against their measured error (research/reports).
 
     Prints bins of stated confidence: the error in the picture as a share of the trunk's length (median, 90 percent) and
     how many points lie within 20 percent of it, measured and by the stored curve of the detector, where it has one.

@@ -1,4 +1,4 @@
-"""Stated confidence against measured error: what a detector's confidence is worth (docs/confidence.md)."""
+"""Stated confidence against measured error: what a detector's confidence is worth (research/reports)."""
 
 from __future__ import annotations
 

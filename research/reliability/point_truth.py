@@ -232,5 +232,5 @@ def _refused(found: str, expected: str) -> PblError:
         "REFERENCE_INPUT",
         found=found,
         expected=expected,
-        next_step="see docs/confidence.md, section What it is compared with",
+        next_step="see research/reports, section What it is compared with",
     )

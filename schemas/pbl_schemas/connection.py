@@ -15,6 +15,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
+from . import job_errors  # noqa: F401  codes what the driver raises, wherever that is
 from .datajoint_setup import UTC, LostConnectionError, backend_of, datajoint, dj
 from .datajoint_setup import DuplicateError as DuplicateError  # these four for the workers
 from .datajoint_setup import IntegrityError as IntegrityError

@@ -141,9 +141,9 @@ class TrialInput(dj.Computed):
 
         with ExitStack() as stack:
             found = _load_trial(stack, refs, rig)
-        used, share = check_trial(found, name, methods.stored(**method))
+        checked = check_trial(found, name, methods.stored(**method))
         miss = number(100 * np.nanmax(ray_miss_m(found))) if isinstance(found, MultiView) else None
-        return int(np.sum(used)), float(share), miss, ids, method["sha"]
+        return int(np.sum(checked.used)), float(checked.whole_share), miss, ids, method["sha"]
 
     def make_insert(
         self, key: dict, n_used: int, share: float, miss: float | None, ids: list[int], sha: str, origin: Origin

@@ -244,10 +244,11 @@ class GaitCycle(dj.Computed):
         opposite_foot_down : float64           # (s)
         cycle_foot_up      : float64           # (s)
         cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false where one of the next five says why
+        cycle_used         : bool              # false where one of the next six says why
         cycle_first_step   : bool              # touches the first step of its walking bout
         cycle_last_step    : bool              # touches the last step of its walking bout
         cycle_length_ratio=null : float64      # (1) length over the typical stride's, null unless left out for it
+        cycle_length_unproven=null : bool      # no feet show whether a step was missed; null: not left out for its length, or not known
         cycle_curve_distance=null : float64    # (deg) from its side's median curves, null unless left out for it
         cycle_curves_n=null : int16            # cycles of that median, null with it
         cycle_failed_checks : json             # names of the checks of the fit that FAIL, such as []
@@ -258,7 +259,7 @@ class GaitCycle(dj.Computed):
         cycle_step_width=null    : float64     # (m) null unless the metres were measured
         cycle_lengths_metric=null : bool       # false: as large as the detector takes the person to be
         cycle_lengths_missing='' : varchar(150)  # why there are no lengths
-        """
+        """  # noqa: E501
 
     def make_fetch(self, key: dict) -> tuple:
         correction = correction_of(key)
@@ -300,34 +301,7 @@ class GaitCycle(dj.Computed):
                     **origin.row("cycles"),
                 }
             )
-        self.Cycle.insert(
-            {
-                **key,
-                "cycle_no": c.number,
-                "cycle_side": c.side,
-                "cycle_bout": c.bout,
-                "cycle_start": c.start_s,
-                "opposite_foot_up": c.opposite_foot_up_s,
-                "opposite_foot_down": c.opposite_foot_down_s,
-                "cycle_foot_up": c.foot_up_s,
-                "cycle_end": c.end_s,
-                "cycle_used": c.used,
-                "cycle_first_step": c.exclusion.first_step,
-                "cycle_last_step": c.exclusion.last_step,
-                "cycle_length_ratio": number(c.exclusion.length_ratio),
-                "cycle_curve_distance": number(c.exclusion.curve_distance_deg),
-                "cycle_curves_n": c.exclusion.n_curves,
-                "cycle_failed_checks": list(c.exclusion.failed_checks),
-                "curves_missing": c.curves_missing[:100],
-                "cycle_far_leg": c.far_leg or None,
-                "cycle_stride_length": number(c.lengths.stride_length_m),
-                "cycle_step_length": number(c.lengths.step_length_m),
-                "cycle_step_width": number(c.lengths.step_width_m),
-                "cycle_lengths_metric": c.lengths.metric,
-                "cycle_lengths_missing": c.lengths.missing[:150],
-            }
-            for c in cycles
-        )
+        self.Cycle.insert({**key, **row_of_cycle(c)} for c in cycles)
 
 
 @schema
@@ -498,6 +472,35 @@ def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEve
     return events_of(row, None if cycles["correction_no"] is None else {k: cycles[k] for k in names}, rows)
 
 
+def row_of_cycle(c: lib.GaitCycle) -> dict[str, Any]:
+    """A row of GaitCycle.Cycle, without its key above; its curves are in a file."""
+    return {
+        "cycle_no": c.number,
+        "cycle_side": c.side,
+        "cycle_bout": c.bout,
+        "cycle_start": c.start_s,
+        "opposite_foot_up": c.opposite_foot_up_s,
+        "opposite_foot_down": c.opposite_foot_down_s,
+        "cycle_foot_up": c.foot_up_s,
+        "cycle_end": c.end_s,
+        "cycle_used": c.used,
+        "cycle_first_step": c.exclusion.first_step,
+        "cycle_last_step": c.exclusion.last_step,
+        "cycle_length_ratio": number(c.exclusion.length_ratio),
+        "cycle_length_unproven": None if c.exclusion.length_ratio is None else c.exclusion.length_unproven,
+        "cycle_curve_distance": number(c.exclusion.curve_distance_deg),
+        "cycle_curves_n": c.exclusion.n_curves,
+        "cycle_failed_checks": list(c.exclusion.failed_checks),
+        "curves_missing": c.curves_missing[:100],
+        "cycle_far_leg": c.far_leg or None,
+        "cycle_stride_length": number(c.lengths.stride_length_m),
+        "cycle_step_length": number(c.lengths.step_length_m),
+        "cycle_step_width": number(c.lengths.step_width_m),
+        "cycle_lengths_metric": c.lengths.metric,
+        "cycle_lengths_missing": c.lengths.missing[:150],
+    }
+
+
 def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:
     from pbl_pipeline import gait as lib
 
@@ -515,6 +518,8 @@ def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = Non
             first_step=bool(row["cycle_first_step"]),
             last_step=bool(row["cycle_last_step"]),
             length_ratio=number(row["cycle_length_ratio"]),
+            # NULL for cycles older than this column: it is not known, so the spread is withheld
+            length_unproven=row["cycle_length_ratio"] is not None and row["cycle_length_unproven"] != 0,
             curve_distance_deg=number(row["cycle_curve_distance"]),
             n_curves=None if row["cycle_curves_n"] is None else int(row["cycle_curves_n"]),
             failed_checks=tuple(row["cycle_failed_checks"]),

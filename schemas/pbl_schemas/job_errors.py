@@ -7,7 +7,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pbl_pipeline.errors import CODES, PblError
+import pymysql
+
+from pbl_pipeline.errors import CODERS, CODES, PblError, causes
 
 from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
 
@@ -34,8 +36,7 @@ def fitted(error: PblError, key: Mapping[str, Any]) -> PblError:
 
 def store_full(error: BaseException) -> PblError | None:
     """STORE_FULL if an error says that the store has no room, or came from one that does."""
-    seen: BaseException | None = error
-    while seen is not None:
+    for seen in causes(error):
         if getattr(seen, "errno", None) in (errno.ENOSPC, errno.EDQUOT) or _BUCKET_FULL.search(str(seen)):
             return PblError(
                 "STORE_FULL",
@@ -43,7 +44,6 @@ def store_full(error: BaseException) -> PblError | None:
                 expected="room for arrays and temporary files",
                 next_step="free space, or give the store's disk or bucket more; jobs that met it go on by themselves",
             )
-        seen = seen.__cause__ or seen.__context__
     return None
 
 
@@ -69,6 +69,15 @@ def of_server(error: Exception) -> PblError:
         expected="a statement that the server executes; nothing was written",
         next_step=next((said for numbers, said in steps.items() if number in numbers), "report it with the whole text"),
     )
+
+
+def of_database(error: BaseException) -> PblError | None:
+    """The coded error for one that the driver or DataJoint raised, or that came from such a one; else None."""
+    found = (e for e in causes(error) if isinstance(e, (pymysql.err.Error, LostConnectionError)))
+    return next((of_server(e) for e in found if isinstance(e, Exception)), None)
+
+
+CODERS.append(of_database)
 
 
 def internal(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:

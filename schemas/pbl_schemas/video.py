@@ -66,7 +66,7 @@ class MarkerRecording(dj.Manual):
     ---
     recording_marker_set     : varchar(64)     # where on the body the markers sit: a shipped set, or the stem of marker_table_file
     marker_table_sha256=''   : varchar(64)     # of the bytes of marker_table_file, empty where the set ships
-    vertical_axis            : enum('y', 'z')  # of the file as it was given; z for .npz
+    vertical_axis            : enum('y', 'z')  # as stated for the file, z for .npz; fits turn a trial whose body stands along another axis
     recording_n_frames       : int32           # frames
     recording_n_markers      : int16           # markers of the set that the file has
     recording_duration       : float64         # (s) from the first to the last frame
@@ -127,7 +127,7 @@ class PhoneAttitude(dj.Manual):
     attitude_form           : varchar(32)      # format; docs/phone_capture.md
     attitude_device=''      : varchar(128)     # phone, as the log names it
     attitude_n              : int32            # orientations
-    attitude_rate           : float64          # (1/s) orientations per second, by the median interval
+    attitude_rate           : float64          # (1/s) orientations per second, by the sampling interval
     attitude_duration       : float64          # (s) from the first to the last
     attitude_start_utc=null : varchar(40)      # moment of the first, null where the log does not count in UTC
     attitude_sensors        : json             # other sensors in it: name to number of samples
@@ -178,7 +178,7 @@ class VideoInfo(dj.Computed):
     width                : int32               # (px) of the upright frame
     height               : int32               # (px) of the upright frame
     rotation             : int16               # (deg) rotation flag of the file
-    fps=null             : float64             # (1/s) 1 / median frame interval, a description only
+    fps=null             : float64             # (1/s) 1 / sampling interval, a description only
     duration=null        : float64             # (s) from the first frame to the end of the last
     n_frames             : int32               # frames that decode
     n_frames_announced   : int32               # frames the header claims, 0 when it says nothing

@@ -137,6 +137,11 @@ def undo_0008(cursor: Any) -> None:
 
 
 def undo_0009(cursor: Any) -> None:
+    """Forget whether the feet show that a cycle of odd length is not one stride."""
+    cursor.execute("ALTER TABLE pbl_gait.__gait_cycle__cycle DROP COLUMN cycle_length_unproven")
+
+
+def undo_0010(cursor: Any) -> None:
     """Forget the unshrunk index."""
     for table, prefix in (("__g_d_i", "gdi"), ("__session_gdi", "session_gdi")):
         for column in (f"{prefix}_unshrunk", f"{prefix}_unshrunk_sd"):

@@ -3,6 +3,7 @@
 import contextlib
 import gzip
 import json
+import random
 import shutil
 import subprocess
 import threading
@@ -72,7 +73,7 @@ def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert gzip.decompress((saved / "database.sql.gz").read_bytes()).count(b"\n") > 2 * len(before)
     elsewhere()
     assert pbl("db", "restore", "--check", saved).code == 0
-    done = pbl("db", "restore", saved)
+    done = pbl("db", "restore", saved, "--recordings-below", films[0].parent)
     assert done.code == 0, done.err
     assert everything() == before
     # Recordings are where they were registered, and what is there is not touched.
@@ -253,6 +254,69 @@ def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
     manifest["rows"]["pbl_lab.subject"] -= 1
     (saved / "manifest.json").write_text(json.dumps(manifest))
     assert pbl("db", "restore", "--again", saved).code == 0
+
+
+@pytest.fixture
+def backup_with_films(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    """A backup of three recordings of /FOLDER/archive, which are gone, and their sums by path."""
+    archive, saved = tmp_path / "archive", tmp_path / "backup"
+    archive.mkdir()
+    saved.mkdir()
+    sums = {}
+    for name in "abc":
+        (archive / f"{name}.mp4").write_text(name)
+        sums[str(archive / f"{name}.mp4")] = sha256_of(archive / f"{name}.mp4")
+    assert len(backup_files.save_recordings(sums.items(), saved).paths) == 3
+    for path in sums:
+        Path(path).unlink()
+    return saved, sums
+
+
+def test_recordings_come_back_below_the_folders_that_were_told_alone(
+    backup_with_films: tuple[Path, dict[str, str]], tmp_path: Path
+):
+    saved, sums = backup_with_films
+    a, b, c = map(Path, sums)
+    other = backup_files.restore_recordings(saved, sums, [tmp_path / "other"])
+    assert (other.paths, list(other.left)) == ([], [str(a), str(b), str(c)])
+    assert "--recordings-below" in other.left[str(a)]
+    b.symlink_to(tmp_path / "outside")
+    done = backup_files.restore_recordings(saved, {**sums, str(c): "0" * 64}, [tmp_path / "archive"])
+    assert (done.paths, list(done.left)) == ([str(a)], [str(b), str(c)])
+    assert not (tmp_path / "outside").exists()
+
+
+def test_a_manipulated_backup_writes_nothing_elsewhere(backup_with_films: tuple[Path, dict[str, str]], tmp_path: Path):
+    """Drawn: names, links, and sums that agree with them."""
+    saved, sums = backup_with_films
+    outside, archive = tmp_path / "outside", tmp_path / "archive"
+    outside.mkdir()
+    (outside / "secret").write_text("secret")
+    (archive / "way").symlink_to(outside)
+    listing, draw = (saved / "recordings.sha256").read_text(), random.Random(0)
+    for _ in range(200):
+        name = draw.choice(["way/x.mp4", "../outside/x.mp4", "./a.mp4", "a.mp4", "n.mp4", "way/../way/x.mp4"])
+        whole = str(archive / name).lstrip("/")
+        source = saved / "recordings" / whole
+        if draw.random() < 0.5 and not source.exists():
+            source.parent.mkdir(parents=True, exist_ok=True)
+            source.write_text("planted") if draw.random() < 0.5 else source.symlink_to(outside / "secret")
+        sha = sha256_of(source) if source.exists() else "0" * 64
+        (saved / "recordings.sha256").write_text(f"{listing}{sha}  {whole}\n")
+        with contextlib.suppress(PblError):
+            backup_files.restore_recordings(saved, sums, [archive])
+        assert [p.name for p in outside.iterdir()] == ["secret"]
+        assert {p.name for p in archive.iterdir()} <= {"a.mp4", "b.mp4", "c.mp4", "way"}
+
+
+def test_a_link_in_a_backup_is_a_changed_file(filled: None, tmp_path: Path):
+    saved = tmp_path / "backup"
+    backup.backup(saved)
+    one = next(p for p in sorted((saved / "store").rglob("*")) if p.is_file())
+    one.rename(tmp_path / "elsewhere")
+    one.symlink_to(tmp_path / "elsewhere")
+    done = pbl("db", "restore", "--check", saved)
+    assert (done.error_code, one.name in done.err) == ("BACKUP_INVALID", True)
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "../x", "a/../../x", "", "a\nb", "..\\x"])

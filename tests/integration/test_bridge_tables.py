@@ -13,7 +13,7 @@ from tests.command import pbl
 from tests.integration.chain import small_video
 from tests.rows import register
 
-OLD, NEW = "zeni-2008-v1", "phase-transformer-v2"
+OLD, NEW = "zeni-2008-v1", "phase-transformer-v3"
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_keys_without_results_are_refused(visits: None):
 
 def test_an_upgrade_names_results_by_an_older_default(visits: None, monkeypatch: pytest.MonkeyPatch):
     assert comparison.changed_defaults() == []
-    newer = "phase-transformer-v3"
+    newer = "phase-transformer-v4"
     defaults = {**comparison.default_methods(), "gait_method": ("gait", "phase-transformer", newer)}
     monkeypatch.setattr(comparison, "default_methods", lambda: defaults)
     (line,) = comparison.changed_defaults()

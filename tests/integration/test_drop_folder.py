@@ -188,9 +188,10 @@ def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, archive: Pa
     assert set(look(drop, archive).registered) == names
 
 
-def test_an_error_that_nobody_foresaw_keeps_one_upload_and_takes_the_others(
+def test_an_error_that_nobody_foresaw_leaves_one_upload_and_takes_the_others(
     drop: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    """It is a fault of the program, not of the recording, which a later run takes."""
     bad, good = upload(drop, "P001/1/walk.mp4"), upload(drop, "P002/1/walk.mp4", "other")
     content = bad.read_bytes()
     real = incoming.register
@@ -200,12 +201,27 @@ def test_an_error_that_nobody_foresaw_keeps_one_upload_and_takes_the_others(
             raise ZeroDivisionError("a defect")
         return real(recordings)
 
-    monkeypatch.setattr(incoming, "register", fails)
-    taken = twice(drop, archive)
-    assert (taken.registered, codes(taken)) == ([str(good.relative_to(drop))], {"P001/1/walk.mp4": "INTERNAL"})
-    (kept,) = (archive / "_refused" / "P001").glob("*.mp4")
-    assert kept.read_bytes() == content
-    assert "a defect" in kept.with_name(kept.name + ".txt").read_text()
+    with monkeypatch.context() as defect:
+        defect.setattr(incoming, "register", fails)
+        taken = twice(drop, archive)
+    assert (taken.registered, codes(taken)) == ([str(good.relative_to(drop))], {})
+    assert "a defect" in taken.left["P001/1/walk.mp4"].text()
+    assert bad.read_bytes() == content
+    assert not list((archive / "P001").rglob("*.mp4")) + list((archive / "_refused").rglob("*"))
+    assert look(drop, archive).registered == ["P001/1/walk.mp4"]
+
+
+def test_an_upload_whose_log_could_not_be_read_in_time_is_left(
+    drop: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
+):
+    video_file = upload(drop, "P001/1/walk.mp4")
+    video_file.with_suffix(".csv").write_text("time_s,qw,qx,qy,qz\n")
+    with monkeypatch.context() as short:
+        short.setattr(incoming, "LOG_S", 0.0)
+        taken = twice(drop, archive)
+        assert {name: error.code for name, error in taken.left.items()} == {"P001/1/walk.mp4": "MACHINE_SHORT"}
+        assert video_file.exists()
+    assert codes(look(drop, archive)) == {"P001/1/walk.mp4": "PHONE_LOG"}  # now it was read
 
 
 def test_the_same_bytes_for_another_person_are_kept_and_named(drop: Path, archive: Path):

@@ -90,7 +90,8 @@ def test_rows_say_what_forces_were_computed_from(walk: Path):
     known = [v for v in used if v is not None]
     assert known
     assert impulse["force_left"] == pytest.approx(sum(known) / len(known))
-    assert {r["forces_check"] for r in kinetics.Kinetics.Check.to_dicts()} == {"kinetics_residual", "kinetics_scale"}
+    checks = {r["forces_check"] for r in kinetics.Kinetics.Check.to_dicts()}
+    assert checks == {"kinetics_residual", "kinetics_scale", "legs_seen_alike"}
 
 
 def test_without_a_mass_forces_are_per_body_weight(upright: None, tmp_path: Path):

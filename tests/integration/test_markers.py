@@ -72,9 +72,10 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
     used = {int(r["video_id"]): int(r["n_cycles_used"]) for r in gait.GaitCycle().to_dicts()}
     assert found[PHONE]["session_cycles"] == used[ids["static"]] > 0
     assert found[LAB]["session_cycles"] == used[ids["none"]] > 0
-    # The stand-in gives the video's movement exactly, so what differs is the error of the fit of the markers.
+    # The stand-in gives the video's movement exactly, so what differs is the error of the fit of the markers, and what
+    # the index takes back for the error that such a fit states, most where it is as high as here.
     phone, laboratory = (found[m]["session_gdi"] for m in (PHONE, LAB))
-    assert laboratory == pytest.approx(phone, abs=1.0)
+    assert laboratory == pytest.approx(phone, abs=1.5)
     assert found[LAB]["session_cadence"] == pytest.approx(120 / CYCLE_S, rel=0.01)
     row = (fit.SessionFit.Trial & {"video_id": ids["none"]}).fetch1()
     assert row["trial_residual_3d"] < 0.5

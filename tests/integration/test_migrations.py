@@ -160,7 +160,13 @@ def without_instruments(folder: Path) -> dict[str, list[tuple]]:
     """Declare the tables and take the migrations from 0006 back."""
     pbl_schemas.activate()
     rows = everything()
-    _undo(older_tables.undo_0009, older_tables.undo_0008, older_tables.undo_0007, older_tables.undo_0006)
+    _undo(
+        older_tables.undo_0010,
+        older_tables.undo_0009,
+        older_tables.undo_0008,
+        older_tables.undo_0007,
+        older_tables.undo_0006,
+    )
     return rows
 
 
@@ -321,7 +327,42 @@ def test_instruments_and_errors_of_before_get_their_columns(put: Put):
     assert gdi.SessionGdi.Measure.heading.names[-2:] == ["session_measure_error", "session_measure_minimal_change"]
     assert {"gdi_unshrunk", "gdi_unshrunk_sd"} < set(gdi.GDI.heading.names)
     assert {"session_gdi_unshrunk", "session_gdi_unshrunk_sd"} < set(gdi.SessionGdi.heading.names)
+    assert "cycle_length_unproven" in gait.GaitCycle.Cycle.heading.names
     assert migrations.migrate().steps == []
+
+
+def test_a_running_worker_of_another_version_is_named_and_refused(put: Put):
+    put(without_instruments)
+    add = "INSERT INTO pbl_worker.worker (worker, worker_host, worker_pid, worker_resource, worker_version,"
+    add += " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 7, 'any', %s, NOW(3),"
+    add += " NOW(3) - INTERVAL %s SECOND, NULL, '')"
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for name, version, ago in (
+            ("a" * 16, "0.1.0", 5),
+            ("b" * 16, code_version()[:64], 5),
+            ("c" * 16, "0.1.0", 500),
+        ):
+            cursor.execute(add, (name, f"host-{name[0]}", version, ago))
+    dry = pbl("db", "migrate", "--dry-run")
+    assert [line for line in dry.out.splitlines() if "running" in line] == [
+        "  still running: process 7 on host-a, pbl-pipeline 0.1.0"
+    ]
+    refused = pbl("db", "migrate")
+    assert (refused.error_code, "host-a" in refused.err, "--force" in refused.err) == ("DB_MIGRATION", True, True)
+    assert "joint_normal_p" not in columns_of("pbl_validation", "__kinematic_error__joint")
+    assert pbl("db", "migrate", "--force").code == 0
+    assert "joint_normal_p" in columns_of("pbl_validation", "__kinematic_error__joint")
+    assert pbl("db", "migrate").code == 0  # nothing is left to do
+
+
+def columns_of(schema: str, table: str) -> set[str]:
+    """Columns of a table on the server."""
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "SELECT column_name FROM information_schema.columns WHERE table_schema = %s AND table_name = %s",
+            (schema, table),
+        )
+        return {str(row[0]) for row in cursor.fetchall()}
 
 
 def test_corrections_by_a_method_become_rows(put: Put):

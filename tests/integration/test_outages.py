@@ -14,9 +14,11 @@ import pymysql
 import pytest
 
 import pbl_pipeline.video
+from pbl_pipeline.errors import causes
 from pbl_schemas import connection, fit, lab, review, session, tracking, video, worker
+from pbl_schemas.connection import LostConnectionError
 from pbl_schemas.decisions import review_decisions
-from pbl_schemas.job_errors import error_code, of_server
+from pbl_schemas.job_errors import error_code, of_server, store_full
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import catalog
 from pbl_schemas.operations.orphans import orphans
@@ -25,6 +27,7 @@ from pbl_schemas.store import store_error
 from pbl_schemas.stored_files import remove_left_over
 from pbl_workers import queue, recover, refresh, run_job
 from pbl_workers.heartbeat import Heartbeat
+from tests.command import pbl
 from tests.rows import register
 
 from . import chain
@@ -229,6 +232,17 @@ def test_a_bucket_without_room_has_its_code():
     assert store_error(OSError(errno.EIO, "no route to host")).code == "STORE_UNAVAILABLE"
 
 
+@pytest.mark.parametrize("circle", [False, True])
+@pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "STORE_FULL"), (errno.EIO, None)])
+def test_a_store_is_found_among_the_causes_of_an_error(number: int, code: str | None, circle: bool):
+    first, last = ValueError("no array"), OSError(number, "the disk")
+    first.__cause__ = last
+    last.__cause__ = first if circle else None
+    assert list(causes(first)) == [first, last]
+    assert getattr(store_full(first), "code", None) == code
+    assert run_job.cause_outside(first) == f"STORE: OSError: {last}"
+
+
 class Killed(BaseException):
     """In place of SIGKILL."""
 
@@ -390,3 +404,23 @@ def test_jobs_of_a_deleted_key_go_whatever_a_refresh_looks_at(tmp_path: Path, mo
 
 def test_people_who_use_datajoint_are_asked_before_rows_go():
     assert connection.dj.config["safemode"]
+
+
+@pytest.mark.usefixtures("tables")
+@pytest.mark.parametrize("error", [
+    pymysql.err.OperationalError(2013, "Lost connection to MySQL server during query"),
+    LostConnectionError("Connection was lost"),
+])  # fmt: skip
+def test_a_database_that_goes_away_in_the_middle_of_any_command_is_named(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+):
+    """Wherever it happens: the command line asks the tables what the error means."""
+
+    def lost(*_: object, **__: object) -> None:
+        raise ValueError("while rows were read") from error
+
+    monkeypatch.setattr("pbl_workers.recover.free_dead", lost)
+    monkeypatch.setattr("pbl_workers.requeue.retry", lost)
+    for command in ("release", "reprocess"):
+        done = pbl("cron", command)
+        assert (done.code, done.error_code) == (1, "DB_NOT_RUNNING"), done.err

@@ -13,7 +13,7 @@ import pytest
 import pbl_pipeline.fit
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
-from pbl_pipeline.gait import IMPORTANT_CHANGE, chances, change_sd
+from pbl_pipeline.gait import IMPORTANT_CHANGE, MEASURES_REMAIN, chances, change_sd
 from pbl_schemas import fit, gait, gdi, study
 from pbl_schemas.reading import comparison, frames, registered
 from pbl_workers.populate import populate
@@ -192,7 +192,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
     try:
         found = comparison.compare([(1, None), (2, None)]).compared[1]
         change = found.changes["cadence_steps_per_min"]
-        sd = change_sd((0.5, 0.5), (0.3, 0.3))
+        sd = change_sd((0.5, 0.5), (0.3, 0.3), MEASURES_REMAIN)
         assert change.real == chances(change.by, sd).real
         assert (change.important, change.least) == (None, 0.5)
         index = not_none(found.change)

@@ -109,10 +109,12 @@ def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english
         one.headers["accept-language"] = "de"
     refused = phone.get("/visits").text
     link = web.post(browser, "/visits/1/film", hours="2").text
-    page = phone.get(not_none(re.search(r"/phone/open\?key=[\w-]+", link))[0]).text
+    address, key = not_none(re.search(r"(/phone/open\?key=([\w-]+))", link)).groups()
+    before = phone.get(address).text
+    page = phone.post("/phone/open", data={"key": key}).text
     assert "data-said" in page
     assert "Aufstehen vom Stuhl" in page  # a step of a protocol
-    for text in (refused, link, page, phone.get("/phone/open?key=another").text):
+    for text in (refused, link, before, page, phone.get("/phone/open?key=another").text):
         assert 'lang="de"' in text
         assert not english_of(text, english, NAMES + r"|http\S+")
 

@@ -3,9 +3,14 @@
 import contextlib
 import hashlib
 import json
+import os
 import random
 import re
+import shutil
 import socket
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +30,8 @@ from pbl_schemas.intake.protocols import add_protocol, read_protocol
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.usable import Next, Usable
 from pbl_schemas.rows import check_row
-from pbl_workers import incoming, phone_uploads, queue
+from pbl_workers import browser_uploads, incoming, phone_uploads, queue
+from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, verdict
@@ -61,9 +67,14 @@ def link_of(visit: int, **fields: object) -> str:
 def phone(visit: int, **fields: object) -> TestClient:
     """A phone that has opened a new link of the visit."""
     browser = stranger()
-    answer = browser.get("/phone/open", params={"key": link_of(visit, **fields)}, follow_redirects=False)
+    answer = take(browser, link_of(visit, **fields))
     assert (answer.status_code, answer.headers["location"]) == (303, "/phone")
     return browser
+
+
+def take(browser: TestClient, key: str) -> Any:
+    """Open a link, as the page behind its address does."""
+    return browser.post("/phone/open", data={"key": key}, follow_redirects=False)
 
 
 def parts_of(body: bytes) -> list[bytes]:
@@ -94,13 +105,17 @@ def put(browser: TestClient, number: int, start: int, part: bytes, total: int, *
     return browser.put(f"/phone/recordings/{number}.json", content=part, headers={**own, **headers})
 
 
-def send(browser: TestClient, film: bytes, log: bytes = b"", **about: Any) -> dict[str, Any]:
-    """A whole recording; the answer to its end."""
+def send_all(browser: TestClient, film: bytes, log: bytes = b"", **about: Any) -> Any:
+    """Send a whole recording; the answer to its end."""
     told = begin(browser, film, log, **about)
     for n in told["missing"]:
         part = parts_of(film + log)[n]
         assert put(browser, told["number"], n * 4096, part, len(film + log)).status_code == 204
-    return finish(browser, told["number"]).json()
+    return finish(browser, told["number"])
+
+
+def send(browser: TestClient, film: bytes, log: bytes = b"", **about: Any) -> dict[str, Any]:
+    return send_all(browser, film, log, **about).json()
 
 
 def finish(browser: TestClient, number: int) -> Any:
@@ -125,16 +140,19 @@ def attitude_log() -> bytes:
 def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
     key = link_of(visit)
     mine, other = stranger(), stranger()
-    assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
+    for look in (other.get, other.head, mine.get):  # a preview, a phone that has not gone on yet
+        assert look("/phone/open", params={"key": key}, follow_redirects=False).status_code == 200
+        assert "pbl_phone" not in other.cookies
+    assert take(mine, key).status_code == 303
     page = mine.get("/phone")
     assert page.status_code == 200
     assert "P001" in page.text
     assert "camera=(self)" in page.headers["permissions-policy"]
     # The same phone may scan it again; another one may not, and neither can take it by a wrong key.
     assert mine.get("/phone/open", params={"key": key}, follow_redirects=False).status_code == 303
-    answer = other.get("/phone/open", params={"key": key}, follow_redirects=False)
-    assert answer.status_code == 403
-    assert "PHONE_LINK" in answer.text
+    for answer in (take(other, key), other.get("/phone/open", params={"key": key}, follow_redirects=False)):
+        assert answer.status_code == 403
+        assert "PHONE_LINK" in answer.text
     assert other.get("/phone").status_code == 401
     assert other.get("/phone/open", params={"key": key + "x"}, follow_redirects=False).status_code == 403
     # No key and no cookie is in the tables.
@@ -370,8 +388,7 @@ def test_the_command_prints_a_link_that_opens(visit: int):
     assert done.exit_code == 0, done.output
     address = done.output.splitlines()[-1]
     assert address.startswith("https://gait.example:8484/phone/open?key=")
-    answer = stranger().get(address.removeprefix("https://gait.example:8484"), follow_redirects=False)
-    assert answer.status_code == 303
+    assert take(stranger(), address.partition("key=")[2]).status_code == 303
 
 
 @pytest.mark.parametrize(("now", "then", "side", "words"), [
@@ -487,6 +504,74 @@ def test_what_is_no_video_or_comes_with_a_bad_log_is_refused_by_its_code(visit: 
     assert "cannot be used" in web.client(target=nothing).get(f"/visits/{visit}").text
 
 
+@pytest.mark.parametrize("limit", ["_OPEN_S", "LOG_S"])
+def test_a_server_that_is_short_of_time_or_memory_says_try_again(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+):
+    """The recording is not at fault: its parts stay, and the same bytes are taken later."""
+    browser, whole, log = phone(visit), film(tmp_path), attitude_log()
+    with monkeypatch.context() as short:
+        short.setattr(incoming, limit, 0)
+        for tried in (1, 2):
+            answer = send_all(browser, whole, log)
+            assert (answer.status_code, code(answer)) == (503, "MACHINE_SHORT")
+            row = PhoneRecording().fetch1()
+            assert row["phone_state"] == "uploading"
+            assert row["phone_error"].startswith(f"{tried} x MACHINE_SHORT")
+    left = [p.name for p in (tmp_path / "archive" / "_phone").rglob("*") if p.is_file()]
+    assert sorted(left, key=int) == [str(n) for n in range(len(parts_of(whole + log)))]
+    assert send(browser, whole, log)["state"] == "received"
+    assert PhoneRecording().fetch1("phone_error") == ""
+
+
+def test_the_recording_of_one_visit_does_not_wait_for_that_of_another(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """One server: while a file of the first visit is being opened, that of the second is taken."""
+    slow, quick = film(tmp_path, "slow"), film(tmp_path, "quick")
+    other, opened, go_on = new_visit("2026-02-10"), threading.Event(), threading.Event()
+    check = incoming.check_opens
+
+    def waits(path: Path) -> None:
+        if path.read_bytes() == slow:
+            opened.set()
+            assert go_on.wait(60.0)
+        check(path)
+
+    monkeypatch.setattr(phone_uploads, "check_opens", waits)
+    first = phone(visit)
+    second = TestClient(first.app, base_url=web.BASE)
+    take(second, link_of(other))
+    with first, ThreadPoolExecutor(1) as thread:
+        second.portal = first.portal  # of one loop, as in the server
+        waiting = thread.submit(send, first, slow)
+        assert opened.wait(60.0)
+        assert send(second, quick)["state"] == "received"
+        assert not waiting.done()
+        go_on.set()
+        assert waiting.result()["state"] == "received"
+
+
+def test_a_part_that_comes_again_while_the_recording_is_registered_is_not_kept(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    browser, whole = phone(visit), film(tmp_path)
+    told = begin(browser, whole)
+    keep = phone_uploads.keep_part
+    for n, part in enumerate(parts_of(whole)):
+        put(browser, told["number"], n * 4096, part, len(whole))
+
+    def registered_first(*args: Any) -> None:
+        owner = phone_of(browser.cookies["pbl_phone"])
+        sent = phone_recordings.recording(owner, told["number"])
+        phone_uploads.register(owner, sent, phone_uploads.put_together(owner, sent))
+        keep(*args)
+
+    monkeypatch.setattr(phone_uploads, "keep_part", registered_first)
+    assert put(browser, told["number"], 0, parts_of(whole)[0], len(whole)).status_code == 204
+    assert not list((tmp_path / "archive" / "_phone").rglob("*"))
+
+
 def test_parts_that_were_changed_on_the_way_are_sent_again(visit: int, tmp_path: Path):
     """Each part has the sum that its request states, but together they are another recording than was announced."""
     browser, whole = phone(visit), film(tmp_path)
@@ -541,6 +626,51 @@ def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(incoming, "KEPT_FREE", 10**18)
     answer = phone(visit).post("/phone/recordings.json", json=stated(film(tmp_path)))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_room_is_promised_to_all_recordings_that_were_begun(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Twice its length for each: the parts, and the whole beside them."""
+    one, two = film(tmp_path, "one"), film(tmp_path, "two")
+    disk = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + 3 * len(one)))
+    browser = phone(visit)
+    first = begin(browser, one)
+    answer = browser.post("/phone/recordings.json", json=stated(two))
+    assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+    assert [row["phone_recording"] for row in PhoneRecording().to_dicts()] == [first["number"]]
+    assert send(browser, one)["state"] == "received"
+    assert send(browser, two)["state"] == "received"
+
+
+def test_no_part_takes_the_room_that_is_kept_free(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    browser, whole = phone(visit), film(tmp_path)
+    told = begin(browser, whole)
+    with monkeypatch.context() as full:
+        full.setattr(incoming, "KEPT_FREE", 10**18)
+        answer = put(browser, told["number"], 0, parts_of(whole)[0], len(whole))
+        assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+        to = browser_uploads.place(visit)
+        arriving = browser_uploads.Arriving(to, "walk.mp4")
+        with pytest.raises(OSError, match="kept free"):
+            arriving.write(b"a piece, whatever length was announced")
+        arriving.discard()
+    assert begin(browser, whole)["missing"] == list(range(len(parts_of(whole))))
+    assert send(browser, whole)["state"] == "received"
+
+
+def test_parts_of_a_recording_that_did_not_go_on_give_their_room_back(visit: int, tmp_path: Path):
+    browser, whole, other = phone(visit), film(tmp_path), film(tmp_path, "other")
+    for one in (whole, other):
+        put(browser, begin(browser, one)["number"], 0, parts_of(one)[0], len(one))
+    old, new = sorted((tmp_path / "archive" / "_phone" / "P001").iterdir())
+    for path in (old / "0", old):
+        os.utime(path, times=(time.time() - 8 * 86_400,) * 2)
+    done = CliRunner().invoke(cron, ["release"])
+    assert "removed 1 recordings" in done.output
+    assert (old.exists(), new.exists()) == (False, True)
+    assert send(browser, whole)["state"] == "received"  # the phone has it still
 
 
 def test_the_size_of_a_part_is_that_of_the_page(visit: int):

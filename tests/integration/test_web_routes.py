@@ -75,6 +75,7 @@ EXPECTED = {
     "POST /visits/1/film": (DECIDE, ""),
     "POST /visits/1/film/end": (DECIDE, ""),
     "GET /phone/open": ("*", ""),
+    "POST /phone/open": ("*", ""),
     "GET /phone/offline.js": ("*", ""),
     "GET /phone/store.js": ("*", ""),
     "GET /phone/authority.crt": ("*", ""),

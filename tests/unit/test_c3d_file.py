@@ -144,7 +144,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def notes(trial: Any) -> str:
-    return "".join(c.advice for c in trial.events.qc if c.check == "c3d_assumptions")
+    return "".join(c.advice for c in trial.events.qc if c.check == "input_assumptions")
 
 
 def refused(code: str, path: Path, **options: Any) -> str:
@@ -529,3 +529,33 @@ def test_files_that_ezc3d_has_written_again(shared_data, tmp_path):
         for angle, values in getattr(first.series, side).items():
             np.testing.assert_allclose(getattr(again.series, side)[angle], values, atol=1e-4)
     assert first.events.events == again.events.events
+
+
+# ------------------------------------------------------------------------------------------- against the person
+def test_units_and_rates_that_no_person_has_are_refused(file):
+    written = Written(walk()).events()
+    written.parameters["POINT:UNITS"] = ["m"]
+    assert "millimetres read as metres" in refused("GAIT_INPUT", written.save(file))
+    written = Written(walk(1200))
+    written.parameters["POINT:RATE"] = F32(10 * RATE)
+    written.header["rate"] = 10 * RATE
+    assert "strides of 0.1 s" in refused("GAIT_INPUT", written.save(file))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [("Knee", lambda x: -x), ("Hip", lambda x: x + 180), ("Ankle", lambda x: x - 150)],
+)
+def test_angles_that_no_joint_has_are_refused(file, name, change):
+    points = {n: change(x) if n.endswith(name + "Angles") else x for n, x in walk().items()}
+    with pytest.raises(PblError, match="GAIT_INPUT") as error:
+        read_lab_trial(Written(points).events().save(file))
+    assert name.lower() in error.value.found
+
+
+def test_angles_of_the_other_side_are_refused(file):
+    points = walk()
+    other = {n: points[{"L": "R", "R": "L"}[n[0]] + n[1:]] if n.endswith("Angles") else x for n, x in points.items()}
+    trial = read_lab_trial(Written(other).events().save(file))
+    with pytest.raises(PblError, match="knees bent by 8 deg in what the events call swing"):
+        gait_metrics([trial], model="gillette-2008")

@@ -352,13 +352,24 @@ def test_the_weights_are_those_that_the_method_names():
     about = load(params.model)[1]
     assert about["train"]["seed"] == 0
     assert about["reliability"]["expected_error"] < 0.01
-    assert METHODS.find("phase-transformer-v2") == method
+    assert METHODS.find("phase-transformer-v3") == method
 
 
-def test_rows_of_the_first_version_stand():
-    """Its turns are judged by time; its hash is the one that stored rows name."""
-    params = dataclasses.replace(METHODS.find().params, walking=WalkingParams())
-    assert METHODS.make("phase-transformer", 1, params).hash.startswith("9f9ad11a864dcb24")
+def test_rows_of_earlier_versions_stand():
+    """Turns of the first are judged by time, neither is mirrored; their hashes are those that stored rows name."""
+    second = dataclasses.replace(METHODS.find().params, mirrored=False)
+    assert METHODS.make("phase-transformer", 2, second).hash == "9844ae859a517ec9"
+    first = dataclasses.replace(second, walking=WalkingParams())
+    assert METHODS.make("phase-transformer", 1, first).hash == "9f9ad11a864dcb24"
+
+
+def test_events_of_the_second_version_stay():
+    """Times (s) as version 2 found them before it had a successor."""
+    method = METHODS.make("phase-transformer", 2, dataclasses.replace(METHODS.find().params, mirrored=False))
+    found = detect_events(feet_of(truth_of(seed=1, seconds=6.0)), method)
+    np.testing.assert_allclose(
+        [e.time_s for e in found.events][::4], [0.0279, 1.1366, 2.2468, 3.3587, 4.477, 5.5921], atol=2e-4
+    )
 
 
 def test_what_counts_as_turning_does_not_follow_the_speed():

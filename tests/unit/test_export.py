@@ -23,7 +23,8 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS, ExportOptions, write_export
 from pbl_pipeline.export.columns import Column, Labels, Table, lines, number_cells, text_cells, write_csv
 from pbl_pipeline.fit import TrialFit
-from pbl_pipeline.gait import GaitMetrics, gait_metrics, trial_poses
+from pbl_pipeline.gait import GaitMetrics, angle_series, gait_metrics, read_lab_trial, trial_poses
+from pbl_pipeline.gait.c3d_file import C3dFile
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import FAIL, Check
@@ -283,6 +284,16 @@ def test_the_floor_is_at_0_where_it_was_found(walk, tmp_path):
     assert json.loads((tmp_path / "a" / "export.json").read_text())["trials"]["walk"]["ground"] == ground
 
 
+def test_the_floor_is_followed_to_the_ends_of_a_recording(walk, tmp_path):
+    qpos, time = walk.qpos.copy(), walk.time_s
+    # As in the demonstration, the floor seems to rise where the person comes and to sink where the person goes.
+    qpos[:, walk.joint_names.index("pelvis_ty")] -= 0.11 * np.abs(time - time.mean())
+    fit = with_markers(dataclasses.replace(walk, qpos=qpos))
+    pelvis, _ = _heights(written(Recording.of("walk", fit), tmp_path / "a", "trc", "mot"))
+    step = 17  # frames
+    assert [pelvis[:step].mean(), pelvis[-step:].mean()] == pytest.approx([0.96, 0.96], abs=0.005)
+
+
 def test_the_floor_of_a_c3d_is_at_0(walk, tmp_path):
     file = c3d_of(written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d")
     heels = [walk.marker_names.index(f"{s}_heel") for s in ("left", "right")]
@@ -454,17 +465,121 @@ def test_sensors_of_the_phone_are_analog_channels_on_the_videos_clock(fit, tmp_p
     xyz = np.column_stack([time, 2 * time, np.full_like(time, 9.81)])  # straight lines: interpolation is exact
     log = PhoneLog(time, np.tile([1.0, 0, 0, 0], (len(time), 1)), "camera", None, "own", None, {}, "CSV")
     log = dataclasses.replace(log, sensors={"accelerometer": Sensor(time, xyz), "gyroscope": Sensor(time, xyz)})
-    file = c3d_of(written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d")
+    path = written(Recording.of("w", fit, load_log=Held((log, 0.5))), tmp_path / "a", "c3d") / "w.c3d"
+    file = c3d_of(path)
     analog = file["parameters"]["ANALOG"]
     assert analog["LABELS"]["value"][:4] == [*(f"phone_accelerometer_{a}" for a in "xyz"), "phone_gyroscope_x"]
     assert analog["UNITS"]["value"][:4] == ["m/s^2"] * 3 + ["rad/s"]
     assert analog["RATE"]["value"][0] == 120  # the multiple of 30 Hz that is not below the sensor's 100
     values = file["data"]["analogs"][0]
+    np.testing.assert_allclose(C3dFile(path.read_bytes()).analogs().reshape(-1, 6).T, values, atol=1e-5)
     at = np.arange(values.shape[1]) / 120
     inside = (at >= 0.5) & (at <= 5.49)
     np.testing.assert_allclose(values[1, inside], 2 * (at[inside] - 0.5), atol=1e-5)
     assert np.isnan(values[:, at < 0.49]).all()
     assert np.isnan(values[:, at > 5.51]).all()
+
+
+# -------------------------------------------------------------------------------------------------------- Plug-in Gait
+@pytest.fixture(scope="module")
+def pig(walk, tmp_path_factory) -> tuple[Path, GaitMetrics]:
+    """A C3D with Plug-in Gait's names, and what we measured of the walk."""
+    measures = gait_metrics([walk])
+    recording = Recording.of("walk", walk).with_measured(measures.trials[0])
+    out = tmp_path_factory.mktemp("pig") / "a"
+    return written(recording, out, "c3d", names="plug-in-gait") / "walk.c3d", measures
+
+
+def test_our_reader_of_laboratories_finds_the_same_walk(pig, walk):
+    path, measures = pig
+    found, own = read_lab_trial(path), angle_series(walk)
+    for ours, theirs in ((own.left, found.series.left), (own.right, found.series.right)):
+        for name, values in ours.items():
+            pelvis = 12.0 if name in ("pelvis_tilt", "hip_flexion") else 0.0
+            np.testing.assert_allclose(theirs[name], values + pelvis, atol=1e-4, err_msg=name)
+    events = measures.trials[0].events.events
+    assert [(e.side, e.event) for e in found.events.events] == [(e.side, e.event) for e in events]
+    np.testing.assert_allclose([e.time_s for e in found.events.events], [e.time_s for e in events], atol=1e-4)
+    again = gait_metrics([found])
+    for name in ("cadence_steps_per_min", "stance_percent", "stride_length_m", "speed_m_per_s"):
+        own, read = (not_none(m.spatiotemporal.measures[name].mean) for m in (measures, again))
+        assert read == pytest.approx(own, rel=1e-3), name
+
+
+def test_markers_of_plug_in_gait_lie_on_the_body(pig, walk, tmp_path):
+    file = C3dFile(pig[0].read_bytes())
+    names = [*(s + n for n in ("ASI", "PSI", "KNE", "ANK", "HEE", "TOE") for s in "LR"), "SACR"]
+    assert file.labels[: len(names)] == names
+    assert file.texts("POINT:ANGLES") == file.labels[len(names) :]
+    assert file.texts("POINT:ANGLE_UNITS") == ["deg"]
+    at = dict(zip(names, 1e-3 * file.points(range(len(names))).transpose(1, 0, 2), strict=True))
+    np.testing.assert_allclose(at["SACR"], (at["LPSI"] + at["RPSI"]) / 2, atol=1e-6)
+    own = C3dFile((written(Recording.of("walk", walk), tmp_path / "a", "c3d") / "walk.c3d").read_bytes())
+    assert own.labels == list(walk.marker_names)
+    for name, point in (("KNE", "knee"), ("ANK", "ankle"), ("HEE", "heel")):
+        for letter, side in (("L", "left"), ("R", "right")):
+            joint = 1e-3 * own.points([own.labels.index(f"{side}_{point}")])[:, 0]
+            off = np.linalg.norm(at[letter + name] - joint, axis=1)
+            assert 0.02 < off.mean() < 0.09, name  # the landmarks are inside, the markers on the skin
+
+
+def test_angles_of_uneven_frames_are_interpolated_as_the_markers_are(walk, tmp_path):
+    kept = np.delete(np.arange(120), [30, 61, 62])
+    fields = {f: getattr(walk, f)[kept] for f in ("time_s", "qpos", "qpos_sd", "markers_world_m", "phone_quat_wxyz")}
+    residuals = {f: getattr(walk, f)[kept] for f in ("residual_2d_px", "residual_3d_m")}
+    uneven = dataclasses.replace(walk, **fields, **residuals)
+    path = written(Recording.of("w", uneven), tmp_path / "a", "c3d", names="plug-in-gait") / "w.c3d"
+    knee = read_lab_trial(path, events_csv=None).series.left["knee_flexion"]
+    np.testing.assert_allclose(knee, angle_series(walk).left["knee_flexion"], atol=1.5)
+
+
+def _by_kind(events: list[tuple[str, str, float]]) -> dict[tuple[str, str], list[float]]:
+    """(side, foot_down or foot_up) -> times in order, without those of the first and last 0.2 s."""
+    kinds = [(side, event) for side in ("left", "right") for event in ("foot_down", "foot_up")]
+    return {k: sorted(t for *kind, t in events if tuple(kind) == k and 0.2 < t < 3.8) for k in kinds}
+
+
+def _ours(measures: GaitMetrics) -> dict[tuple[str, str], list[float]]:
+    return _by_kind([(e.side, e.event, e.time_s) for e in measures.trials[0].events.events])
+
+
+@pytest.mark.needs_extra
+def test_gaitkit_finds_our_events_from_the_markers(pig, walk):
+    gaitkit: Any = pytest.importorskip("gaitkit")
+    trial = gaitkit.load_c3d(pig[0])
+    assert trial["diagnostics"]["missing_core_markers"] == []
+    knee = [frame["left_knee_angle"] for frame in trial["angle_frames"]]
+    np.testing.assert_allclose(knee, angle_series(walk).left["knee_flexion"], atol=1e-4)
+    found = gaitkit.detect(trial, method="zeni")
+    kinds = (("foot_down", found.left_hs, found.right_hs), ("foot_up", found.left_to, found.right_to))
+    events = [
+        (side, kind, event["time"])
+        for kind, *sides in kinds
+        for side, of_side in zip(("left", "right"), sides, strict=True)
+        for event in of_side
+    ]
+    for kind, times in _ours(pig[1]).items():
+        assert _by_kind(events)[kind] == pytest.approx(times, abs=0.034), kind  # a frame
+    cadence = 2 * found.cycles["cadence"].mean()  # strides, not steps
+    assert cadence == pytest.approx(not_none(pig[1].spatiotemporal.measures["cadence_steps_per_min"].mean), rel=0.01)
+
+
+@pytest.mark.needs_extra
+def test_gaitalytics_cuts_the_walk_by_our_events(pig, walk, tmp_path):
+    api: Any = pytest.importorskip("gaitalytics.api")
+    config = tmp_path / "config.yaml"
+    config.write_text(json.dumps({"analysis": {"markers": ["LKneeAngles", "RKneeAngles"]}}))
+    trial = api.load_c3d_trial(pig[0], api.load_config(config))
+    api.check_events(trial.events)
+    down = {"Foot Strike": "foot_down", "Foot Off": "foot_up"}
+    rows = trial.events[["context", "label", "time"]].itertuples(index=False)
+    events = _by_kind([(side.lower(), down[label], time) for side, label, time in rows])
+    assert events == {kind: pytest.approx(times, abs=1e-3) for kind, times in _ours(pig[1]).items()}
+    cycles = api.segment_trial(trial).get_all_cycles()
+    assert sum(map(len, cycles.values())) == pig[1].trials[0].spatiotemporal.n_cycles_found
+    knee = list(cycles["Left"][0].get_all_data().values())[-1].sel(channel="LKneeAngles_x")
+    own = next(c.curves for c in pig[1].trials[0].cycles if c.side == "left")["knee_flexion"]
+    assert np.ptp(knee.values) == pytest.approx(np.ptp(own), abs=1.0)
 
 
 # -------------------------------------------------------------------------------------------------------------- tables
@@ -755,6 +870,9 @@ def test_the_command_on_files(files, tmp_path):
     assert "fitted_with=0.1.0+gabc" in (tmp_path / "a" / "walk" / "walk.mot").read_text()
     again = pbl("export", files / "walk.fit.npz", "--to", "mot", "--out", tmp_path / "a")
     assert (again.code, again.error_code) == (1, "FILE_UNWRITABLE")
+    names = ("--to", "c3d", "--names", "plug-in-gait")
+    assert pbl("export", files / "walk.fit.npz", *names, "--out", tmp_path / "b").code == 0
+    assert C3dFile((tmp_path / "b" / "walk" / "walk.c3d").read_bytes()).labels[0] == "LASI"
 
 
 def test_the_command_with_events_and_the_phones_log(files, tmp_path):
@@ -787,6 +905,8 @@ def test_a_log_of_another_recording_is_refused(files, tmp_path):
         (["walk.fit.npz", "--to", "mot", "--subject", "P1"], "USAGE"),
         (["--subject", "P1", "--to", "c3d", "--attitude", "log.csv"], "USAGE"),
         (["walk.fit.npz", "--to", "bvh"], "USAGE"),
+        (["walk.fit.npz", "--to", "mot", "--names", "plug-in-gait"], "USAGE"),
+        (["walk.fit.npz", "--to", "c3d", "--names", "helen-hayes"], "USAGE"),
         (["nothing.fit.npz", "--to", "mot"], "FILE_MISSING"),
         (["walk.keypoints.npz", "--to", "mot"], "FILE_FORMAT"),
         (["walk.fit.npz", "--to", "mot", "--attitude", "log.csv", "--attitude", "log.csv"], "USAGE"),

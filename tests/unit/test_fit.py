@@ -260,7 +260,7 @@ def test_where_nothing_was_seen_nothing_is_known():
     confidence[65:70, :11] = 0  # the face alone
     xy = np.where(confidence[..., None] > 0, k.xy_px, np.nan)
     xyz = np.where(confidence[..., None] > 0, k.xyz_cam_m, np.nan)
-    used, _ = check_trial(dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence), "a")
+    used = check_trial(dataclasses.replace(k, xy_px=xy, xyz_cam_m=xyz, confidence=confidence), "a").used
     assert np.flatnonzero(~used).tolist() == list(range(40, 62))
 
 

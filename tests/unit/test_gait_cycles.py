@@ -15,6 +15,7 @@ from pbl_pipeline.gait import (
     FootTrajectories,
     GaitCycle,
     GaitParams,
+    Lengths,
     Measure,
     Spatiotemporal,
     cycle_checks,
@@ -27,6 +28,7 @@ from pbl_pipeline.gait._cycles import foot_passes
 from pbl_pipeline.gait.events import GaitEvent
 from pbl_pipeline.methods import stored
 from pbl_pipeline.paramset import Paramset
+from pbl_schemas import gait
 from tests import not_none
 from tests.walking_fit import walking_fit
 
@@ -414,3 +416,21 @@ def test_a_method_of_ones_own_at_another_pace(trials: list, family: str):
     plain = gait_metrics(trials[:1], params=GaitParams(gdi=GDI_METHODS[family].params), model=family)
     assert (done.gdi.model, done.gdi.params_hash) == ("any-pace", own.hash)
     assert done.gdi.mean == plain.gdi.mean
+
+
+def test_every_field_of_a_cycle_survives_its_row():
+    """All off their defaults; curves and the model of their error are in a file, and the name of the trial is given."""
+    why = Exclusion(True, True, 1.9, True, 24.5, 8, ("scale",))
+    lengths = Lengths(1.2, 0.6, 0.1, "why", True)
+    whole = GaitCycle("t", 3, 1, "right", 0.5, 0.6, 1.0, 1.1, 1.5, why, {}, "no curves", {}, lengths, far_leg="left")
+    default = GaitCycle("t", 0, 0, "left", 0.0, 0.1, 0.5, 0.6, 1.0)
+    for record, other in ((whole, default), (whole.exclusion, Exclusion()), (whole.lengths, Lengths())):
+        same = [f.name for f in dataclasses.fields(record) if getattr(record, f.name) == getattr(other, f.name)]
+        assert set(same) <= {"trial", "curves", "curves_sd", "angle_model", "error_model"}
+    for c in (whole, default):
+        assert gait.cycle_of_row(gait.row_of_cycle(c), "t") == c
+
+
+def test_a_cycle_of_odd_length_in_a_row_of_before_may_be_one_stride():
+    row = gait.row_of_cycle(cycle(Exclusion(length_ratio=1.9))) | {"cycle_length_unproven": None}
+    assert gait.cycle_of_row(row, "t").exclusion == Exclusion(length_ratio=1.9, length_unproven=True)

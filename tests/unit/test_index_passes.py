@@ -109,8 +109,8 @@ def test_walks_that_turn_their_far_leg_hold_nine_of_ten():
         person = Person(rng)
         view, other = (("", "right"), ("left", ""))[k % 2]
         held.append(holds(score_gdi(person.walks("a", view, turning(view, other))), person))
-    # 0.88 of 800 such: the interval is symmetric, the index of drawn people near the norm is not.
-    assert np.mean(held) == pytest.approx(0.88, abs=0.045)
+    # 0.94 of 1,200 such: the widening is that of the corpus.
+    assert np.mean(held) == pytest.approx(0.93, abs=0.045)
 
 
 def test_one_bad_pass_of_three_is_named_and_hardly_counts():
@@ -129,14 +129,20 @@ def test_one_bad_pass_of_three_is_named_and_hardly_counts():
 
 
 def test_of_two_passes_that_differ_none_is_right():
-    person = Person(np.random.default_rng(4))
-    good, other, bad = (person.walks(n, "left", off=o) for n, o in (("a", 0.0), ("b", 0.0), ("b", BENT_25)))
-    alike, apart = score_gdi(good + other), score_gdi(good + bad)
-    assert not agree(alike)
-    assert "a, " in agree(apart)
-    assert "b, " in agree(apart)
-    assert not_none(apart.sd) > 1.3 * not_none(alike.sd)
-    assert not_none(apart.minimal_change) > 1.3 * not_none(alike.minimal_change)
+    rng, rows = np.random.default_rng(4), []
+    for _ in range(60):
+        person = Person(rng)
+        good, other, bad = (person.walks(n, "left", off=o) for n, o in (("a", 0.0), ("b", 0.0), ("b", BENT_25)))
+        alike, apart = score_gdi(good + other), score_gdi(good + bad)
+        assert "a, " in agree(apart)
+        assert "b, " in agree(apart)
+        errors = [not_none(v) for g in (alike, apart) for v in (g.sd, g.minimal_change)]
+        rows.append([bool(agree(alike)), holds(apart, person), *errors])
+    flagged, held, sd, least, sd_apart, least_apart = np.mean(rows, axis=0)
+    assert flagged <= 1 / 60
+    assert held >= 0.72  # 0.83 of 150
+    assert sd_apart > 1.15 * sd
+    assert least_apart > least
 
 
 def pooled(trials: Sequence[tuple[str, Sequence[GaitCycle]]]) -> dict[str, Any]:
@@ -167,7 +173,7 @@ def test_the_unshrunk_index_hears_a_person_whole():
         rows.append((person.index, not_none(found.mean), not_none(found.unshrunk), not_none(found.unshrunk_sd)))
     true, index, unshrunk, sd = np.array(rows).T
     assert np.polyfit(true, index, 1)[0] < 0.8
-    assert np.polyfit(true, unshrunk, 1)[0] == pytest.approx(1.0, abs=0.12)
+    assert np.polyfit(true, unshrunk, 1)[0] == pytest.approx(0.95, abs=0.15)
     assert np.std(unshrunk - true) / np.mean(sd / MODEL.widening) == pytest.approx(1.0, abs=0.15)
     plain = score_gdi([dataclasses.replace(c, error_model="") for c in Person(rng).walks("a", "left")])
     assert (plain.unshrunk, plain.unshrunk_sd) == (plain.mean, None)

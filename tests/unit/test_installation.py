@@ -40,7 +40,7 @@ def test_no_command_begins_on_another_python(tmp_path, what):
     command = [python(tmp_path, "python3", what), *PBL[1:], "doctor"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr.startswith(f"PYTHON_UNSUPPORTED: {CODES['PYTHON_UNSUPPORTED']}\n  found:    Python 3.")
+    assert done.stderr.startswith(f"PYTHON_UNSUPPORTED: {CODES['PYTHON_UNSUPPORTED'].meaning}\n  found:    Python 3.")
     assert ("3.10 of 64 bits" if what == OLD else "of 32 bits") in done.stderr
     assert "make demo PYTHON=" in done.stderr
     assert "Traceback" not in done.stderr

@@ -51,8 +51,8 @@ from pbl_pipeline.names import check_mass
 from pbl_pipeline.report import write_report
 from pbl_pipeline.synthetic import SynthSpec, synthesise
 from pbl_pipeline.visit import Recording, Visit, load_kinetics, save_kinetics
-from research.benchmarks.kinetics_phone import vertical_rms
-from research.corpus.walks import Walk
+from research.benchmarks.kinetics_phone import tilted, vertical_rms
+from research.corpus.walks import Walk, synthetic_walk
 from tests import not_none
 from tests.walking_fit import walking_fit
 
@@ -332,6 +332,15 @@ def test_a_walk_has_measures_with_intervals(walk: TrialFit, found: Kinetics) -> 
     assert (cycle.curves_sd["force_vertical_bw"] > 0).any()
 
 
+@pytest.mark.parametrize("tilt_deg", [-1.0, 1.0])
+def test_a_vertical_that_is_off_hardly_changes_the_excursion(tilt_deg: float) -> None:
+    """The world turned across the way: the height of the centre of mass rises or falls by 2 cm in each stride."""
+    known = dataclasses.replace(synthetic_walk(3).fit(), orientation_source="measured: phone")
+    true, off = (kinetics_of(f).measures["centre_of_mass_excursion_m"] for f in (known, tilted(known, tilt_deg)))
+    assert 0.02 < true.mean < 0.07
+    np.testing.assert_allclose([off.left, off.right], [true.left, true.right], atol=0.003)
+
+
 def test_the_result_is_the_same_every_time_and_needs_no_mass(walk: TrialFit, found: Kinetics) -> None:
     again = kinetics_of(walk)
     assert (found.mass_kg, again.mass_kg) == (70.0, None)
@@ -374,6 +383,13 @@ def test_what_cannot_have_forces_says_why(walk: TrialFit, change: dict, aid: str
     assert (found.status, found.code) == ("EMPTY", code)
     assert found.measures == {}
     assert set(found.reasons) == set(MEASURES)
+
+
+def test_an_ankle_that_is_not_observed_has_no_forces(walk: TrialFit) -> None:
+    sd = np.full_like(walk.qpos, np.radians(2))
+    sd[:, BODY.joint_names.index("ankle_angle_l")] = np.radians(25)
+    found = kinetics_of(dataclasses.replace(walk, qpos_sd=sd))
+    assert (found.code, found.measures) == ("NOT_OBSERVED", {})
 
 
 def test_a_treadmill_has_no_forces(walk: TrialFit) -> None:

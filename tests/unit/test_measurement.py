@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from pbl_pipeline.gait import (
     spatiotemporal,
 )
 from pbl_pipeline.gait.measurement import (
+    USUAL_CHANGE,
     MeasureError,
     MeasurementModel,
     Pass,
@@ -260,19 +262,18 @@ def test_the_interval_holds_nine_of_ten_of_the_models_own_people():
 
 
 @pytest.mark.parametrize(
-    ("cycles", "sd", "anew"),
+    ("n", "own", "spread"),
     [
-        ({"left": 8}, np.sqrt(9 + 4 + 1), np.sqrt(4 + 1)),
-        ({"right": 8}, np.sqrt(9 + 4 + 1), np.sqrt(4 + 1)),  # a mirrored view errs alike
-        ({"left": 32}, np.sqrt(9 + 4 + 0.25), np.sqrt(4 + 0.25)),
-        ({"": 2}, np.sqrt(1 + 64), 8.0),
-        # Half of each: what lasts is the same in both, what is anew is not.
-        ({"left": 8, "": 8}, np.sqrt(2.0**2 + 0.25 * (5 + 16)), np.sqrt(0.25 * (5 + 16))),
+        (8, None, 8.0 * 8.5 + 1.2**2),
+        (32, 3.0, 8.0 * 8.5 + 1.2**2),  # less than is usual, which by chance a few cycles are
+        (8, 10.0, 0.5 * (8.0 * 8.5 + 1.2**2) + 0.5 * 10.0**2),
     ],
 )
-def test_the_error_of_a_measure_by_view_and_number_of_cycles(cycles, sd, anew):
-    assert measure_error(toy_model(), "stance_percent", cycles) == pytest.approx((sd, anew))
-    assert measure_error(toy_model(), "step_width_m", cycles) is None
+def test_the_error_of_a_measure_by_the_number_and_spread_of_cycles(n, own, spread):
+    """Mean squares over the views: 5 lasts, 2 is of the visit, 8.5 new in a pass of 8 cycles."""
+    found = measure_error(toy_model(), "stance_percent", n, own, 6)
+    assert found == pytest.approx((np.sqrt(5.0 + 2.0 + spread / n), np.sqrt(2.0 + spread / n)))
+    assert measure_error(toy_model(), "step_width_m", n) is None
 
 
 @pytest.mark.parametrize("by", [-7.0, 7.0])
@@ -280,10 +281,35 @@ def test_probabilities_of_a_change_are_those_of_a_normal_error(by):
     assert change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (3.0, 3.0)) == pytest.approx(np.sqrt(18.0))  # all is anew
     sd = change_sd((Z90 * np.sqrt(2.0) * 3.0,) * 2, (5.0, 5.0))
     assert sd == pytest.approx(np.sqrt(18.0 + 0.3 * (50.0 - 18.0)))
-    found = chances(by, sd, 5.0)
-    assert found.real == pytest.approx(normal.cdf(7.0 / sd))
-    assert found.important == pytest.approx(normal.cdf(2.0 / sd))
+    assert chances(by, sd).real == pytest.approx(normal.cdf(7.0 / sd))
     assert chances(by, sd).important is None
+
+
+@pytest.mark.parametrize(("by", "sd"), [(-7.0, 5.0), (3.0, 6.0), (40.0, 2.0), (1.0, 30.0)])
+def test_probabilities_of_a_change_of_the_index_weigh_the_usual_changes(by, sd):
+    """By numerical integration of Bayes' theorem; large changes are taken as they are."""
+    true = np.linspace(-200.0, 200.0, 400_001)
+    weight = np.exp(-np.abs(true) / USUAL_CHANGE) * normal.pdf(by, true, sd)
+    same = true * np.sign(by)
+    found = chances(by, sd, 5.0)
+    assert found.real == pytest.approx(weight[same > 0].sum() / weight.sum(), abs=1e-4)
+    assert found.important == pytest.approx(weight[same > 5.0].sum() / weight.sum(), abs=1e-4)
+    assert chances(0.0, sd, 5.0).real == pytest.approx(0.5)
+
+
+def test_probabilities_of_the_index_hold_among_changes_that_were_drawn():
+    """Many small changes and few large ones: of those called important with 0.65 to 0.8 so many are; a prior that takes
+    all changes as equally likely would state 0.1 more."""
+    rng = np.random.default_rng(3)
+    true, sd = rng.laplace(0.0, USUAL_CHANGE, 40_000), 6.0
+    found = true + rng.normal(0.0, sd, len(true))
+    said = np.array([chances(by, sd, 5.0) for by in found], float)
+    real = true * np.sign(found)
+    for column, limit in ((0, 0.0), (1, 5.0)):
+        for low, high in itertools.pairwise((0.05, 0.2, 0.5, 0.65, 0.8, 0.9, 0.95, 1.01)):
+            inside = (said[:, column] >= low) & (said[:, column] < high)
+            if inside.sum() > 500:
+                assert (real[inside] > limit).mean() == pytest.approx(said[inside, column].mean(), abs=0.03)
 
 
 def measured(far_leg: str = "right", error_model: str = "blazepose-33", metric: bool = False) -> Spatiotemporal:
@@ -305,10 +331,9 @@ def test_measures_of_a_visit_state_their_error():
     model, found = load_model("blazepose-33"), measured()
     stance = not_none(found["stance_percent"])
     assert stance.error_sd is not None
-    sd, anew = not_none(measure_error(model, "stance_percent", {"right": 8}))
-    chance = not_none(stance.variability) / np.sqrt(8)
-    assert stance.error_sd == pytest.approx(np.hypot(sd, chance))
-    assert stance.minimal_change == pytest.approx(Z90 * np.sqrt(2) * np.hypot(anew, chance), rel=1e-4)
+    sd, anew = not_none(measure_error(model, "stance_percent", 8, stance.variability, 6))
+    assert stance.error_sd == pytest.approx(sd)
+    assert stance.minimal_change == pytest.approx(Z90 * np.sqrt(2) * anew, rel=1e-4)
     assert stance.interval == pytest.approx((stance.mean - Z90 * stance.error_sd, stance.mean + Z90 * stance.error_sd))
     assert error_sd(found, "speed_m_per_s") == pytest.approx(0.08, abs=0.02)
 

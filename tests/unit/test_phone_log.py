@@ -305,7 +305,7 @@ def test_a_log_that_covers_half_the_trial_is_left_out_of_the_session():
     walk = observe(plain_walk(np.arange(120) / 30), np.arange(120) / 30)
     quat = hand(np.arange(41) / 10).as_quat(scalar_first=True)
     whole = dataclasses.replace(walk, phone_time_s=np.arange(41) / 10, phone_quat_wxyz=quat)
-    used, _ = check_trial(whole, "walk")
+    used = check_trial(whole, "walk").used
     assert used.all()
     half = dataclasses.replace(walk, phone_time_s=np.arange(21) / 10, phone_quat_wxyz=quat[:21])
     assert "from 0.00 to 2.00 s" in refused("PHONE_LOG", check_trial, half, "walk").found
@@ -328,12 +328,12 @@ def test_a_hole_in_a_log_is_unknown_orientation(tmp_path):
     walk = observe(plain_walk(np.arange(130) / 30), np.arange(130) / 30)
     missing = (walk.time_s > at[149]) & (walk.time_s < at[150])
     for k, lost in ((walk, False), (walk.with_attitude(attitude), missing)):
-        used, _ = check_trial(k, "walk")
+        used = check_trial(k, "walk").used
         np.testing.assert_array_equal(used, ~(missing & lost))
         assert ("not used: 1.5 to 2.5 s" in visibility(k).text()) == bool(np.any(lost))
         assert np.isnan(feet_from_keypoints(k).heel_m[missing]).all() == bool(np.any(lost))
     still = Attitude(attitude.time_s, np.tile(attitude.quat_wxyz[0], (len(at), 1)))
-    assert check_trial(walk.with_attitude(still), "walk")[0].all()  # a phone on a stand did not turn meanwhile
+    assert check_trial(walk.with_attitude(still), "walk").used.all()  # a phone on a stand did not turn meanwhile
 
 
 def test_a_log_of_one_sample_a_second_is_refused(tmp_path):

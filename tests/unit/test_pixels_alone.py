@@ -46,6 +46,15 @@ def test_the_worst_of_several_trials_counts():
     assert check.outcome == "FAIL"
 
 
+def test_a_body_that_turns_round_within_a_moment_fails():
+    qpos = FIT.qpos.copy()
+    qpos[40:, BODY.joint_names.index("pelvis_rotation")] += np.radians(130)
+    turn, _ = _depth(session(keypoints()), [dataclasses.replace(looking(90), qpos=qpos)])
+    assert (turn.check, turn.outcome) == ("pelvis_turn_without_3d_deg", "FAIL")
+    assert turn.value == pytest.approx(130, abs=10)
+    assert "which way a person faces" in turn.advice
+
+
 def test_with_depth_nothing_is_said():
     seen = keypoints(xyz_cam_m=np.ones((5, 3, 3)))
     assert _depth(session(seen), [looking(0)]) == []

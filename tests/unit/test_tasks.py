@@ -123,6 +123,83 @@ def test_half_turns_are_found_either_way_round(way: int):
     assert sum(mean[p] for p in parts) < mean["tug_time_s"]
 
 
+def parts(heading: np.ndarray, plain: TaskMotion) -> tuple[list[float | None], dict[str, str]]:
+    """Walk out, turn, walk back and turn before sitting."""
+    found, reasons = task_measures(dataclasses.replace(plain, heading_deg=heading), "tug")
+    names = ("walk_out_time_s", "turn_time_s", "walk_back_time_s", "turn_to_sit_time_s")
+    return [None if (m := found[name]) is None else m.mean for name in names], reasons
+
+
+@pytest.mark.parametrize(
+    ("seat", "turned", "bend"),
+    [(0.0, 180.0, 0.0), (28.0, 180.0, 0.0), (-40.0, 180.0, 0.0), (0.0, 152.0, 0.0), (40.0, 220.0, 0.0), (0, 180, 25.0)],
+)
+def test_parts_do_not_depend_on_how_the_person_sits_or_on_the_angle_of_a_turn(seat: float, turned: float, bend: float):
+    plain = motion([(1.0, 1.0)], [(12.0, 1.0)], 15.0)
+    t = plain.time_s
+    heading = seat * (1 - ease((t - 1.5) / 1.0)) + turned * ease((t - 4.5) / 1.5) + 200.0 * ease((t - 9.5) / 1.5)
+    heading += bend * ease((t - 6.0) / 3.5)
+    found, reasons = parts(heading, plain)
+    rise_end = 1.0 + float(np.interp(0.85, ease(_X), _X))
+    begin = 1.5 * float(np.interp(0.15, ease(_X), _X))
+    wanted = [4.5 + begin - rise_end, 1.5 * MIDDLE, 5.0 - 1.5 * MIDDLE, 1.5 * MIDDLE]
+    assert (found, reasons) == (pytest.approx(wanted, abs=0.08), {})
+
+
+def test_what_is_not_two_half_turns_has_no_parts():
+    plain = motion([(1.0, 1.0)], [(16.0, 1.0)], 19.0)
+    t = plain.time_s
+    found, reasons = parts(180.0 * sum(ease((t - at) / 1.5) for at in (4.0, 8.0, 12.0)), plain)
+    assert (found, reasons["turn_time_s"]) == ([None] * 4, "the person turned more often than twice")
+    found, reasons = parts(180.0 * ease((t - 4.0) / 1.5) + 60.0 * ease((t - 12.0) / 1.5), plain)
+    assert (found, reasons["turn_time_s"]) == ([None] * 4, "two half turns are needed, 1 were found")
+
+
+def after_an_attempt(height: float, attempt_s: float, rises: int) -> TaskMotion:
+    """Rises every four seconds and, at a time, one that ends at a fraction of the way."""
+    starts = [4.0 * (k + 1) for k in range(rises)]
+    plain = motion([(s, 1.0) for s in starts], [(s + 1.4, 1.0) for s in starts], 4.0 * rises + 5.0)
+    t = plain.time_s
+    lowered = plain.lowered - 0.45 * height * (ease((t - attempt_s) / 0.6) - ease((t - attempt_s - 0.7) / 0.6))
+    return dataclasses.replace(plain, lowered=lowered, knee_deg=180.0 * lowered)
+
+
+@pytest.mark.parametrize("height", [0.5, 0.8, 0.9])
+def test_an_attempt_is_not_a_rise_and_its_time_counts(height: float):
+    between, before = (
+        {n: m and m.mean for n, m in task_measures(after_an_attempt(height, at, 5), "sit_to_stand")[0].items()}
+        for at in (10.6, 2.0)
+    )
+    assert (
+        (between["rise_count"], between["attempt_count"]) == (before["rise_count"], before["attempt_count"]) == (5, 1)
+    )
+    assert between["rise_time_s"] == pytest.approx(MIDDLE, abs=0.02)
+    assert between["five_rises_time_s"] == pytest.approx(16.0 + MIDDLE, abs=0.02)
+    assert before["five_rises_time_s"] == pytest.approx(18.0 + MIDDLE, abs=0.15)  # the clock runs from the first
+    _, reasons = task_measures(after_an_attempt(height, 10.6, 3), "sit_to_stand")
+    assert reasons["five_rises_time_s"] == (
+        "five rises are needed, 3 were found (sat back before standing: 1, rose again before sitting: 0)"
+    )
+
+
+def test_a_high_seat_has_rises_and_a_doubtful_or_cut_one_is_not_counted():
+    high = dataclasses.replace(five_times(), lowered=0.05 + (five_times().lowered - 0.05) / 3, knee_deg=np.zeros(850))
+    assert not_none(task_measures(high, "sit_to_stand")[0]["rise_count"]).mean == 5.0
+    found, reasons = task_measures(after_an_attempt(0.95, 10.6, 5), "sit_to_stand")
+    assert found["rise_count"] is None
+    assert reasons["five_rises_time_s"] == "a rise came 95 percent of the way up: whether the person stood is not known"
+    late = {f.name: getattr(five_times(), f.name)[five_times().time_s > 1.5] for f in dataclasses.fields(TaskMotion)}
+    assert task_measures(TaskMotion(**late), "sit_to_stand")[1] == {
+        "five_rises_time_s": "the recording begins during a rise"
+    }
+    crouched = dataclasses.replace(five_times(), knee_deg=five_times().knee_deg + 40.0)
+    found, reasons = task_measures(crouched, "sit_to_stand")
+    assert not any(found.values())
+    assert (
+        reasons["rise_count"] == "the knees are never straighter than 49 degrees: whether the person stood is not known"
+    )
+
+
 def test_synthetic_squats_are_counted():
     truth = synthesise(SynthSpec("squat", 3, seconds=9.0)).truth
     names = ("time_s", "joint_names", "qpos", "scale")

@@ -343,6 +343,21 @@ def on_a_desktop(image: np.ndarray, i: int, wall: np.ndarray, dark: bool) -> np.
     return screen
 
 
+@pytest.mark.parametrize(("left", "code"), [(1 << 20, "VIDEO_NOT_A_VIDEO"), (1 << 62, "MACHINE_SHORT")])
+def test_too_little_memory_is_no_fault_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int, code: str
+):
+    """A file that asks for more than there is on a machine with memory, and a file on a machine without."""
+    (tmp_path / "a.mp4").write_bytes(b"content")
+
+    def no_memory(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(decode.av, "open", no_memory)
+    monkeypatch.setattr(decode, "_ENOUGH", left)
+    refused(code, probe, tmp_path / "a.mp4")
+
+
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 def test_a_window_on_a_desktop_is_named_as_a_screen(tmp_path, dark):
     wall = cv2.GaussianBlur(np.random.default_rng(1).normal(size=(384, 420, 3)), (0, 0), 12) * 800 + 120

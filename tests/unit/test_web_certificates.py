@@ -13,7 +13,9 @@ from cryptography import x509
 
 from pbl_pipeline.errors import PblError
 from pbl_workers.cli.web import web
-from pbl_workers.web import certificates
+from pbl_workers.web import Where, certificates
+from pbl_workers.web.access import host_name
+from tests import refused
 
 NAMES = ("127.0.0.1", "gait.example")
 
@@ -110,3 +112,42 @@ def test_the_command_makes_it_and_asks_for_accounts(home: Path):
     assert done.exception.code == "WEB_ACCOUNT"
     both = CliRunner().invoke(web, ["--tls", "--tls-cert", "a.pem", "--tls-key", "b.pem"])
     assert both.exit_code == 2
+
+
+def test_names_are_those_of_a_host_header(home: Path):
+    """Capital letters, umlauts, IPv6: what a browser sends is answered, in the certificate, and printed."""
+    where = Where("0.0.0.0", tls_cert=Path("c"), hostnames=("Gait.Example", "büro.example", "FE80:0:0::1", "LAB-PC."))
+    assert where.names == {"gait.example", "xn--bro-hoa.example", "fe80::1", "lab-pc"}
+    assert "https://[fe80::1]:8484" in where.addresses(8484)
+    cert, _ = certificates.server_certificate(sorted(where.names))
+    first = cert.read_bytes()
+    certificates.server_certificate(sorted(where.names))
+    assert cert.read_bytes() == first
+
+
+@pytest.mark.parametrize("name", ["", " ", "a b", "https://gait.example", "x" * 64, "a..b", "-a"])
+def test_what_is_no_name_of_a_host_is_refused(name: str):
+    assert "--hostname" in refused("USAGE", host_name, name).next_step
+
+
+def test_an_authority_signs_names_of_the_laboratory_alone(home: Path):
+    certificates.server_certificate(NAMES)
+    certificates.server_certificate(("192.168.1.7", "lab.local", "www.gait.example"))
+    assert "other.example" in refused("WEB_TLS", certificates.server_certificate, ("other.example",)).found
+
+
+@pytest.mark.parametrize("harm", ["lost", "damaged", "another", "open"])
+def test_an_authority_is_never_replaced_in_silence(home: Path, harm: str):
+    certificates.server_certificate(NAMES)
+    key, before = certificates.folder() / "authority.key", certificates.authority().read_bytes()
+    if harm == "lost":
+        key.unlink()
+    elif harm == "damaged":
+        key.write_bytes(key.read_bytes()[:40])
+    elif harm == "another":
+        key.write_bytes((certificates.folder() / "server.key").read_bytes())
+    else:
+        key.chmod(0o644)
+    error = refused("WEB_TLS", certificates.server_certificate, NAMES)
+    assert ("chmod 600" in error.next_step) == (harm == "open")
+    assert certificates.authority().read_bytes() == before

@@ -12,13 +12,14 @@ from pbl_pipeline.body import MARKER_SETS, load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS, check_trial, read_markers
 from pbl_pipeline.fit.checks import _vertical
-from pbl_pipeline.fit.lever_arms import OPEN_RAD, PLACED_M, lever_arms_m
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.fit.world_checks import in_upright_world
+from pbl_pipeline.gait import load_events
 from pbl_pipeline.keypoints import MultiView, WorldMarkers
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.video import CameraPose
 from research.walker.views import observe_markers, observe_views
+from tests.command import pbl
 
 NAME = "bml_movi_87"
 PARAMS = METHODS.find().params
@@ -237,17 +238,6 @@ def test_names_as_their_programs_write_them(tmp_path: Path, name: str):
     assert both.unused == (names[0],)
 
 
-@pytest.mark.parametrize(("name", "is_open"), [("mpi_inf_3dhp_17", True), ("blazepose_33", False), ("halpe_26", False)])
-def test_ankles_without_a_marker_on_the_foot_are_left_open(name: str, is_open: bool):
-    session = make_session([markers(name)], ["walk"], PARAMS)
-    lever = lever_arms_m(session, walk()[0][::10])
-    joints = list(session.body.joint_names)
-    sd = PLACED_M / np.maximum(lever, 1e-9)
-    assert (sd[joints.index("ankle_angle_r")] > OPEN_RAD) == is_open
-    assert sd[[joints.index(n) for n in ("hip_flexion_r", "hip_rotation_l", "knee_angle_l")]].max() < OPEN_RAD
-    assert np.all(session.markers.weight_3d == 1)
-
-
 def test_a_disagreement_that_nothing_explains_is_not_its_own_cause():
     """A search for the first cause of an error would never end, as a worker's job did."""
     poses = list(rig().poses)
@@ -255,3 +245,43 @@ def test_a_disagreement_that_nothing_explains_is_not_its_own_cause():
     with pytest.raises(PblError, match="VIEWS_DISAGREE") as error:
         check_trial(dataclasses.replace(rig(), poses=tuple(poses)), "walk")
     assert error.value.__cause__ is not error.value
+
+
+def test_the_world_of_a_trial_is_computed_once(monkeypatch: pytest.MonkeyPatch):
+    called = []
+
+    def counted(trial, name, table):
+        called.append(name)
+        return in_upright_world(trial, name, table)
+
+    monkeypatch.setattr("pbl_pipeline.fit.session.in_upright_world", counted)
+    make_session([markers(), moved(markers(), WORLDS["-z"])], ["a", "b"], PARAMS)
+    assert called == ["a", "b"]
+
+
+def test_zeros_of_a_trc_are_named_as_missing(tmp_path: Path):
+    trial = markers()
+    xyz = trial.xyz_world_m.copy()
+    xyz[:7, 3] = 0
+    path = trc(tmp_path / "w.trc", dataclasses.replace(trial, xyz_world_m=xyz))
+    read = read_markers(path, marker_set(NAME)).trial
+    assert not read.confidence[:7, 3].any()
+    (check,) = in_upright_world(read, "w", marker_set(NAME)).trial.origin.checks("w")
+    assert check.advice.startswith(f"w: points of three zeros count as missing (7 samples): {trial.names[3]}. ")
+
+
+@pytest.mark.parametrize("axis", ["+y", "-z"])
+def test_events_of_markers_in_another_world(tmp_path: Path, axis: str):
+    walked, time = walk(8.0)
+    trial = observe_markers(walked, time, marker_set=NAME, noise_m=0.002, drop_share=0)
+    rows = []
+    for i, seen in enumerate((trial, moved(trial, WORLDS[axis]))):
+        seen.save(tmp_path / f"{i}.npz")
+        done = pbl("events", tmp_path / f"{i}.npz", "--out", tmp_path / f"{i}.csv")
+        assert (f"stands along {axis}" in done.out) == bool(i)
+        rows.append([e.time_s for e in load_events(tmp_path / f"{i}.csv")])
+    assert len(rows[0]) > 15
+    np.testing.assert_allclose(rows[0], rows[1], atol=0.002)
+    dataclasses.replace(trial, xyz_world_m=1000 * trial.xyz_world_m).save(tmp_path / "mm.npz")
+    refusal = pbl("events", tmp_path / "mm.npz", "--out", tmp_path / "mm.csv").err
+    assert "millimetres read as metres" in " ".join(refusal.split())

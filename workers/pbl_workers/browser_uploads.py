@@ -8,22 +8,18 @@ import functools
 import hashlib
 import os
 import secrets
-import time
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_schemas import session, video, worker
 from pbl_schemas.decisions.review_decisions import record
 from pbl_schemas.intake import Registered, VisitRecord
 from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
 
-from .incoming import VIDEO_ENDINGS, Copy, check_opens, register_copies
+from .incoming import VIDEO_ENDINGS, Copy, check_log, check_opens, keep_free, register_copies
 
-#: Age at which the rest of a broken upload is removed (s).
-_REST_S = 86_400.0
-_PREFIX = "browser-"
 _refused = functools.partial(PblError, "UPLOAD_REFUSED")
 
 
@@ -69,10 +65,7 @@ class Arriving:
             )
         self._most = LARGEST_LOG if ending in LOG_ENDINGS else LARGEST
         folder = folder_of(archive_dir(), PHONE, to.subject)
-        for rest in folder.glob(f"{_PREFIX}*"):  # of a server that was ended
-            if time.time() - rest.stat().st_mtime > _REST_S:
-                rest.unlink(missing_ok=True)
-        self.path = folder / f"{_PREFIX}{secrets.token_hex(6)}{ending}"
+        self.path = folder / f"browser-{secrets.token_hex(6)}{ending}"
         self._file = open(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")  # noqa: SIM115
         self._sum, self._n = hashlib.sha256(), 0
 
@@ -87,6 +80,7 @@ class Arriving:
         if self._n > self._most:
             found, most = f"a file of more than {self._most / 1e9:g} GB", f"at most {self._most / 1e9:g} GB"
             raise _refused(found, most, "send a shorter recording", self.name)
+        keep_free(self.path.parent, len(piece))
         self._sum.update(piece)
         self._file.write(piece)
 
@@ -104,9 +98,9 @@ class Arriving:
 
 
 def check(arrived: Arriving) -> PblError | None:
-    """Return what is wrong with a file that is to be a video: VIDEO_..., or None. Its first picture is decoded."""
+    """Return what is wrong with a file that arrived, or could not be checked (`check_opens`, `check_log`); or None."""
     try:
-        check_opens(arrived.path, "a video file", "copy it from the phone again")
+        (check_log if arrived.is_log else check_opens)(arrived.path)
     except PblError as error:
         return error.with_key(arrived.name)
     return None
@@ -146,7 +140,7 @@ def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str)
     try:
         result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
-        if error.code.startswith(("DB_", "STORE_")):  # of the installation: the others would meet it as well
+        if CODES[error.code].cause == MACHINE:  # the others would meet it as well
             raise
         return Outcome(name, "refused", error=error.with_key(name))
     assert result.video_id is not None

@@ -12,6 +12,7 @@ Uploads are imported in random order, so that none waits forever behind one that
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import multiprocessing
 import os
@@ -19,12 +20,12 @@ import random
 import secrets
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 import pymysql
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
@@ -54,7 +55,7 @@ VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".webm", ".mkv", ".avi", ".3gp")
 #: Time after which a run begins no further upload, and that after which it gives up copying one (s).
 RUN_S, UPLOAD_S = 600.0, 600.0
 #: Limits for reading a sensor log (s, bytes).
-LOG_S, LOG_BYTES = 60.0, 2**30
+LOG_S, LOG_BYTES = 30.0, 2**30
 #: Limits for opening a recording (s, bytes).
 _OPEN_S, _OPEN_BYTES = 60.0, 2**31
 #: Space on the archive's disk that uploads do not fill (bytes).
@@ -179,6 +180,8 @@ def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload],
                 copies.append(_copy(drop, upload, archive, end))
             subject, session, file = recording.name.parts
             check_subject(normalised_label(subject), "rename the folder and upload again", recording.name)
+            for copy in copies[1:]:
+                check_log(copy.path)
             registered = register_copies(VisitRecord(subject, session), file, copies, archive)
         except (OSError, StillChanging, pymysql.err.Error, dj.DataJointError):
             raise
@@ -186,6 +189,12 @@ def _import_upload(drop: Folder | Bucket, recording: Upload, logs: list[Upload],
             coded = _named(name, error)
             if coded.code in _OURS:
                 raise
+            if CODES[coded.code].cause == MACHINE:
+                out.left[name] = coded
+                for copy in copies:  # the next run makes them again; one with a row was registered before
+                    if not video.Video & {"video_path": str(copy.path)}:
+                        copy.path.unlink(missing_ok=True)
+                return
             out.refused[name] = coded
             _set_aside(drop, given, copies, archive, coded)
         else:
@@ -212,8 +221,7 @@ def _copy(drop: Folder | Bucket, upload: Upload, archive: Path, end: float) -> C
     digest, n = hashlib.sha256(), 0
     folder = folder_of(archive, COPIES, normalised_label(upload.name.parts[0]))
     part = folder / f"{secrets.token_hex(6)}{upload.name.suffix.lower()}"
-    if not has_room(folder, upload.size):
-        raise OSError(f"{upload.size / 1e9:.1f} GB do not fit beside {KEPT_FREE / 1e9:.0f} GB that are kept free")
+    keep_free(folder, upload.size)
     try:
         with (
             drop.open(upload) as source,
@@ -244,6 +252,12 @@ def has_room(folder: Path, n_bytes: int) -> bool:
     return shutil.disk_usage(folder).free >= n_bytes + KEPT_FREE
 
 
+def keep_free(folder: Path, n_bytes: int) -> None:
+    """Raise OSError if so many bytes do not fit on the disk of a folder beside `KEPT_FREE`."""
+    if not has_room(folder, n_bytes):
+        raise OSError(errno.ENOSPC, f"no room beside the {KEPT_FREE / 1e9:.0f} GB that are kept free")
+
+
 def check_room(n_bytes: int, next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE, with `next_step`, if so many bytes do not fit into the archive."""
     if not has_room(archive_dir(), n_bytes):
@@ -255,35 +269,38 @@ def check_room(n_bytes: int, next_step: str) -> None:
         )
 
 
-def check_opens(path: Path, expected: str, next_step: str) -> None:
+def check_opens(path: Path) -> None:
     """Decode the first picture of a file in a process with limits. Raises `PblError` VIDEO_...: what is wrong with it;
-    VIDEO_NOT_A_VIDEO, with `expected` and `next_step`, beyond the limits."""
+    MACHINE_SHORT beyond the limits, or if the process was ended."""
+    _within_limits(read_first, path, _OPEN_S, _OPEN_BYTES)
+
+
+def check_log(path: Path) -> None:
+    """Read a sensor log in a process with limits. Raises `PblError` PHONE_LOG, FILE_FORMAT; MACHINE_SHORT."""
+    _within_limits(read_phone_log, path, LOG_S, LOG_BYTES)
+
+
+def _within_limits(read: Callable[[Path], object], path: Path, seconds: float, n_bytes: int) -> None:
     try:
-        limited(read_first, path, seconds=_OPEN_S, n_bytes=_OPEN_BYTES)
+        limited(read, path, seconds=seconds, n_bytes=n_bytes)
     except LimitExceeded as error:
         raise PblError(
-            "VIDEO_NOT_A_VIDEO", found=f"a file that takes {error} to open", expected=expected, next_step=next_step
+            "MACHINE_SHORT",
+            found=f"the file was not opened: {error}",
+            expected=f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory",
+            next_step="try again; if it stays so, give the server more memory, or fewer processes",
+            key=path,
         ) from error
 
 
 def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archive: Path) -> Registered:
-    """Move copies of a recording, and of its sensor log if there is one, to their place in the archive and register
-    them; return the outcome. `file`: the name that the recording came with.
+    """Move copies of a recording, and of its sensor log if there is one (`check_log`), to their place in the archive
+    and register them; return the outcome. `file`: the name that the recording came with.
 
     Raises `PblError`, which says what is wrong with the recording.
     """
     visit.check(file)
     recording, *logs = copies
-    for log in logs:
-        try:
-            limited(read_phone_log, log.path, seconds=LOG_S, n_bytes=LOG_BYTES)
-        except LimitExceeded as error:
-            raise PblError(
-                "PHONE_LOG",
-                found=f"a sensor log that takes {error} to read",
-                expected="the log of some minutes",
-                next_step="upload the recording without it, or with the log as its app wrote it",
-            ) from error
     folder = private_folder(folder_of(archive, "", visit.subject) / plain_name(visit.session_label))
     target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):

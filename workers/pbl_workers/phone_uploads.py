@@ -17,11 +17,11 @@ from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_opens, register_copies
+from .incoming import Copy, check_log, check_opens, check_room, keep_free, register_copies
 from .registry import FIRST
 
 
@@ -49,12 +49,20 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
     return start // PART_BYTES
 
 
+def check_promised(begun_bytes: int, next_step: str) -> None:
+    """Raise `PblError` FILE_UNWRITABLE if all recordings that were begun do not fit, each twice: the parts stay until
+    the whole is registered."""
+    here = sum(one.n_bytes for one in unfinished(archive_dir()))
+    check_room(max(2 * begun_bytes - here, 0), next_step)
+
+
 def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -> None:
     """Write a part to the archive, on disk when this returns. Raises `PblError` UPLOAD_REFUSED if the bytes are not
     those that the phone sent; OSError if it cannot be written."""
     if hashlib.sha256(body).hexdigest() != sha256:
         raise upload_refused(f"part {number} with another SHA-256 than was sent", "it is sent again")
     here = folder(phone, sent)
+    keep_free(here, len(body))
     write_text(here / str(number), body)
     sync_folders(here, here)
 
@@ -64,14 +72,28 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
     phone stated.
 
     Raises `PblError` UPLOAD_REFUSED: parts are missing, or together they are not what was announced; VIDEO_... for what
-    is not a video.
+    is not a video, PHONE_LOG; MACHINE_SHORT. Only the parts are left then.
     """
     if left := missing(phone, sent):
         raise upload_refused(f"{len(left)} of {sent.n_parts} parts are missing", "the page sends them")
     here = folder(phone, sent)
-    whole, sums = here / "video.mp4", hashlib.sha256()
-    log = here / "log.json"
-    video_sum, left_of_video = hashlib.sha256(), sent.video_bytes
+    whole, log = here / "video.mp4", here / "log.json"
+    try:
+        video_sum = _join(here, sent, whole, log)
+        check_opens(whole)
+        if sent.log_bytes:
+            check_log(log)
+    except BaseException:
+        remove_joined(phone, sent)
+        raise
+    copies = [Copy(whole, video_sum)]
+    return [*copies, Copy(log, "")] if sent.log_bytes else copies
+
+
+def _join(here: Path, sent: Sent, whole: Path, log: Path) -> str:
+    """Write video and log from the parts; return the SHA-256 of the video."""
+    keep_free(here, sent.video_bytes + sent.log_bytes)
+    sums, video_sum, left_of_video = hashlib.sha256(), hashlib.sha256(), sent.video_bytes
     with whole.open("wb") as film, log.open("wb") as beside:
         for number in range(sent.n_parts):
             body = (here / str(number)).read_bytes()
@@ -88,9 +110,13 @@ def put_together(phone: Phone, sent: Sent) -> list[Copy]:
         for number in range(sent.n_parts):
             (here / str(number)).unlink()
         raise upload_refused("parts that together have another SHA-256 than was announced", "they are sent again")
-    check_opens(whole, "a recording of the page of a phone", "film again")
-    copies = [Copy(whole, video_sum.hexdigest())]
-    return [*copies, Copy(log, "")] if sent.log_bytes else copies
+    return video_sum.hexdigest()
+
+
+def remove_joined(phone: Phone, sent: Sent) -> None:
+    """Remove what was made of the parts and is not registered; the parts stay."""
+    for name in ("video.mp4", "log.json"):
+        (folder(phone, sent) / name).unlink(missing_ok=True)
 
 
 def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:

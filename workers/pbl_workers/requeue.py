@@ -22,7 +22,15 @@ from . import queue
 from .registry import AGAIN, table_named
 
 #: Errors whose cause lies outside of the recording and may be gone tomorrow.
-OUTSIDE = ("ASSET_MISSING", "MODEL_MISSING", "VIDEO_MISSING", "WORKER_CRASH", "DEVICE_UNAVAILABLE", "STORE_UNAVAILABLE")
+OUTSIDE = (
+    "ASSET_MISSING",
+    "MODEL_MISSING",
+    "VIDEO_MISSING",
+    "WORKER_CRASH",
+    "DEVICE_UNAVAILABLE",
+    "STORE_UNAVAILABLE",
+    "MACHINE_SHORT",
+)
 #: Rows deleted in one transaction.
 CHUNK = 200
 

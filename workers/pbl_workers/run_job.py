@@ -14,7 +14,7 @@ from typing import Any
 import deepdiff
 import pymysql
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, causes
 from pbl_schemas import connection
 from pbl_schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
 from pbl_schemas.datajoint_setup import AWAY, FULL, REPEAT
@@ -207,11 +207,9 @@ def cause_outside(error: BaseException) -> str | None:
         return f"DATABASE: {type(error).__name__}: {error}"
     if isinstance(error, PblError) and error.code == "STORE_FULL":  # `pbl_schemas.origin.computes` gave it its code
         return f"STORE: {error.found}"
-    seen: BaseException | None = error
-    while seen is not None:
+    for seen in causes(error):
         if isinstance(seen, OSError) and seen.errno in STORE_GONE and not isinstance(error, PblError):
             return f"STORE: {type(seen).__name__}: {seen}"
-        seen = seen.__cause__ or seen.__context__
     return None
 
 

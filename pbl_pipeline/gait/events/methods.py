@@ -18,6 +18,6 @@ MODEL, MODEL_SHA256 = "phase-transformer-v1", "5df821c76563b25e459a6b5ed22bdba0c
 #: The function of a family takes `FootTrajectories` and the `Method`, and returns `GaitEvents`.
 METHODS: Stage[Any] = Stage("gait", "family", "phase-transformer")
 WALKING = WalkingParams(max_turn_deg_per_stride=30.0)
-METHODS.register("phase-transformer", 2, PhaseParams(MODEL, MODEL_SHA256, WALKING), detect_by_phase)
+METHODS.register("phase-transformer", 3, PhaseParams(MODEL, MODEL_SHA256, WALKING, mirrored=True), detect_by_phase)
 METHODS.register("zeni-2008", 1, EventParams(), detect_by_coordinates)
 METHODS.register("oconnor-2007", 2, FootVelocityParams(), detect_by_foot_velocity)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
+from pbl_pipeline.paramset import later
 from pbl_pipeline.qc import PASS, WARN, Check, warn_if
 
 from ._preconditions import check_preconditions, input_error
@@ -44,6 +45,9 @@ class PhaseParams:
         Added to every event of all four kinds alike, so that it changes neither step times nor supports: half of
         the 15 ms by which the model is early against the force plates of 11 children, because against the eye, on the
         one adult on video whose contacts were read, it is 10 ms late without any (docs/events.md).
+    mirrored
+        The mirror image of a walk has the mirrored events: the network's outputs for both are averaged, and the filter
+        takes all four phases alike. False up to version 2.
     """
 
     model: str
@@ -55,6 +59,7 @@ class PhaseParams:
     min_foot_downs: int = 2
     min_probability: float = 0.2
     event_delay_s: float = 0.008
+    mirrored: bool = later(False)
 
 
 def detect_by_phase(feet: FootTrajectories, method: Method[PhaseParams]) -> GaitEvents:
@@ -70,7 +75,7 @@ def detect_by_phase(feet: FootTrajectories, method: Method[PhaseParams]) -> Gait
     if grid is None or reason:
         return no_events(method.name, method.hash, feet.source, reason, advice)
     time = np.asarray(feet.time_s, float)
-    phases = predict(grid, p.model)
+    phases = predict(grid, p.model, p.mirrored)
     curve = load(p.model)[1]["probability"]
     stretches, half_seen = candidates(grid, phases, p)
     events: list[GaitEvent] = []
@@ -126,7 +131,7 @@ def candidates(grid: Any, phases: Any, p: PhaseParams) -> tuple[list[list[Candid
             half_seen += 1
             continue
         z = np.where(np.logical_or.reduce(below, axis=1)[:, None], phases.z[cut], 0)
-        smooth = smooth_phases(z, 1 / GRID_HZ, p.filter)
+        smooth = smooth_phases(z, 1 / GRID_HZ, p.filter, p.mirrored)
         time_s, own = grid.time_s[cut], []
         for k, (side, event) in enumerate(PHASE_ORDER):
             for at in crossings(smooth.phase_rad[:, k], time_s):

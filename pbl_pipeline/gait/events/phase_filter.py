@@ -48,8 +48,11 @@ class SmoothPhases:
     rate: Float[np.ndarray, " T"]
 
 
-def smooth_phases(z: np.ndarray, step_s: float, params: FilterParams) -> SmoothPhases:
+def smooth_phases(z: np.ndarray, step_s: float, params: FilterParams, alike: bool = False) -> SmoothPhases:
     """Consistent phases from the model's complex numbers `z` (T, 4), cos + i sin; 0 or NaN is not measured.
+
+    With `alike` each of the four phases wanders about their common one by `offset_noise`, so that no side is the first;
+    else the phase of left initial contact is the common one.
 
     The length of a number is the model's certainty: if angles scatter with variance s^2, their mean has the length
     exp(-s^2 / 2).
@@ -69,10 +72,14 @@ def smooth_phases(z: np.ndarray, step_s: float, params: FilterParams) -> SmoothP
             *[params.offset_noise**2 * step_s] * 3,
         ]
     )
+    x, p = _start(z, step_s), np.diag([1.0, 9.0, 0.5, 0.5, 0.5])
+    if alike:  # the first phase also wanders: with it the lead of the others over it
+        first = np.array([1.0, 0.0, -1.0, -1.0, -1.0])
+        noise += params.offset_noise**2 * step_s * np.outer(first, first)
+        p += 0.5 * np.outer(first, first)
     look = np.zeros((4, 5))
     look[:, 0] = 1.0
     look[1:, 2:] = np.eye(3)
-    x, p = _start(z, step_s), np.diag([1.0, 9.0, 0.5, 0.5, 0.5])
     before_x, before_p, after_x, after_p = (np.empty((n, *s)) for s in ((5,), (5, 5), (5,), (5, 5)))
     for t in range(n):
         if t:

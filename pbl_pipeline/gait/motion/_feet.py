@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from pbl_pipeline.assumptions import check_size, check_steps, check_strides
 from pbl_pipeline.errors import PblError
 
 from ._legs import LEG_JOINTS, LEG_POINTS, BodyPoses, legs_from_points, trial_poses
@@ -142,17 +143,43 @@ def feet_from_fit(fit: TrialFit, poses: BodyPoses | None = None) -> FootTrajecto
     frame, time stamps out of order).
     """
     poses = poses or trial_poses(fit)
-    hips, knees, ankles, heels, toes = map(poses.of_sides, ("femur", "tibia", "talus", "calcn", "toes"))
-    for s, name in enumerate(("calcn_l", "calcn_r")):
-        heels[:, s] += poses.rotation[:, poses.index(name)] @ (_HEEL_IN_CALCN_M * poses.scale_of(name, fit.scale))
-    confidence = np.full((len(fit.time_s), 2), np.nan)
     # A handheld phone moves with the person: the way in its frame is not the way on the ground.
     travels = fit.camera_motion == "static"
-    unseen = ~_feet_seen(fit)
+    return feet_from_poses(fit.time_s, poses, fit.scale, "fit", travels, ~_feet_seen(fit))
+
+
+def feet_from_poses(
+    time_s: np.ndarray, poses: BodyPoses, scale: np.ndarray, source: str, travels: bool, unseen: np.ndarray
+) -> FootTrajectories:
+    """Heel, toe joint and hip centres of a body of this scale (8,) in its poses; a leg below the hip is NaN where it is
+    `unseen` (T, 2). `travels`: the pelvis' path is that over the ground. Raises `PblError` GAIT_INPUT (time stamps)."""
+    hips, knees, ankles, heels, toes = map(poses.of_sides, ("femur", "tibia", "talus", "calcn", "toes"))
+    for s, name in enumerate(("calcn_l", "calcn_r")):
+        heels[:, s] += poses.rotation[:, poses.index(name)] @ (_HEEL_IN_CALCN_M * poses.scale_of(name, scale))
     for joint in (knees, ankles, heels, toes):
         joint[unseen] = np.nan
     legs = np.stack([hips, knees, ankles, heels, toes], axis=1)
-    return _assemble(fit.time_s, hips, heels, toes, _WORLD_UP, confidence, "fit", travels, legs)
+    return _assemble(
+        time_s, hips, heels, toes, _WORLD_UP, np.full((len(poses.position_m), 2), np.nan), source, travels, legs
+    )
+
+
+#: Distance (m) from the middle of the hips to a heel of an adult who stands.
+_ADULT_M = 0.93
+
+
+def check_feet(feet: FootTrajectories, name: str) -> None:
+    """Check unit, times and strides of feet in metres against a person. Raises `PblError` GAIT_INPUT."""
+
+    def refuse(found: str, expected: str, next_step: str) -> PblError:
+        return PblError("GAIT_INPUT", found, expected, next_step, name)
+
+    check_steps(feet.time_s, refuse)
+    reach = np.linalg.norm(feet.heel_m - feet.pelvis_m[:, None], axis=2)
+    seen = reach[np.isfinite(reach)]
+    check_size(float(np.percentile(seen, 95)) / _ADULT_M if len(seen) else float("nan"), refuse)
+    across = np.eye(3)[[i for i in range(3) if i != np.argmax(np.abs(feet.up))]]
+    check_strides((feet.heel_m[:, 0] - feet.heel_m[:, 1]) @ across.T, feet.time_s, refuse)
 
 
 def _feet_seen(fit: TrialFit) -> np.ndarray:

@@ -68,9 +68,17 @@ def trial_poses(fit: TrialFit) -> BodyPoses:
             next_step="write qpos in radians, as `pbl fit` does; the angles.csv beside it is in degrees",
             key=fit.name,
         )
-    padded = np.zeros((-(-len(seen) // _CHUNK) * _CHUNK, qpos.shape[1]), np.float32)
+    return poses_of(qpos, fit.scale)
+
+
+def poses_of(qpos: np.ndarray, scale: np.ndarray) -> BodyPoses:
+    """Forward kinematics of joint values (T, 40) in m and rad, NaN in unknown frames, of a body of this scale (8,)."""
+    from pbl_pipeline.body import load_body
+
+    body, seen = load_body(), np.flatnonzero(np.all(np.isfinite(qpos), axis=1))
+    padded = np.zeros((max(-(-len(seen) // _CHUNK), 1) * _CHUNK, qpos.shape[1]), np.float32)
     padded[: len(seen)] = qpos[seen]
-    scale = np.asarray(fit.scale, np.float32)
+    scale = np.asarray(scale, np.float32)
     parts = [_compiled()(padded[i : i + _CHUNK], scale) for i in range(0, len(padded), _CHUNK)]
     position = np.full((len(qpos), len(body.body_names), 3), np.nan)
     rotation = np.full((*position.shape, 3), np.nan)

@@ -104,11 +104,13 @@ def roles(
 
 @click.command()
 @click.option("--dry-run", is_flag=True, help="Print what would be done, change nothing. Exit code 1: more is needed.")
-def migrate(dry_run: bool) -> None:
+@click.option("--force", is_flag=True, help="Go on beside running workers of another version.")
+def migrate(dry_run: bool, force: bool) -> None:
     """Bring the tables on the server to their definitions in this version: create what is missing, apply numbered
     migrations, then compare. Safe to repeat.
 
-    Rows stay as they are. Make a backup first, stop the workers, and use an account that may alter tables.
+    Rows stay as they are. Make a backup first, and use an account that may alter tables. Running workers of another
+    version are named, and refused without --force.
 
     \b
     Example: pbl db migrate --dry-run
@@ -119,7 +121,9 @@ def migrate(dry_run: bool) -> None:
 
     known = migrations.applied()
     click.echo(f"{len(known)} migrations applied so far" + (f", last {known[-1].when} UTC" if known else ""))
-    outcome = migrations.migrate(dry_run, click.echo)
+    for line in migrations.workers_of_other_versions():
+        click.echo(f"  still running: {line}")
+    outcome = migrations.migrate(dry_run, click.echo, force)
     for line in outcome.created:
         click.echo(f"  {line}")
     for title, statements in outcome.steps:

@@ -46,7 +46,15 @@ def _say_left(saved: Backup) -> None:
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--check", "only_check", is_flag=True, help="Compare the backup with its checksums; change nothing.")
 @click.option("--again", is_flag=True, help="After an interrupted restore: remove what it left and start again.")
-def restore(folder: Path, only_check: bool, again: bool) -> None:
+@click.option(
+    "--recordings-below",
+    "below",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Folder in which recordings may be written, at their registered paths. Can be repeated. "
+    "[default: PBL_ARCHIVE]",
+)
+def restore(folder: Path, only_check: bool, again: bool, below: tuple[Path, ...]) -> None:
     """Bring a backup back into an empty database and its store. An embedded database that is not running, or not there
     yet, is started.
 
@@ -56,6 +64,7 @@ def restore(folder: Path, only_check: bool, again: bool) -> None:
     \b
     Example: pbl db restore --check /backup/2026-03-01
     Example: PBL_HOME=/srv/pbl-new pbl db restore /backup/2026-03-01
+    Example: pbl db restore --recordings-below /data/videos /backup/2026-03-01
     """
     from pbl_schemas.operations import backup
 
@@ -64,7 +73,7 @@ def restore(folder: Path, only_check: bool, again: bool) -> None:
         click.echo(f"The backup of {manifest['created']} is whole: {sum(manifest['rows'].values())} rows, ", nl=False)
         click.echo(f"{manifest['n_files']} files, {manifest['n_recordings']} recordings")
         return
-    done = backup.restore(folder, again, click.echo)
+    done = backup.restore(folder, again, click.echo, below)
     click.echo(f"{sum(done.rows.values())} rows, {done.n_files} files and ", nl=False)
     click.echo(f"{done.n_recordings} recordings of {done.created} are back")
     _say_left(done)

@@ -49,6 +49,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl export --help`
 )
 @click.option("--marker-set", type=click.Path(path_type=Path), help="Table (CSV) that FILES were fitted with.")
 @click.option("--name", default="", help="Name of the person or trial for the headers; without it they are anonymous.")
+@click.option("--names", default="", metavar="plug-in-gait", help="Plug-in Gait's markers and angles in the C3D.")
 @click.option("--number-trials", is_flag=True, help="trial_1, trial_2, ... instead of the recordings' names.")
 @click.option("--markers-only", is_flag=True, help="No further points on each body in .trc and .osim.")
 @click.option("--allow-failed", is_flag=True, help="Export a fit that failed a check; the files say so.")
@@ -62,6 +63,7 @@ def export(
     attitude: tuple[Path, ...],
     marker_set: Path | None,
     name: str,
+    names: str,
     number_trials: bool,
     markers_only: bool,
     allow_failed: bool,
@@ -88,7 +90,7 @@ def export(
         raise _usage("--all with --session", "one of them")
     if not files and (attitude or marker_set):
         raise _usage("--attitude or --marker-set without FILES", "them with FILES: the tables have the log")
-    options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite)
+    options = ExportOptions(name, number_trials, not markers_only, allow_failed, overwrite, names)
     check_export(formats, out, options)
     wanted = {column: value for column, value in named.items() if value is not None}
     if many:

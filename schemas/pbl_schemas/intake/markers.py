@@ -40,6 +40,7 @@ class LaboratoryMarkers(Recording):
     found: MarkerFile = dataclasses.field(init=False)
     about: dict[str, str] = dataclasses.field(default_factory=dict, init=False)  # which set: columns of MarkerRecording
     in_view_share: float = dataclasses.field(default=np.nan, init=False)
+    turned: str = dataclasses.field(default="", init=False)  # a note where the vertical is another axis
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -110,7 +111,10 @@ class LaboratoryMarkers(Recording):
         from pbl_pipeline.fit import check_trial
 
         method = library_methods.stored(**method_row(fit.FitMethod, chosen))
-        _, self.in_view_share = check_trial(self.found.trial, self.files[0].path.stem, method, self.found.markers)
+        checked = check_trial(self.found.trial, self.files[0].path.stem, method, self.found.markers)
+        self.in_view_share = checked.whole_share
+        if checked.world is not None and checked.world.axis:
+            self.turned = f"; the body stands along {checked.world.axis} of the world as read: the fit turns it"
 
     def check_session(self, session_id: int) -> None:
         there = video.MarkerRecording * video.Video.proj("session_id") & {"session_id": session_id}
@@ -140,4 +144,4 @@ class LaboratoryMarkers(Recording):
             files = {"markers_file": folder / "markers.npz", "marker_table_file": self._table}
             video.MarkerRecording.insert1({**row, **files})
         unused = f"; not in the marker set: {', '.join(self.found.unused)}" if self.found.unused else ""
-        return [self.found.text() + unused]
+        return [self.found.text() + unused + self.turned]

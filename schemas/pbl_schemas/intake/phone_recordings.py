@@ -6,6 +6,7 @@ import dataclasses
 import datetime
 import functools
 import hashlib
+import re
 import secrets
 from collections.abc import Mapping
 from typing import Any
@@ -34,6 +35,10 @@ _refused = functools.partial(
     next_step='press "Film with a phone" on the page of the visit and scan the new code; recordings on this phone '
     "are kept",
 )
+
+
+_TAKEN = "a link that another phone has opened"
+_TRIED = re.compile(r"(\d+) x ")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,18 +122,26 @@ def use_link(key: str, cookie: str) -> str | None:
 
     The phone that opens a link first is the only one that it opens for. Raises `PblError` PHONE_LINK.
     """
-    link = _valid(PhoneLink & {"link_key_sha256": hashed(key)})
-    if cookie and link["link_phone_sha256"] == hashed(cookie):
+    if is_open(key, cookie):
         return None
     new = secrets.token_urlsafe(32)
     bound = PhoneLink.connection.query(
         f"UPDATE {PhoneLink.full_table_name} SET link_phone_sha256 = %s"  # noqa: S608  DataJoint's own name
-        " WHERE phone_link = %s AND link_phone_sha256 = ''",
-        args=(hashed(new), link["phone_link"]),
+        " WHERE link_key_sha256 = %s AND link_phone_sha256 = ''",
+        args=(hashed(new), hashed(key)),
     )
     if int(bound.rowcount) != 1:
-        raise _refused("a link that another phone has opened")
+        raise _refused(_TAKEN)
     return new
+
+
+def is_open(key: str, cookie: str) -> bool:
+    """Return whether the phone with a cookie has opened a link, by its key; False for a link that no phone has opened.
+    Raises `PblError` PHONE_LINK for one that is not known, has ended or that another phone has opened."""
+    phone = _valid(PhoneLink & {"link_key_sha256": hashed(key)})["link_phone_sha256"]
+    if phone and not (cookie and phone == hashed(cookie)):
+        raise _refused(_TAKEN)
+    return bool(phone)
 
 
 def phone_of(cookie: str) -> Phone:
@@ -201,6 +214,18 @@ def begin(phone: Phone, stated: object) -> Sent:
     return _sent((PhoneRecording & same).fetch1())
 
 
+def begun_bytes(days: float) -> int:
+    """Return the length of all recordings that phones began to send within so many days and have not ended (byte)."""
+    since = utc_now() - datetime.timedelta(days=days)
+    begun = PhoneRecording & {"phone_state": UPLOADING} & f"phone_created > '{since:%F %T}'"
+    return int(sum(sum(begun.to_arrays(name)) for name in ("phone_video_size", "phone_log_size")))
+
+
+def not_begun(number: int) -> None:
+    """Take back that a recording was begun, of which nothing is here; the phone begins it again."""
+    (PhoneRecording & {"phone_recording": number, "phone_state": UPLOADING}).delete_quick()
+
+
 def recording(phone: Phone, number: int) -> Sent:
     """Return a recording of the phone's visit. Raises `PblError` DB_NOT_FOUND for that of another one."""
     rows = (PhoneRecording & {"phone_recording": number, "session_id": phone.session_id}).to_dicts()
@@ -237,13 +262,21 @@ def filming(session_id: int) -> dict[str, Any]:
 
 def received(number: int, video_id: int) -> None:
     """Note that a recording is registered as a video."""
-    PhoneRecording.update1({"phone_recording": number, "phone_state": RECEIVED, "video_id": video_id})
+    row = {"phone_recording": number, "phone_state": RECEIVED, "phone_error": "", "video_id": video_id}
+    PhoneRecording.update1(row)
 
 
 def refused(number: int, error: PblError) -> None:
     """Note that a recording cannot be taken, and why."""
     row = {"phone_recording": number, "phone_state": REFUSED, "phone_error": error.short()[:1000]}
     PhoneRecording.update1(row)
+
+
+def not_yet(number: int, error: PblError) -> None:
+    """Note that a recording could not be taken this time, for what is no fault of it, and how often that was."""
+    before = (PhoneRecording & {"phone_recording": number}).fetch1("phone_error")
+    tried = int(found[1]) + 1 if (found := _TRIED.match(before)) else 1
+    PhoneRecording.update1({"phone_recording": number, "phone_error": f"{tried} x {error.short()}"[:1000]})
 
 
 def upload_refused(found: str, next_step: str = "film again; if it happens again, report it") -> PblError:

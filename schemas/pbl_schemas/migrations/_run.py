@@ -11,6 +11,7 @@ from typing import Any
 
 import pymysql
 
+from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_schemas import connection
 from pbl_schemas.chain import tables
@@ -22,6 +23,8 @@ from pbl_schemas.tables_version import applied, numbered, record, refuse_newer, 
 
 _error = functools.partial(PblError, "DB_MIGRATION")
 
+#: Age of the last heartbeat up to which a worker counts as running (s).
+SEEN_S = 120.0
 #: Time for which a migration waits for the end of another one (s).
 LOCK_S = 5
 
@@ -91,16 +94,33 @@ def available() -> list[Migration]:
     return [Migration(n, name, module.statements) for n, name, module in loaded]
 
 
-def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
+def workers_of_other_versions() -> list[str]:
+    """Return the live workers of another version of the code, in words."""
+    if (connection.schema_name("worker"), "worker") not in catalog.names():
+        return []
+    rows = connection.connect().query(
+        f"SELECT worker_host, worker_pid, worker_version FROM `{connection.schema_name('worker')}`.worker"  # noqa: S608
+        " WHERE worker_stopped IS NULL AND worker_seen > NOW(3) - INTERVAL %s SECOND AND worker_version <> %s",
+        args=(SEEN_S, code_version()[:64]),
+    )
+    return [f"process {pid} on {host}, pbl-pipeline {version}" for host, pid, version in rows.fetchall()]
+
+
+def migrate(dry_run: bool = False, say: Say = lambda _: None, force: bool = False) -> Outcome:
     """Bring the tables on the server to their definitions in this version of the code. Safe to repeat.
 
-    Needs an account that may create and alter tables. Stop the workers before.
+    Needs an account that may create and alter tables.
 
     Raises `PblError` DB_MIGRATION when the plan leaves differences that no migration removes (before anything is done),
-    when the database has seen a newer version of the code, or when another process is migrating it; DB_REFUSED when the
-    account may not alter tables.
+    when workers of another version are running, when the database has seen a newer version of the code, or when another
+    process is migrating it; DB_REFUSED when the account may not alter tables.
 
-    `dry_run`: change nothing, return what would be done.
+    Parameters
+    ----------
+    dry_run
+        Change nothing, return what would be done.
+    force
+        Go on beside workers of another version, which write rows as their version does until they end.
     """
     refuse_newer()
     if dry_run:
@@ -109,8 +129,16 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None) -> Outcome:
         cursor.execute("SELECT GET_LOCK(%s, %s)", (f"{connection.prefix()}_migrate", LOCK_S))
         if (cursor.fetchone() or (0,))[0] != 1:
             raise _error("another process is migrating this database", "one at a time", "wait until it has ended")
-        if left := _plan().open:
-            raise _differs(left)
+        plan = _plan()
+        if plan.open:
+            raise _differs(plan.open)
+        running = workers_of_other_versions() if plan.created or any(s for _, s in plan.steps) else []
+        if running and not force:
+            raise _error(
+                f"workers of another version are running: {'; '.join(running)}",
+                "no process that writes rows as another version does",
+                "stop them (they end after the job in hand), or repeat with --force",
+            )
         created = _bind(create=True)
         steps = _apply(cursor, say)
     _reread()  # also where nothing was left to do: an earlier run may have ended before it came to this

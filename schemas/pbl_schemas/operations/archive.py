@@ -11,11 +11,13 @@ SUBJECT is `_` for uploads under a name that is not a code.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pbl_pipeline import settings
 
@@ -26,6 +28,8 @@ from .folders import private_folder, remove_empty, write_json
 #: (`worker.installation_lock`).
 LOCK = "incoming"
 REFUSED, COPIES, PHONE = "_refused", ".incoming", "_phone"
+#: Age at which the parts of a recording that did not go on are removed (days).
+UNFINISHED_DAYS = 7.0
 _SEEN = "seen.json"
 
 
@@ -51,6 +55,34 @@ def files_of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", R
         for path in folder.rglob("*")
         if path.is_symlink() or not path.is_dir()
     )
+
+
+class Unfinished(NamedTuple):
+    """What came of a recording that is not whole: its folder or file, its length (byte), the time of its last part."""
+
+    path: Path
+    n_bytes: int
+    last_s: float
+
+
+def unfinished(archive: Path) -> list[Unfinished]:
+    """Return what phones and browsers have begun to send, while other processes write and remove it."""
+    out = []
+    for path in (archive / PHONE).glob("*/*"):
+        with contextlib.suppress(FileNotFoundError):
+            own, files = path.stat(), [f.stat() for f in (path.iterdir() if path.is_dir() else (path,))]
+            last_s = max([own.st_mtime, *(f.st_mtime for f in files)])
+            out.append(Unfinished(path, sum(f.st_size for f in files), last_s))
+    return out
+
+
+def remove_unfinished(archive: Path, days: float = UNFINISHED_DAYS) -> list[Unfinished]:
+    """Remove and return what did not go on for so long; the phone keeps its recording, and sends it again."""
+    old = [one for one in unfinished(archive) if one.last_s < time.time() - 86_400 * days]
+    for one in old:
+        shutil.rmtree(one.path, ignore_errors=True) if one.path.is_dir() else one.path.unlink(missing_ok=True)
+        remove_empty(one.path.parent, 1)
+    return old
 
 
 def remove_folders(archive: Path, subject: str) -> None:

@@ -17,7 +17,7 @@ import datetime
 import functools
 import gzip
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ from pbl_schemas.operations.folders import make_private, private_folder, write_j
 from pbl_schemas.store import check_store, store_error, store_errors
 
 from . import backup_files, catalog
-from .backup_files import PARTS, listed, safe_path, unwritable
+from .archive import archive_dir
+from .backup_files import PARTS, is_own_file, listed, safe_path, unwritable
 from .catalog import Column, quote
 
 FORMAT = 1
@@ -135,6 +136,10 @@ def backup(
     return Backup(folder, created, rows, manifest["n_files"], manifest["n_bytes"], len(copied.paths), copied.left)
 
 
+#: Files of a backup that its manifest has the sums of.
+_SUMMED = ("database.sql.gz", *(f"{part}.sha256" for part in PARTS))
+
+
 def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     """Compare every byte of a backup with its checksums; return the manifest. Raises `PblError` BACKUP_INVALID, which
     names the missing or changed files."""
@@ -155,7 +160,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
             f"manifest.json cannot be read ({error})", "the manifest that pbl db backup wrote", key=folder
         ) from error
     for name, sha in parts.items():
-        if not (folder / name).is_file() or sha256_of(folder / name) != sha:
+        if name not in _SUMMED or not is_own_file(folder, name) or sha256_of(folder / name) != sha:
             raise _invalid(f"{name} is missing or was changed", f"SHA-256 {sha}", key=folder)
     files = [(part, *file) for part in PARTS if f"{part}.sha256" in parts for file in listed(folder, part)]
     say(f"Checking {len(files)} files of the backup")
@@ -163,7 +168,7 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     with progress.bar("check", total=len(files), unit="file") as update:
         for part, sha, path in files:
             file = folder / part / path
-            if not file.is_file() or sha256_of(file) != sha:
+            if not is_own_file(folder / part, path) or sha256_of(file) != sha:
                 wrong.append(f"{part}/{path}")
             update(1)
     if wrong or len(files) != expected:
@@ -174,8 +179,12 @@ def check(folder: Path, say: Say = lambda _: None) -> dict[str, Any]:
     return manifest
 
 
-def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Backup:
+def restore(
+    folder: Path, again: bool = False, say: Say = lambda _: None, below: Sequence[Path] | None = None
+) -> Backup:
     """Restore a backup into an empty database and its store. Everything is checked before anything is written.
+
+    `below`: folders in which recordings may be written; None: the archive of uploads alone.
 
     Raises `PblError` BACKUP_INVALID; STORE_UNAVAILABLE; DB_REFUSED if this prefix has tables already, PBL_DB_PREFIX
     differs from the backup's, or a file of the store from the backup's.
@@ -217,7 +226,9 @@ def restore(folder: Path, again: bool = False, say: Say = lambda _: None) -> Bac
             "correct the cause and run the same with --again, which first removes what was begun",
         ) from error
     say(f"Bringing {manifest['n_recordings']} recordings back to where they were registered")
-    copied = backup_files.restore_recordings(folder)
+    with closing(connection.plain_connection()) as server:
+        registered = dict(_videos(server, prefix)) if manifest["n_recordings"] else {}
+    copied = backup_files.restore_recordings(folder, registered, below or [archive_dir()])
     about = (manifest["created"], manifest["rows"], manifest["n_files"], manifest["n_bytes"])
     return Backup(folder, *about, len(copied.paths), copied.left)
 

@@ -19,7 +19,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -150,6 +150,12 @@ def listed(folder: Path, part: str) -> Iterable[tuple[str, str]]:
         yield sha, str(safe_path(path))
 
 
+def is_own_file(folder: Path, path: str) -> bool:
+    """Return whether a path of a part of a backup is a file there, reached through no link."""
+    file = folder / path
+    return file.is_file() and not any(p.is_symlink() for p in (file, *file.parents) if p.is_relative_to(folder))
+
+
 @dataclasses.dataclass
 class Recordings:
     """Recordings that were copied."""
@@ -211,14 +217,30 @@ def _save_recording(path: Path, sha: str, target: Path, old: Path | None) -> str
     return ""
 
 
-def restore_recordings(folder: Path) -> Recordings:
-    """Copy the recordings of a backup back to where they were registered. Existing files are never changed. Raises
-    `PblError` FILE_UNWRITABLE."""
+def restore_recordings(folder: Path, registered: Mapping[str, str], below: Sequence[Path]) -> Recordings:
+    """Copy the recordings of a backup back to where they were registered. Existing files are never changed.
+
+    Parameters
+    ----------
+    registered
+        Path -> SHA-256 of the videos in the rows; what the backup lists besides is left out.
+    below
+        Folders in which files may be written; recordings elsewhere are left out.
+
+    Raises `PblError` FILE_UNWRITABLE.
+    """
     done = Recordings()
     if not (folder / f"{RECORDINGS}.sha256").exists():
         return done
+    roots = [root.resolve() for root in below]
     for sha, name in listed(folder, RECORDINGS):
         path = Path("/") / name
+        if registered.get(str(path)) != sha:
+            done.left[str(path)] = "no row names this file with these bytes"
+            continue
+        if path.is_symlink() or not any(path.parent.resolve().is_relative_to(root) for root in roots):
+            done.left[str(path)] = f"outside of {', '.join(map(str, below))} (--recordings-below FOLDER)"
+            continue
         if path.exists():
             if sha256_of(path) != sha:
                 done.left[str(path)] = "another file is there"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 import struct
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ def write_json(path: Path, content: dict[str, Any], mode: int = 0o600) -> None:
 def write_text(path: Path, content: str | bytes, mode: int = 0o600) -> None:
     """Write a file with these permissions, atomically: no reader, and no power cut, leaves half of it. Raises OSError
     if it cannot be written; the file that was there is unchanged."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")  # of this call: threads write the same file
     try:
         with os.fdopen(os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as out:
             if hasattr(os, "fchmod"):  # not on Windows before Python 3.13

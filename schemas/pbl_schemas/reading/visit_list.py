@@ -203,9 +203,9 @@ def judged(
     """Judge a change.
 
     `errors`: standard deviation of the error, and minimal detectable change, of both values; None if one is not
-    known. `differs`: what was not alike (`not_alike`).
+    known. `differs`: what was not alike (`not_alike`). `important`: of the index alone.
     """
-    from pbl_pipeline.gait import Z90, chances, change_sd
+    from pbl_pipeline.gait import MEASURES_REMAIN, REMAINS, Z90, chances, change_sd
 
     if any(d.what != VIEW for d in differs):
         return Change(by, None, None, differs)
@@ -214,7 +214,8 @@ def judged(
         return Change(by, None, None, (*differs, Difference("error")))
     (sd_1, sd_2), (least_1, least_2) = zip(*known, strict=True)
     # From other sides the errors of the two views do not cancel.
-    sd = math.hypot(sd_1, sd_2) if differs else change_sd((least_1, least_2), (sd_1, sd_2))
+    remains = MEASURES_REMAIN if important is None else REMAINS
+    sd = math.hypot(sd_1, sd_2) if differs else change_sd((least_1, least_2), (sd_1, sd_2), remains)
     least = Z90 * sd if differs else max(least_1, least_2)
     return Change(by, abs(by) >= least, least, differs, *chances(by, sd, important))
 

@@ -85,16 +85,20 @@ def refresh(everything: bool) -> None:
 
 @cron.command()
 def release() -> None:
-    """Put the jobs of dead workers back into the queue.
+    """Put the jobs of dead workers back into the queue, and remove parts of recordings that did not go on for a week.
 
     Example: pbl cron release
     """
     import pbl_schemas
+    from pbl_schemas.operations.archive import archive_dir, remove_unfinished
     from pbl_workers.recover import free_dead
 
     pbl_schemas.activate(methods=False)
     freed = {t.__name__: n for t in pbl_schemas.computed_tables() if (n := free_dead(t))}
     click.echo(", ".join(f"{n} of {name}" for name, n in freed.items()) or "no dead reservations")
+    if removed := remove_unfinished(archive_dir()):
+        n_bytes = sum(one.n_bytes for one in removed)
+        click.echo(f"removed {len(removed)} recordings that were begun and did not go on ({n_bytes / 1e6:.0f} MB)")
 
 
 @cron.command()

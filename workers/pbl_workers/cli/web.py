@@ -78,7 +78,7 @@ def web(
         from pbl_workers.web import certificates
 
         host, hostnames = host or "0.0.0.0", hostnames or certificates.own_names()  # noqa: S104
-        tls_cert, tls_key = certificates.server_certificate(hostnames)
+        tls_cert, tls_key = certificates.server_certificate(sorted(Where(host, hostnames=hostnames).names))
         click.echo(f"Phones trust this page once they have {certificates.authority()}: docs/capture.md")
     where = Where(host or "127.0.0.1", port, tls_cert, tls_key, behind_proxy, hostnames)
     serve(where, (name or getpass.getuser())[:64], roles, visit, folder=shown)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import hmac
+import ipaddress
 import re
 import secrets
 import time
@@ -19,6 +20,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 from pbl_schemas.intake.phone_recordings import hashed
 
@@ -35,6 +37,8 @@ RIGHTS: dict[str, frozenset[str]] = {
 BODY_BYTES = 65_536
 #: Valid addresses: without characters to escape, numbers of rows in their shortest form.
 _PATH = re.compile(r"/|(?:/(?:[A-Za-z_][A-Za-z0-9._-]*|[1-9][0-9]{0,8}(?:\.json)?))+")
+#: Names of hosts in a Host header, as DNS has them.
+_HOST = re.compile(r"(?!-)[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*")
 #: Searches that a session remembers.
 _SEARCHES = 200
 
@@ -240,6 +244,28 @@ class Gate:
         if not _PATH.fullmatch(request.scope["path"]):
             return "address"
         return "" if request.method in ("GET", "HEAD") or _from_here(headers) else "token"
+
+
+def host_name(stated: str) -> str:
+    """Return a name or address as a browser sends it in a Host header: lower case, other letters than a to z as DNS
+    has them (IDNA), addresses in their short form. Raises `PblError` USAGE for what is neither."""
+    text = stated.strip().rstrip(".").removeprefix("[").removesuffix("]")
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
+        pass
+    try:
+        name = text.encode("idna").decode().lower()
+    except UnicodeError:
+        name = ""
+    if not _HOST.fullmatch(name):
+        raise PblError(
+            "USAGE",
+            found=f"the name of a host {ascii(stated)[:100]}",
+            expected="a name such as gait.example.org, or an address, without https:// and port",
+            next_step="correct --hostname, or the name of this machine",
+        )
+    return name
 
 
 def host_of(header: str) -> str:

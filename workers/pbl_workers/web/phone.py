@@ -8,9 +8,11 @@ import dataclasses
 import functools
 import io
 import json
+import logging
 import re
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import segno
 from markupsafe import Markup
@@ -27,13 +29,13 @@ from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import Step, steps_of
+from pbl_schemas.operations.archive import UNFINISHED_DAYS
 from pbl_schemas.reading.usable import Next, Usable, computed, next_pass, usable
 
 from .. import phone_uploads
-from ..incoming import check_room
 from ..process_queue import ProcessQueue
 from . import certificates
-from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, sender
+from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, read_form, sender
 from .address import FILM, OPEN, Address, number_of
 from .computing import Target
 from .computing import begin as compute
@@ -54,6 +56,9 @@ _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9
 _SAID = "capture."
 _NEXT_STEP = "tell who runs the server; the recording stays on the phone until there is room"
 _on_disk = functools.partial(on_disk, _NEXT_STEP)
+#: Recordings of all visits that are put together and opened at a time.
+_OPENED_AT_ONCE = 4
+log = logging.getLogger(__name__)
 
 
 class Phones:
@@ -71,7 +76,9 @@ class Phones:
 
 
 def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue, target: Target) -> list[Address]:
-    finishing = asyncio.Lock()
+    #: Of each visit one recording at a time is finished; of all, as many are opened at once.
+    finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
+    opening = asyncio.Semaphore(_OPENED_AT_ONCE)
 
     async def make(request: Request) -> Response:
         fields = await form_of(request)
@@ -100,9 +107,16 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         await tables.ask(phone_recordings.end_link, number, link)
         return RedirectResponse(f"/visits/{number}#film", 303)
 
+    async def ask(request: Request) -> Response:
+        """Ask whether this is the phone: what only looks at an address (a preview, HEAD) does not take the link."""
+        key = request.query_params.get("key", "")
+        if await tables.ask(phone_recordings.is_open, key, phones.cookie.of(request)):
+            return RedirectResponse("/phone", 303)
+        return pages.show(request, "open.html", key=key)
+
     async def opened(request: Request) -> Response:
-        mine = phones.cookie.of(request)
-        cookie = await tables.ask(phone_recordings.use_link, request.query_params.get("key", ""), mine)
+        key, mine = (await read_form(request)).get("key", ""), phones.cookie.of(request)
+        cookie = await tables.ask(phone_recordings.use_link, key, mine)
         response = RedirectResponse("/phone", 303)
         if cookie is not None:
             phones.cookie.set(response, cookie, int(3600 * MOST_HOURS))
@@ -167,23 +181,30 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         sha256 = request.headers.get("x-sha256", "")
         await _on_disk(phone_uploads.keep_part, request.state.phone, sent, number, body, sha256)
         try:
-            await recording(request)
+            sent = await recording(request)
         except PblError as error:
             await removed(request, sent, error)
             raise
+        if sent.state != UPLOADING:  # it was finished while this part came again
+            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
         return Response(status_code=204)
 
     async def finish(request: Request) -> Response:
         await _body(request, "application/json", BODY_BYTES)
         phone: Phone = request.state.phone
-        async with finishing:
+        async with finishing.setdefault(phone.session_id, asyncio.Lock()):
             sent = await recording(request)
             if sent.state == UPLOADING:
                 try:
-                    copies = await _on_disk(phone_uploads.put_together, phone, sent)
+                    async with opening:
+                        copies = await _on_disk(phone_uploads.put_together, phone, sent)
                     await tables.ask(phone_uploads.register, phone, sent, copies)
                 except PblError as error:
-                    if not error.code.startswith(("VIDEO_", "PHONE_LOG")):
+                    await asyncio.to_thread(phone_uploads.remove_joined, phone, sent)
+                    if not error.final:
+                        if error.code == "MACHINE_SHORT":
+                            log.warning("recording %d of visit %d: %s", sent.number, phone.session_id, error.short())
+                            await tables.ask(phone_recordings.not_yet, sent.number, error)
                         await removed(request, sent, error)
                         raise
                     await tables.ask(phone_recordings.refused, sent.number, error)
@@ -204,8 +225,13 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
     async def told(request: Request, sent: Sent) -> Response:
         missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
         if len(missing) == sent.n_parts:
-            # Twice: the parts stay until the whole is registered.
-            await _on_disk(check_room, 2 * (sent.video_bytes + sent.log_bytes), _NEXT_STEP)
+            begun = await tables.ask(phone_recordings.begun_bytes, UNFINISHED_DAYS)
+            try:
+                await _on_disk(phone_uploads.check_promised, begun, _NEXT_STEP)
+            except PblError:
+                await tables.ask(phone_recordings.not_begun, sent.number)
+                await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+                raise
         return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
 
     async def worker(request: Request) -> Response:
@@ -223,7 +249,8 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
     return [
         Address("/visits/{session_id:int}/film", make, "decide", methods=["POST"]),
         Address("/visits/{session_id:int}/film/end", end, "decide", methods=["POST"]),
-        Address("/phone/open", opened, OPEN),
+        Address("/phone/open", ask, OPEN),
+        Address("/phone/open", opened, OPEN, methods=["POST"]),
         Address("/phone", page, FILM),
         Address("/phone/offline.js", worker, OPEN),
         Address("/phone/store.js", worker, OPEN),

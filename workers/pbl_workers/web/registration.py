@@ -6,6 +6,7 @@ import asyncio
 import datetime
 import functools
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -126,8 +127,11 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
             fields, outcomes, whole = await _receive(request, to, arriving)
             stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
             good = []
+            videos = {Path(one.name).stem for one, _ in whole if not one.is_log}
             for one, copy in whole:
-                error = None if one.is_log else await _on_disk(browser_uploads.check, one)
+                # A log alone is refused as such.
+                alone = one.is_log and Path(one.name).stem not in videos
+                error = None if alone else await _on_disk(browser_uploads.check, one)
                 if error is None:
                     good.append((one, copy))
                 else:

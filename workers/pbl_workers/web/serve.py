@@ -20,7 +20,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 
-from .access import Sessions
+from .access import Sessions, host_name
 from .accounts import Accounts
 from .app import Options, create_app
 from .connections import Connection
@@ -57,7 +57,13 @@ class Where:
     def names(self) -> frozenset[str]:
         """The names in a Host header that are answered."""
         own = {*LOOPBACK} if self.host in LOOPBACK and not self.by_accounts else {self.host} - {*EVERYWHERE}
-        return frozenset({*self.hostnames, *own})
+        return frozenset(map(host_name, (*self.hostnames, *own)))
+
+    def addresses(self, port: int) -> list[str]:
+        """Return the addresses under which browsers reach the page."""
+        scheme = "https://" if self.tls_cert is not None else ""
+        shown = (f"[{name}]" if ":" in name else name for name in sorted(self.names))
+        return [f"{scheme}{name}:{port}" if scheme else name for name in shown]
 
     def tls(self) -> ssl.SSLContext | None:
         """Return the TLS context; None without TLS. Raises OSError."""
@@ -169,20 +175,22 @@ def serve(
     listening = _listen(where.host, where.port)
     port = listening.getsockname()[1]
     if where.by_accounts:
-        app = create_app(Options(hosts=where.names, accounts=accounts, secure=True))
-        shown = ", ".join(sorted(where.names))
-        if where.tls_cert is not None:
-            shown = ", ".join(f"https://{name}:{port}" for name in sorted(where.names))
-        click.echo(f"Serving on {where.host}:{port} for {shown}, to those who have an account (pbl web account list).")
+        options = Options(hosts=where.names, accounts=accounts, secure=True)
     else:
         roles = roles if folder is None else ("reader",)
         options = Options(hosts=where.names, name=name, roles=roles, folder=folder)
-        app = _opened_by_links(where, port, options, visit)
-    click.echo("The page ends with Ctrl-C.")
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
     signal.signal(signal.SIGTERM, _end)  # uvicorn raises the signal again when it has ended, and the database ends too
     needed = database() if folder is None else contextlib.nullcontext()
-    with needed, contextlib.closing(listening), contextlib.suppress(KeyboardInterrupt):
+    # An address is printed once it can be answered: not beside a refusal of the tables.
+    with contextlib.closing(listening), needed, contextlib.suppress(KeyboardInterrupt):
+        if where.by_accounts:
+            app = create_app(options)
+            shown = ", ".join(where.addresses(port))
+            click.echo(f"Serving on {where.host}:{port} for {shown}, to those who have an account")
+        else:
+            app = _opened_by_links(where, port, options, visit)
+        click.echo("The page ends with Ctrl-C.")
         threading.Thread(target=_warm, daemon=True).start()
         uvicorn.Server(config(app, where)).run(sockets=[listening])
 

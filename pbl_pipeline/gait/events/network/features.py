@@ -40,6 +40,15 @@ def features(joints_m: Any, known: Any, up: Any, leg_m: Any, xp: ModuleType = np
     return xp.concatenate([body.reshape(n, -1), 1.0 * use.reshape(n, -1)], axis=1), hips
 
 
+def mirrored(values: np.ndarray) -> np.ndarray:
+    """Return the features (..., 40) of the mirror image of their walk: sides exchanged, the axis to the left turned."""
+    places, known = np.split(values, [3 * N_FEATURES // 4], axis=-1)
+    shape = (*values.shape[:-1], len(LEG_JOINTS), 2)
+    places = places.reshape(*shape, 3)[..., ::-1, :] * np.array([1.0, -1.0, 1.0], values.dtype)
+    known = known.reshape(shape)[..., ::-1]
+    return np.concatenate([v.reshape(*values.shape[:-1], -1) for v in (places, known)], axis=-1)
+
+
 def heading(line_m: Any, known: Any, up: Any, xp: ModuleType = np) -> Any:
     """Unit horizontal heading (T, 3) from the line right to left hip (T, 3): averaged, then left x up."""
     flat = line_m - (line_m @ up)[:, None] * up

@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.sampling import interval_of
 
-from .features import GRID_HZ, features, heading, leg_length
+from .features import GRID_HZ, features, heading, leg_length, mirrored
 
 #: Frames of a window as in training; windows begin every `HOP`; so many are computed at once.
 WINDOW, HOP, CHUNK = 256, 160, 8
@@ -23,6 +23,8 @@ WINDOW, HOP, CHUNK = 256, 160, 8
 MAX_GAP_S = 0.2
 #: Recordings with more frames a second are averaged over a step of the grid.
 _AVERAGE_ABOVE_HZ = 75.0
+#: The network's outputs of the mirror image of a walk in the order of the walk's own.
+_MIRRORED = [4, 5, 6, 7, 0, 1, 2, 3, 8]
 DATA = Path(__file__).parents[1] / "data"
 
 
@@ -80,8 +82,9 @@ def on_grid(time_s: np.ndarray, legs_m: Float[np.ndarray, "T 5 2 3"], up: np.nda
     return Grid(grid, joints, known, up, heading(line, hips, up), leg)
 
 
-def predict(grid: Grid, model: str) -> Phases:
-    """The network's phases on the grid: overlapping windows, the middle of each counting most."""
+def predict(grid: Grid, model: str, both: bool = False) -> Phases:
+    """The network's phases on the grid: overlapping windows, the middle of each counting most. `both`: the mean of the
+    outputs for the walk and for its mirror image."""
     values, seen = features(grid.joints_m, grid.known, grid.up, grid.leg_m)
     n = len(values)
     starts = list(range(0, max(n - WINDOW, 0) + HOP, HOP)) if n > WINDOW else [0]
@@ -100,7 +103,11 @@ def predict(grid: Grid, model: str) -> Phases:
         mask = np.zeros((CHUNK, WINDOW), bool)
         for k, s in enumerate(own):
             batch[k], mask[k] = padded[s : s + WINDOW], there[s : s + WINDOW]
+        if both:
+            batch, mask = np.concatenate([batch, mirrored(batch)]), np.concatenate([mask, mask])
         out = np.asarray(run(network, batch, mask), float)
+        if both:
+            out = 0.5 * (out[:CHUNK] + out[CHUNK:, :, _MIRRORED])
         for k, s in enumerate(own):
             total[s : s + WINDOW] += ramp[:, None] * out[k]
             weight[s : s + WINDOW] += ramp
