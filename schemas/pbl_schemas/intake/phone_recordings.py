@@ -273,7 +273,7 @@ def refused(number: int, error: PblError) -> None:
 
 
 def not_yet(number: int, error: PblError) -> None:
-    """Note that a recording could not be taken this time, for what is no fault of it, and how often that was."""
+    """Note that a recording could not be taken this time, for a cause outside of it, and how often."""
     before = (PhoneRecording & {"phone_recording": number}).fetch1("phone_error")
     tried = int(found[1]) + 1 if (found := _TRIED.match(before)) else 1
     PhoneRecording.update1({"phone_recording": number, "phone_error": f"{tried} x {error.short()}"[:1000]})

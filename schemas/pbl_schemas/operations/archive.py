@@ -58,7 +58,7 @@ def files_of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", R
 
 
 class Unfinished(NamedTuple):
-    """What came of a recording that is not whole: its folder or file, its length (byte), the time of its last part."""
+    """Parts of a recording that is not whole: their folder or file, length (byte), and the time of the last part."""
 
     path: Path
     n_bytes: int
