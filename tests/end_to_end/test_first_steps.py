@@ -193,6 +193,7 @@ class Reader:
         link, phone = re.search(r"<code>(http[^<]+)", browser.text), self.browser()
         assert link
         phone.show(phone.client.get(link[1]))
+        phone.press("Film with this phone")  # a script of the page does
         return phone
 
     def send(self, phone: Browser) -> None:
