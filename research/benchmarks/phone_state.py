@@ -37,14 +37,13 @@ def cpu_s(ask: Callable[[], Any], repeats: int) -> float:
     return statistics.median(spent)
 
 
-def wall_s(ask: Callable[[], Any], repeats: int) -> float:
-    """Return the time of a call (s), the median."""
-    spent = []
-    for _ in range(repeats):
-        begin = time.monotonic()
+def wall_s(ask: Callable[[], Any], seconds: float = 4 * _AGAIN_S) -> float:
+    """Return the mean time of a call (s) over so many seconds."""
+    begin, n = time.monotonic(), 0
+    while (spent := time.monotonic() - begin) < seconds or not n:
         ask()
-        spent.append(time.monotonic() - begin)
-    return statistics.median(spent)
+        n += 1
+    return spent / n
 
 
 def sent_by_phone(folder: Path, label: str) -> int:
@@ -128,7 +127,7 @@ def main(recordings: tuple[int, ...], phones: int, repeats: int) -> None:
             def look() -> None:
                 assert reviewer.get("/visits").status_code == 200
 
-            alone = wall_s(look, 20)
+            alone = wall_s(look)
 
             def repeat(ask: Callable[[], Any]) -> None:
                 while not wait.wait(_AGAIN_S):
@@ -140,7 +139,7 @@ def main(recordings: tuple[int, ...], phones: int, repeats: int) -> None:
             for thread in threads:
                 thread.start()
                 time.sleep(_AGAIN_S / phones)
-            beside = wall_s(look, 20)
+            beside = wall_s(look)
             wait.set()
             for thread in threads:
                 thread.join()

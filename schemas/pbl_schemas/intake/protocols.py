@@ -90,7 +90,7 @@ def protocols() -> list[str]:
 
 
 def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> list[Step]:
-    """Return the steps of the protocol of a visit's newest link, with what is done by its `phone_recordings.recordings`;
+    """Return the steps of the protocol of a visit's newest link, with what its `phone_recordings.recordings` have done;
     none without a protocol."""
     links = (PhoneLink & {"session_id": session_id}).to_dicts(order_by="phone_link DESC")
     if not links or links[0]["protocol"] is None:

@@ -64,8 +64,8 @@ def verdicts(videos: Collection[int]) -> dict[int, Usable]:
 def _verdict(
     checks: list[dict[str, Any]], cycles: tuple[int, int] | None, reasons: Sequence[str], state: Why | None
 ) -> Usable:
-    """Return the verdict by the checks of the keypoints, the used cycles and why there are no measures; state: of a
-    recording without checks or cycles."""
+    """Return the verdict by the checks of the keypoints, the used cycles and the reasons for missing measures; state:
+    of a recording without checks or cycles."""
     if not checks:
         assert state is not None
         return Usable(PENDING) if state.waits else Usable(UNUSABLE, (state.verdict,))

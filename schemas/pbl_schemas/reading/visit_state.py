@@ -1,4 +1,4 @@
-"""Identity of the rows of a visit, by one statement: an answer that was made from them is kept as long as it is equal."""
+"""Identity of the rows of a visit, by one statement: as long as it is equal, answers made from them can be kept."""
 
 from __future__ import annotations
 
@@ -21,22 +21,18 @@ RESULTS = ("SessionGdi", "SessionQc", "FitSelection", "EventCorrection", "NotUsa
 
 def state_of(session_id: int) -> dict[str, str]:
     """Return a text by table, and by "TABLE jobs" for its queue, which changes with the rows of a visit."""
-    parts = [_part(t.__name__, t, _columns(t), session_id) for t in _STATED]
+    parts = []
+    for table in _STATED:
+        columns = [name for name, column in table.heading.attributes.items() if not (column.json or column.codec)]
+        parts.append(_part(table.__name__, table, columns, session_id))
     for table in computed_tables():
-        parts.append(_part(table.__name__, table, [*table.heading.primary_key, *_origin(table)], session_id))
+        # The last two differ where a row was made anew.
+        columns = [name for name in table.heading.names if name.endswith(("_computed", "_seconds"))]
+        parts.append(_part(table.__name__, table, [*table.heading.primary_key, *columns], session_id))
         jobs = jobs_of(table)
         parts.append(_part(f"{table.__name__} jobs", jobs, [*jobs.heading.primary_key, *_OF_A_JOB], session_id))
     rows = video.Video.connection.query(" UNION ALL ".join(parts)).fetchall()
     return {str(name): f"{count} {found}" for name, count, found in rows}
-
-
-def _columns(table: Any) -> list[str]:
-    return [name for name, column in table.heading.attributes.items() if not (column.json or column.codec)]
-
-
-def _origin(table: Any) -> list[str]:
-    """Columns that differ where a row was made anew."""
-    return [name for name in table.heading.names if name.endswith(("_computed", "_seconds"))]
 
 
 def _part(name: str, table: Any, columns: list[str], session_id: int) -> str:
@@ -44,7 +40,7 @@ def _part(name: str, table: Any, columns: list[str], session_id: int) -> str:
     key, where = table.heading.primary_key, f"session_id = {int(session_id)}"
     for column, of in (("fit_set", fit.FitSet), ("video_id", video.Video)):
         if column in key:  # its index; others are rarely indexed
-            where = f"{column} IN (SELECT {column} FROM {of.full_table_name} WHERE session_id = {int(session_id)})"
+            where = f"{column} IN (SELECT {column} FROM {of.full_table_name} WHERE {where})"  # noqa: S608
             break
     values = ", ".join(f"QUOTE({quote(c)})" for c in columns)
     hashed = f"CAST(CONV(LEFT(MD5(CONCAT({values})), 16), 16, 10) AS UNSIGNED)"

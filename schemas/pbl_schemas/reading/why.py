@@ -94,15 +94,15 @@ def whys(videos: Iterable[int]) -> dict[int, Why]:
             several = not _of_set(table) and len(about) > 1
             for one in [[a] for a in about] if several else [about]:
                 # The rows of all sets, then their jobs.
-                own = [s for kind in found[table] for a in one for s in kind.get(a, ())] or [
-                    Step(table.__name__, NOT_YET)
-                ]
+                own = [s for of in found[table] for a in one for s in of.get(a, ())]
+                own = own or [Step(table.__name__, NOT_YET)]
                 steps += [dataclasses.replace(s, camera=one[0][1]) for s in own] if several else own
-        mark = marks.get(number)
-        verdict = f"not usable: {mark.text}; {_TAKE_BACK.format(number)}" if mark is not None else ""
-        verdict = verdict or _verdict(steps, bool(sets[trial]), go_on)
-        about_video = (row["video_name"], row["video_path"], int(row["session_id"]))
-        out[number] = Why(number, *about_video, steps, verdict, mark is not None)
+        if (mark := marks.get(number)) is None:
+            verdict = _verdict(steps, bool(sets[trial]), go_on)
+        else:
+            verdict = f"not usable: {mark.text}; {_TAKE_BACK.format(number)}"
+        of_row = (row["video_name"], row["video_path"], int(row["session_id"]))
+        out[number] = Why(number, *of_row, steps, verdict, mark is not None)
     return out
 
 
@@ -125,9 +125,9 @@ def _steps(table: Any, where: Any) -> tuple[_Steps, _Steps]:
     waiting = [int(row["video_id"]) for row in stored if row.get("choice_status") == "NEEDS_CHOICE"]
     several = tracking.with_several_methods(waiting)
 
-    def add(to: _Steps, row: Mapping[str, Any], *about: str) -> None:
-        video_id = int(row["video_id"]) if "video_id" in key else None
-        to.setdefault((row.get("fit_set"), video_id), []).append(Step(name, about[0], _method(row, table), *about[1:]))
+    def add(to: _Steps, row: Mapping[str, Any], what: str, note: str, next_step: str = "") -> None:
+        about = row.get("fit_set"), int(row["video_id"]) if "video_id" in key else None
+        to.setdefault(about, []).append(Step(name, what, _method(row, table), note, next_step))
 
     for row in stored:
         empty = bool(status) and row[status] in values
