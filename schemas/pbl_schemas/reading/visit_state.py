@@ -43,5 +43,5 @@ def _part(name: str, table: Any, columns: list[str], session_id: int) -> str:
             where = f"{column} IN (SELECT {column} FROM {of.full_table_name} WHERE {where})"  # noqa: S608
             break
     values = ", ".join(f"QUOTE({quote(c)})" for c in columns)
-    hashed = f"CAST(CONV(LEFT(MD5(CONCAT({values})), 16), 16, 10) AS UNSIGNED)"
+    hashed = f"CAST(CONV(LEFT(SHA2(CONCAT({values}), 256), 16), 16, 10) AS UNSIGNED)"
     return f"SELECT '{name}', COUNT(*), BIT_XOR({hashed}) FROM {table.full_table_name} WHERE {where}"  # noqa: S608
