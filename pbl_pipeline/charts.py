@@ -392,4 +392,4 @@ def _number(v: float) -> str:
 
 
 def _points(p: np.ndarray) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in p)
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in p.tolist())

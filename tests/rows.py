@@ -108,3 +108,26 @@ def remove_all() -> None:
             cursor.execute(f"DELETE FROM {name}")
         server.commit()
     shutil.rmtree(settings.home_dir() / "forgotten", ignore_errors=True)
+
+
+def copies(video_id: int, n: int, first: int = 0) -> None:
+    """Give n further videos, with numbers from `first` + 1 on behind that of the video, its rows in every table that
+    names it, its jobs and its phone recording."""
+    own = {
+        "video_id": "t.video_id + more.n",
+        "video_sha256": "SHA2(CONCAT(t.video_sha256, more.n), 256)",
+        "phone_recording": "t.phone_recording + more.n",
+        "phone_sha256": "SHA2(CONCAT(t.phone_sha256, more.n), 256)",
+    }
+    counted = f"WITH RECURSIVE more (n) AS (SELECT {first + 1} UNION ALL SELECT n + 1 FROM more WHERE n < {first + n})"
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SET foreign_key_checks = 0")
+        for table, columns in catalog.tables().items():
+            names = [c.name for c in columns]
+            if "video_id" not in names:
+                continue
+            values = ", ".join(own.get(name, f"t.{catalog.quote(name)}") for name in names)
+            cursor.execute(
+                f"INSERT IGNORE INTO {catalog.quote(*table)} ({', '.join(map(catalog.quote, names))}) "
+                f"{counted} SELECT {values} FROM {catalog.quote(*table)} AS t, more WHERE t.video_id = {video_id}"
+            )

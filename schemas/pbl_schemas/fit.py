@@ -20,7 +20,7 @@ from . import keypoints, lab, session, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, MadeOnce, check_columns, check_row, check_values, number, one
+from .rows import InputChanged, MadeOnce, check_columns, check_row, check_values, inside, number, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -421,7 +421,7 @@ def views_of(trials: Sequence[int]) -> dict[int, list[dict[str, Any]]]:
     """The views of trials that several cameras film, by the trial's number: rows of RigView and Rig, the video that has
     the number first. Empty for other videos."""
     found: dict[int, list[dict[str, Any]]] = {int(t): [] for t in trials}
-    rows = (video.RigView * video.Rig & [{"rig_trial": t} for t in found]).to_dicts(order_by="video_id")
+    rows = (video.RigView * video.Rig & inside("rig_trial", found)).to_dicts(order_by="video_id")
     for row in sorted(rows, key=lambda r: r["video_id"] != r["rig_trial"]):
         found[int(row["rig_trial"])].append(row)
     return found
@@ -429,7 +429,7 @@ def views_of(trials: Sequence[int]) -> dict[int, list[dict[str, Any]]]:
 
 def trials_of(videos: Sequence[int]) -> dict[int, int]:
     """Video -> trial of those videos that are one of several cameras."""
-    rows = (video.RigView & [{"video_id": v} for v in videos]).proj("rig_trial").to_dicts() if videos else []
+    rows = (video.RigView & inside("video_id", videos)).proj("rig_trial").to_dicts()
     return {int(r["video_id"]): int(r["rig_trial"]) for r in rows}
 
 

@@ -95,7 +95,7 @@ class ReadAhead:
         first = keys[0] if keys else {}
         self._common = {k: v for k, v in first.items() if all(key.get(k) == v for key in keys)}
         self._values = {"fit_set": {str(key["fit_set"]) for key in keys}, "video_id": {int(v) for v in videos}}
-        self._tables: dict[tuple, dict[Any, list[dict[str, Any]]]] = {}
+        self._tables: dict[tuple, dict[tuple, list[dict[str, Any]]]] = {}
         self._names: dict[Any, frozenset[str]] = {}
 
     def __call__(self, table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -104,17 +104,23 @@ class ReadAhead:
         names = self._names[table]
         column = next((c for c in self._values if c in names), None)
         if column is None:  # no result: a method or a norm, the same for many
-            return self._grouped((table, *key.items()), lambda: stored_rows(table, key), None)[None]
-        common = {k: v for k, v in self._common.items() if k in names and k not in self._values}
-        of_all = inside(column, self._values[column])
-        read = self._grouped((table,), lambda: stored_rows(table & of_all, common), column)
-        return [r for r in read.get(key[column], ()) if all(r[k] == v for k, v in key.items() if k in r)]
+            return self._grouped((table, *key.items()), (), lambda: stored_rows(table, key))[()]
+        by = tuple(c for c in self._values if c in names and c in key)
+        all_rows = functools.partial(self._grouped, (table,), (), lambda: self._read(table, column, names))
+        own = self._grouped((table, by), by, lambda: all_rows()[()])
+        return [r for r in own.get(tuple(key[c] for c in by), ()) if all(r[k] == v for k, v in key.items() if k in r)]
 
-    def _grouped(self, name: tuple, read: Callable[[], list[dict[str, Any]]], column: str | None) -> dict[Any, list]:
+    def _read(self, table: Any, column: str, names: frozenset[str]) -> list[dict[str, Any]]:
+        common = {k: v for k, v in self._common.items() if k in names and k not in self._values}
+        return stored_rows(table & inside(column, self._values[column]), common)
+
+    def _grouped(
+        self, name: tuple, by: tuple[str, ...], read: Callable[[], list[dict[str, Any]]]
+    ) -> dict[tuple, list[dict[str, Any]]]:
         if name not in self._tables:
-            groups: dict[Any, list] = {} if column else {None: []}
+            groups: dict[tuple, list[dict[str, Any]]] = {} if by else {(): []}
             for row in read():
-                groups.setdefault(column and row[column], []).append(row)
+                groups.setdefault(tuple(row[c] for c in by), []).append(row)
             self._tables[name] = groups
         return self._tables[name]
 

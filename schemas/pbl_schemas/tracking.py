@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from . import video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import delete_below, number, one, utc_now
+from .rows import delete_below, inside, number, one, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -258,13 +258,20 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
         SubjectOverride.insert1(row)
 
 
-def choose_command(key: Mapping[str, Any], persons: str) -> str:
-    """Return the command that decides about the tracking `key`; `persons`: such as "1|2". The method is named
-    where the video has several: each numbers people anew."""
-    several = len(TrackingSelection & {"video_id": key["video_id"]}) > 1
-    return f"pbl choose {key['video_id']} {persons}" + (
-        f" --tracking-method {key['tracking_method']}" if several else ""
-    )
+def with_several_methods(videos: Collection[int]) -> set[int]:
+    """Return those of these videos that are tracked by several methods, each of which numbers people anew."""
+    if not videos:
+        return set()
+    planned = (TrackingSelection & inside("video_id", videos)).to_arrays("video_id").tolist()
+    return {v for v in planned if planned.count(v) > 1}
+
+
+def choose_command(key: Mapping[str, Any], persons: str, several: Collection[int] | None = None) -> str:
+    """Return the command that decides about the tracking `key`; `persons`: such as "1|2". several:
+    `with_several_methods` of videos that the key's is among; asked for where it is not given."""
+    number = int(key["video_id"])
+    named = number in (with_several_methods([number]) if several is None else several)
+    return f"pbl choose {number} {persons}" + (f" --tracking-method {key['tracking_method']}" if named else "")
 
 
 def drop_outdated_choices(restriction: Any = True) -> dict[str, int]:

@@ -351,12 +351,21 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
     assert "<option>clinic</option>" in reviewer.get(f"/visits/{visit}").text
     browser = phone(visit, protocol="clinic")
     assert "<li>Timed Up and Go, from any side" in reviewer.get(f"/visits/{visit}").text
+
+    def counted() -> list[tuple[int, int]]:
+        return [(s["done"], s["waiting"]) for s in browser.get("/phone/state.json").json()["protocol"]]
+
     for n, step in enumerate((1, 2, 2)):
-        done = [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]]
-        assert done == [min(n, 1), max(0, n - 1)]
-        send(browser, film(tmp_path, f"walk{n}"), activity=steps[step - 1].activity, step=str(step))
-    assert "complete by its protocol" in reviewer.get(f"/visits/{visit}").text
+        assert counted() == [(0, min(n, 1)), (0, max(0, n - 1))]
+        whole = small_video(tmp_path, f"walk{n}").read_bytes()
+        send(browser, whole, activity=steps[step - 1].activity, step=str(step))
+    page = reviewer.get(f"/visits/{visit}").text
+    assert "0 of 2; 2 arrived, being checked" in page
+    assert "complete by its protocol" not in page  # a tick means usable
     assert sorted((video.Video & {"session_id": visit}).to_arrays("activity")) == ["tug", "tug", "walking"]
+    populate()
+    assert counted() == [(1, 0), (2, 0)]
+    assert "complete by its protocol" in reviewer.get(f"/visits/{visit}").text
     # What cannot be used does not count.
     video.NotUsable.insert1(
         {
@@ -366,7 +375,8 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
             "unusable_created": "2026-01-01 00:00:00",
         }
     )
-    assert [s["done"] for s in browser.get("/phone/state.json").json()["protocol"]] == [0, 2]
+    assert counted() == [(0, 0), (2, 0)]
+    assert "complete by its protocol" not in reviewer.get(f"/visits/{visit}").text
     answer = web.post(reviewer, f"/visits/{visit}/film", hours=2, protocol="unknown")
     assert answer.status_code == 404
 

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.video import VideoInfo, probe, read_phone_log
-from pbl_schemas import video
+from pbl_schemas import connection, video
 from pbl_schemas.capture import PhoneRecording
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.protocols import Step, add_protocol
+from pbl_schemas.reading.usable import Usable
 from pbl_workers import phone_uploads
 from pbl_workers.web import Options, Where, certificates, create_app, phone
 from tests.integration import web
@@ -360,18 +361,27 @@ def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
     assert len(PhoneRecording()) == 1
 
 
-def test_the_page_leads_through_a_protocol(camera: Any, visit: int):
+def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch: pytest.MonkeyPatch):
     add_protocol("clinic", [Step(1, "walking", "fast", "left", 1), Step(2, "tug", "", "any", 1)])
     with filming(camera, visit, protocol="clinic") as page:
         pressed = page.locator(".steps [aria-pressed='true']")
         assert pressed.inner_text() == "Walk, fast, from the left side: 0 of 1"
         film(page, 1.5)
         page.locator(".keep").click()
+        # It leads on while the server checks, and ticks off what is usable.
         page.locator(".steps [aria-pressed='true']", has_text="TUG").wait_for()
-        assert page.locator(".steps button").first.inner_text().startswith("\u2713")
+        first = page.locator(".steps button").first
+        assert first.inner_text() == "Walk, fast, from the left side: 0 of 1; 1 arrived, being checked"
         film(page, 1.5)
         page.locator(".keep").click()
+        page.get_by_text("TUG, from any side: 0 of 1; 1 arrived, being checked").wait_for()
+        assert page.locator(".complete").inner_text() == ""
+        monkeypatch.setattr(phone_recordings, "verdicts", lambda videos: {v: Usable("usable") for v in videos})
+        with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
+            cursor.execute(f"UPDATE {video.Video.full_table_name} SET video_name = CONCAT(video_name, '.mp4')")
+            server.commit()
         page.get_by_text("complete by its protocol").wait_for()
+        assert first.inner_text().startswith("\u2713")
     assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
     assert list(video.Pace().to_arrays("pace")) == ["fast"]
 

@@ -16,6 +16,7 @@ from pbl_pipeline.names import check_label
 
 from .. import session
 from ..capture import RECEIVED, REFUSED, UPLOADING, PhoneLink, PhoneRecording, Protocol
+from ..reading.usable import Usable, verdicts
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id
 
@@ -239,14 +240,17 @@ def recording(phone: Phone, number: int) -> Sent:
     return _sent(rows[0])
 
 
-def recordings(session_id: int) -> list[Sent]:
-    """Return the recordings that phones sent for a visit, the newest first."""
+def recordings(session_id: int) -> list[tuple[Sent, Usable | None]]:
+    """Return the recordings that phones sent for a visit, the newest first, with the verdicts on those that are
+    registered."""
     rows = (PhoneRecording & {"session_id": session_id}).to_dicts(order_by="phone_recording DESC")
-    return [_sent(row) for row in rows]
+    sent = [_sent(row) for row in rows]
+    judged = verdicts([one.video_id for one in sent if one.video_id is not None])
+    return [(one, None if one.video_id is None else judged[one.video_id]) for one in sent]
 
 
 def filming(session_id: int) -> dict[str, Any]:
-    """Return how a visit is filmed with phones: "links" that are open, without their sums; the recordings "sent";
+    """Return how a visit is filmed with phones: "links" that are open, without their sums; the `recordings` "sent";
     "several", whether more than one phone sent some."""
     rows = (PhoneLink & {"session_id": session_id} & "link_ended IS NULL").to_dicts(order_by="phone_link DESC")
     links = [row for row in rows if row["link_expires"] > utc_now()]

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pbl_pipeline.names import check_label
 
-from ..capture import PhoneLink, PhoneRecording, Protocol
-from ..reading.usable import UNUSABLE, usable
+from ..capture import PhoneLink, Protocol
+from ..reading.usable import PENDING, REMARKS, USABLE, Usable
 from ..rows import utc_now
 from ..transactions import in_transaction
-from .phone_recordings import MOST_RECORDINGS
+from .phone_recordings import MOST_RECORDINGS, Sent
 from .records import usage
 from .sheets import needed, number_of, read_sheets, refused
 
@@ -24,8 +25,8 @@ _STEP = {"step_no": "number", **{f"step_{name}": name for name in COLUMNS}}
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """A step of a visit's protocol. view: side from which it is filmed; done: registered recordings, without those that
-    cannot be used."""
+    """A step of a visit's protocol. view: side from which it is filmed; done: recordings that are usable; waiting:
+    those on which there is no verdict yet."""
 
     number: int
     activity: str
@@ -33,6 +34,7 @@ class Step:
     view: str
     passes: int
     done: int = 0
+    waiting: int = 0
 
     @property
     def complete(self) -> bool:
@@ -87,14 +89,18 @@ def protocols() -> list[str]:
     return sorted(str(name) for name in Protocol.to_arrays("protocol"))
 
 
-def steps_of(session_id: int) -> list[Step]:
-    """Return the steps of the protocol of a visit's newest link, with what is done; none without a protocol."""
+def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> list[Step]:
+    """Return the steps of the protocol of a visit's newest link, with what its `phone_recordings.recordings` have done;
+    none without a protocol."""
     links = (PhoneLink & {"session_id": session_id}).to_dicts(order_by="phone_link DESC")
     if not links or links[0]["protocol"] is None:
         return []
-    sent = (PhoneRecording & {"session_id": session_id} & "video_id IS NOT NULL").to_dicts()
-    done = [str(row["phone_about"].get("step")) for row in sent if usable(int(row["video_id"])).state != UNUSABLE]
-    return [dataclasses.replace(step, done=done.count(str(step.number))) for step in _steps(links[0]["protocol"])]
+    of = collections.Counter((one.about.get("step"), judged.state) for one, judged in sent if judged is not None)
+    return [
+        dataclasses.replace(step, done=of[number, USABLE] + of[number, REMARKS], waiting=of[number, PENDING])
+        for step in _steps(links[0]["protocol"])
+        for number in [str(step.number)]
+    ]
 
 
 def _steps(name: str) -> list[Step]:

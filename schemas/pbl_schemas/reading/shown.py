@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
@@ -17,7 +17,7 @@ from ..decisions.review_decisions import may_be_accepted
 from . import registered
 from .visit_list import Result, VisitRow, results_of, visits_of
 from .visits import load_recording, load_visit
-from .why import why
+from .why import whys
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait import Measure
@@ -118,10 +118,9 @@ def _mean_of(found: Sequence[tuple[Measure | None, str]]) -> tuple[Measure | Non
     return task_measure([m.mean for m, _ in known]), ""
 
 
-def _problem(video_id: int) -> str:
-    """Return why a recording has no fit, without the state of the queues where it only waits to be computed."""
-    found = why(video_id)
-    return NOT_COMPUTED if found.waits else found.verdict
+def _problems(videos: Iterable[int]) -> dict[int, str]:
+    """Return why recordings have no fit, without the state of the queues where one only waits to be computed."""
+    return {v: NOT_COMPUTED if found.waits else found.verdict for v, found in whys(videos).items()}
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
@@ -185,7 +184,7 @@ def shown_recording(video_id: int) -> ShownRecording:
     named = (visits & {"video_id": video_id}).fetch1()
     lead = fit.trial_of(video_id)
     if not recording.fitted:
-        recording = dataclasses.replace(recording, problem=_problem(video_id))
+        recording = dataclasses.replace(recording, problem=_problems([video_id])[video_id])
     return ShownRecording(
         recording=recording,
         number=video_id,
@@ -265,10 +264,11 @@ def _recordings(session_id: int) -> tuple[Recording, ...]:
 
     rows = registered.videos({"session_id": session_id}).to_dict("records")
     marked = unusable(int(row["video_id"]) for row in rows)
+    problems = _problems(n for row in rows if not row["fits"] and (n := int(row["video_id"])) not in marked)
     out = []
     for row in rows:
         number = int(row["video_id"])
-        problem = "" if row["fits"] or number in marked else _problem(number)
         condition = Condition(row["activity"], row["pace"] or "")
+        problem = problems.get(number, "")
         out.append(Recording(row["video_name"], condition=condition, problem=problem, number=number))
     return tuple(out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from pbl_pipeline.words import STAGES
@@ -12,6 +13,7 @@ from ..chain import ON_REQUEST, before, followers
 from ..decisions.not_usable import unusable
 from ..job_errors import error_code, error_found, error_next_step
 from ..jobs import jobs_of
+from ..rows import inside
 from .status import EMPTY_COLUMNS
 
 _TAKE_BACK = "no fit uses it; `pbl choose {} --usable` takes that back"
@@ -41,82 +43,118 @@ class Why:
     session_id: int
     steps: list[Step]
     verdict: str
+    marked: bool  # as not usable
 
     @property
     def waits(self) -> bool:
         """True if it waits for a worker alone, not for another video, a choice, a retry or a withdrawn mark."""
         left = [s for s in self.steps if s.what != DONE]
-        stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or bool(unusable([self.video_id]))
+        stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or self.marked
         return bool(left) and not stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
 
 
 def why(video_id: int) -> Why:
     """Return the state of a registered video in every table. `pbl_schemas.activate()` must have been called. Raises
     `PblError` DB_NOT_FOUND for an unknown video."""
-    row = video.registered_video(video_id)
+    return whys([video_id])[video_id]
+
+
+def whys(videos: Iterable[int]) -> dict[int, Why]:
+    """Return `why` of videos by their numbers, with as many queries for one as for hundreds. Raises as `why`."""
+    numbers = [int(v) for v in videos]
+    if not numbers:
+        return {}
+    rows = {int(row["video_id"]): row for row in (video.Video & inside("video_id", numbers)).to_dicts()}
+    if unknown := [v for v in numbers if v not in rows]:
+        raise video.unknown_video(unknown[0])
     # One of several cameras: from the fit on the trial counts, before it every camera.
-    trial = fit.trial_of(video_id)
-    views = fit.videos_of(trial)
-    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": trial}).to_arrays("fit_set")]
-    current = fit.current()
-    sets = [{"fit_set": k["fit_set"]} for k in (current & sets).to_dicts()] if sets else []
-    steps: list[Step] = []
-    # Markers go straight to the fit: nothing is computed before it.
-    markers = row["camera_motion"] == video.NO_CAMERA
-    for table in [t for t in computed_tables() if not (markers and t in before(fit.SessionFit))]:
-        names = table.heading.primary_key
-        of_view = "video_id" in names and table in before(fit.TrialInput)
-        about = [{"video_id": v} for v in (views if of_view else [trial])] if "video_id" in names else sets
-        if "video_id" in names and "fit_set" in names:
-            about = [{**s, "video_id": trial} for s in sets]
-        if not about:
-            steps.append(Step(table.__name__, NOT_YET))
-            continue
-        several = of_view and len(views) > 1
-        for one in [[a] for a in about] if several else [about]:
-            found = _steps(table, one) or [Step(table.__name__, NOT_YET)]
-            steps += [dataclasses.replace(s, camera=one[0]["video_id"] if several else None) for s in found]
-    mark = unusable([video_id]).get(video_id)
-    verdict = _verdict(steps, bool(sets)) if mark is None else f"not usable: {mark.text}; {_TAKE_BACK.format(video_id)}"
-    return Why(video_id, row["video_name"], row["video_path"], int(row["session_id"]), steps, verdict)
-
-
-def _steps(table: Any, about: Any) -> list[Step]:
-    out = []
-    name = table.__name__
-    prefix = next(n.removesuffix("_computed") for n in table.heading.names if n.endswith("_computed"))
-    for row in (table & about).to_dicts():
-        status, values, reason = EMPTY_COLUMNS.get(name, ("", (), None))
-        empty = bool(status) and row[status] in values
-        waits = row.get("choice_status") == "NEEDS_CHOICE"
-        note = f"{row[prefix + '_computed']} on {row[prefix + '_host']} in {row[prefix + '_seconds']:.1f} s"
-        if (empty or waits) and (text := row.get(reason or "choice_reason")):
-            note = str(text)
-        what = EMPTY if empty else "waits for a choice" if waits else DONE
-        step = tracking.choose_command(row, "PERSON") if waits else ""
-        out.append(Step(name, what, _method(row, table), note, step))
-    for row in (jobs_of(table) & about).to_dicts():
-        method = _method(row, table)
-        if row["status"] == "error":
-            message = row["error_message"]
-            note = f"{error_code(message)}: {error_found(message)}"
-            out.append(Step(name, ERROR, method, note, error_next_step(message)))
-        elif row["status"] == "reserved":
-            out.append(Step(name, RUNNING, method, f"by {row['host']}:{row['pid']} since {row['reserved_time']}"))
-        elif row["status"] == "pending":
-            late = f"; put back: {row['error_message']}" if row["error_message"] else ""
-            out.append(
-                Step(name, PENDING, method, f"priority {row['priority']}, from {row['scheduled_time']} on{late}")
-            )
+    of_camera = fit.trials_of(numbers)
+    trials = {v: of_camera.get(v, v) for v in numbers}
+    views = {t: [int(r["video_id"]) for r in of] or [t] for t, of in fit.views_of(list(trials.values())).items()}
+    sets: dict[int, list[str]] = {t: [] for t in views}
+    members = fit.FitSet.Video.proj() & inside("video_id", sets) & fit.current().proj()
+    for member in members.to_dicts(order_by="fit_set"):
+        sets[int(member["video_id"])].append(str(member["fit_set"]))
+    names_of_sets = {name for of in sets.values() for name in of}
+    of_videos = inside("video_id", {v for of in views.values() for v in of})
+    found = {t: _steps(t, inside("fit_set", names_of_sets) if _of_set(t) else of_videos) for t in computed_tables()}
+    marks, go_on = unusable(numbers), {t.__name__ for t in found if followers(t)}
+    out = {}
+    for number in numbers:
+        row, trial = rows[number], trials[number]
+        steps: list[Step] = []
+        # Markers go straight to the fit: nothing is computed before it.
+        markers = row["camera_motion"] == video.NO_CAMERA
+        for table in [t for t in found if not (markers and t in before(fit.SessionFit))]:
+            about: list[tuple[str | None, int | None]]
+            of_video = "video_id" in table.heading.primary_key
+            about = [(name, trial if of_video else None) for name in sets[trial]]
+            if not _of_set(table):
+                about = [(None, v) for v in (views[trial] if table in before(fit.TrialInput) else [trial])]
+            several = not _of_set(table) and len(about) > 1
+            for one in [[a] for a in about] if several else [about]:
+                # The rows of all sets, then their jobs.
+                own = [s for of in found[table] for a in one for s in of.get(a, ())]
+                own = own or [Step(table.__name__, NOT_YET)]
+                steps += [dataclasses.replace(s, camera=one[0][1]) for s in own] if several else own
+        if (mark := marks.get(number)) is None:
+            verdict = _verdict(steps, bool(sets[trial]), go_on)
+        else:
+            verdict = f"not usable: {mark.text}; {_TAKE_BACK.format(number)}"
+        of_row = (row["video_name"], row["video_path"], int(row["session_id"]))
+        out[number] = Why(number, *of_row, steps, verdict, mark is not None)
     return out
 
 
-def _method(row: dict[str, Any], table: Any) -> str:
+def _of_set(table: Any) -> bool:
+    return "fit_set" in table.heading.primary_key
+
+
+#: Steps of a table's rows or jobs by the set and the video in its key (None where it has no such column).
+_Steps = dict[tuple[str | None, int | None], list[Step]]
+
+
+def _steps(table: Any, where: Any) -> tuple[_Steps, _Steps]:
+    """Return the steps of the rows of a table and of its jobs."""
+    rows, jobs = _Steps(), _Steps()
+    name, key = table.__name__, table.heading.primary_key
+    prefix = next(n.removesuffix("_computed") for n in table.heading.names if n.endswith("_computed"))
+    status, values, reason = EMPTY_COLUMNS.get(name, ("", (), None))
+    columns = [f"{prefix}_{n}" for n in ("computed", "host", "seconds")] + [c for c in (status, reason) if c]
+    stored = (table.proj(*columns) & where).to_dicts(order_by="KEY")
+    waiting = [int(row["video_id"]) for row in stored if row.get("choice_status") == "NEEDS_CHOICE"]
+    several = tracking.with_several_methods(waiting)
+
+    def add(to: _Steps, row: Mapping[str, Any], what: str, note: str, next_step: str = "") -> None:
+        about = row.get("fit_set"), int(row["video_id"]) if "video_id" in key else None
+        to.setdefault(about, []).append(Step(name, what, _method(row, table), note, next_step))
+
+    for row in stored:
+        empty = bool(status) and row[status] in values
+        waits = row.get("choice_status") == "NEEDS_CHOICE"
+        note = f"{row[prefix + '_computed']} on {row[prefix + '_host']} in {row[prefix + '_seconds']:.1f} s"
+        if (empty or waits) and (text := row.get(reason or "")):
+            note = str(text)
+        what = EMPTY if empty else "waits for a choice" if waits else DONE
+        add(rows, row, what, note, tracking.choose_command(row, "PERSON", several) if waits else "")
+    columns = ["status", "error_message", "host", "pid", "reserved_time", "priority", "scheduled_time"]
+    for row in (jobs_of(table).proj(*columns) & where).to_dicts(order_by="KEY"):
+        if row["status"] == "error":
+            message = row["error_message"]
+            add(jobs, row, ERROR, f"{error_code(message)}: {error_found(message)}", error_next_step(message))
+        elif row["status"] == "reserved":
+            add(jobs, row, RUNNING, f"by {row['host']}:{row['pid']} since {row['reserved_time']}")
+        elif row["status"] == "pending":
+            late = f"; put back: {row['error_message']}" if row["error_message"] else ""
+            add(jobs, row, PENDING, f"priority {row['priority']}, from {row['scheduled_time']} on{late}")
+    return rows, jobs
+
+
+def _method(row: Mapping[str, Any], table: Any) -> str:
     return ", ".join(str(row[n]) for n in table.heading.primary_key if n.endswith("_method") or n == "norm")
 
 
-def _verdict(steps: list[Step], in_a_set: bool) -> str:
-    go_on = {t.__name__ for t in computed_tables() if followers(t)}
+def _verdict(steps: list[Step], in_a_set: bool, go_on: Collection[str]) -> str:
     for step in steps:
         stage = STAGES.get(step.table, step.table)  # a laboratory adds tables
         if step.camera is not None:

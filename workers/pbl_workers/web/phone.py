@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import io
 import json
 import logging
@@ -28,9 +29,10 @@ from pbl_pipeline.words import capital
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
-from pbl_schemas.intake.protocols import Step, steps_of
+from pbl_schemas.intake.protocols import steps_of
 from pbl_schemas.operations.archive import UNFINISHED_DAYS
-from pbl_schemas.reading.usable import Next, Usable, computed, next_pass, usable
+from pbl_schemas.reading.usable import Next, Usable, next_pass
+from pbl_schemas.reading.visit_state import RESULTS, state_of
 
 from .. import phone_uploads
 from ..process_queue import ProcessQueue
@@ -49,8 +51,8 @@ _MAY = {
 }
 #: Hours for which a link can be made on the page.
 HOURS = ("2", "8")
-#: Visits for which the gain of one more pass is kept.
-_KEPT = 20
+#: Answers that are kept, by visit and language.
+_KEPT = 200
 _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
 #: Group of the catalogue with the texts of the script.
 _SAID = "capture."
@@ -137,29 +139,37 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
 
     async def state(request: Request) -> Response:
         phone: Phone = request.state.phone
-        language = reader_language(request)
-        recordings, more, steps = await tables.ask(known, phone.session_id)
-        return JSONResponse(
-            {
-                "visit": phone.session_id,
-                "expires": f"{phone.expires.isoformat()}Z",
-                "recordings": [_shown(language, sent, judged) for sent, judged in recordings],
-                "next": next_words(language, more),
-                "protocol": [dataclasses.asdict(step) for step in steps],
-            }
-        )
+        body, tag = await tables.ask(answer, phone.session_id, reader_language(request))
+        headers = {"etag": tag}
+        if tag in request.headers.get("if-none-match", ""):  # a proxy may have called it weak
+            return Response(status_code=304, headers=headers)
+        return Response(body, media_type="application/json", headers=headers)
 
-    #: Gain of one more pass for the last visits, with the identity of their results.
-    worth: dict[int, tuple[tuple[str, ...], Next | None]] = {}
+    #: What was said of the last visits, by language, and the gain of one more pass, with the rows that they are of.
+    said: dict[tuple[int, str], tuple[dict[str, str], tuple[bytes, str]]] = {}
+    worth: dict[int, tuple[list[str | None], Next | None]] = {}
 
-    def known(session_id: int) -> tuple[list[tuple[Sent, Usable | None]], Next | None, list[Step]]:
+    def answer(session_id: int, language: str) -> tuple[bytes, str]:
+        """Return what a phone is told of its visit, and the tag of that text."""
+        rows = state_of(session_id)
+        if (kept := said.get((session_id, language))) is not None and kept[0] == rows:
+            return kept[1]
+        if len(said) >= _KEPT:
+            said.clear()
+            worth.clear()
+        results = [rows.get(name) for name in RESULTS]
+        if session_id not in worth or worth[session_id][0] != results:
+            worth[session_id] = results, next_pass(session_id)
         sent = phone_recordings.recordings(session_id)
-        judged = [(one, None if one.video_id is None else usable(one.video_id)) for one in sent]
-        if worth.get(session_id, ((), None))[0] != (now := computed(session_id)):
-            if len(worth) >= _KEPT:
-                worth.clear()
-            worth[session_id] = now, next_pass(session_id)
-        return judged, worth.get(session_id, ((), None))[1], steps_of(session_id)
+        told = {
+            "visit": session_id,
+            "recordings": [_shown(language, one, judged) for one, judged in sent],
+            "next": next_words(language, worth[session_id][1]),
+            "protocol": [dataclasses.asdict(step) for step in steps_of(session_id, sent)],
+        }
+        body = json.dumps(told).encode()
+        said[session_id, language] = rows, (body, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+        return said[session_id, language][1]
 
     async def begin(request: Request) -> Response:
         try:

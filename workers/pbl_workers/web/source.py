@@ -15,7 +15,6 @@ from pbl_schemas import privacy, video
 from pbl_schemas.decisions import candidates, review_decisions
 from pbl_schemas.intake import phone_recordings, protocols
 from pbl_schemas.reading import shown
-from pbl_schemas.reading.usable import usable
 from pbl_schemas.reading.visit_progress import Progress, visit_progress
 
 from .corrections import Judged, judged
@@ -135,8 +134,7 @@ class TablesSource:
 
         number = about.row.session_id
         film = phone_recordings.filming(number)
-        sent = [(one, None if one.video_id is None else usable(one.video_id)) for one in film["sent"]]
-        film |= {"sent": sent, "steps": protocols.steps_of(number), "protocols": protocols.protocols()}
+        film |= {"steps": protocols.steps_of(number, film["sent"]), "protocols": protocols.protocols()}
         return {
             "decisions": review_decisions.decisions(number),
             "accepted": review_decisions.accepted(about.key) if about.key else {},

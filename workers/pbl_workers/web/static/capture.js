@@ -184,7 +184,8 @@ async function sendAll() {
 /** The steps of the protocol: what came is ticked off, a tap chooses what is filmed now. @param {any[]} steps */
 function lead(steps) {
   const open = steps.find((step) => step.done < step.passes), now = steps.find((step) => step.number === chosen?.number);
-  if (!chosen || (now && chosen.done < chosen.passes && now.done >= now.passes)) choose(open ?? now ?? steps[0]);
+  const lacks = (/** @type {any} */ step) => step.done + step.waiting < step.passes;  // those that are being checked may do
+  if (!chosen || (now && lacks(chosen) && !lacks(now))) choose(steps.find(lacks) ?? open ?? now ?? steps[0]);
   else chosen = now ?? chosen;
   $(".protocol").hidden = !steps.length;
   $(".complete").textContent = steps.length && !open ? t("complete") : "";
@@ -192,7 +193,7 @@ function lead(steps) {
     const line = document.createElement("li"), button = document.createElement("button");
     const of = (/** @type {string} */ name) => (texts[`is_${step[name]}`] ? t(`is_${step[name]}`) : step[name]);
     button.type = "button";
-    button.textContent = `${step.done >= step.passes ? "\u2713 " : ""}${[of("activity"), of("pace"), t(`view_${step.view}`)].filter(Boolean).join(", ")}: ${t("done", { n: step.done, all: step.passes })}`;
+    button.textContent = `${step.done >= step.passes ? "\u2713 " : ""}${[of("activity"), of("pace"), t(`view_${step.view}`)].filter(Boolean).join(", ")}: ${t("done", { n: step.done, all: step.passes })}${step.waiting ? `; ${t("arrived", { n: step.waiting })}` : ""}`;
     button.ariaPressed = String(step.number === chosen?.number);
     button.onclick = () => { choose(step); lead(steps); };
     line.append(button);

@@ -78,11 +78,18 @@ export class Refusal extends Error {
   }
 }
 
+/** The last answers that have a tag: the server does not repeat what has not changed. @type {Map<string, {tag: string, told: any}>} */
+const answers = new Map();
+
 /** @param {string} path @param {RequestInit} more */
 export async function request(path, more = {}) {
-  const answer = await fetch(path, { cache: "no-store", ...more });
+  const kept = answers.get(path);
+  const answer = await fetch(path, { cache: "no-store", ...(kept ? { headers: { "if-none-match": kept.tag } } : {}), ...more });
+  if (answer.status === 304) return kept?.told;
   const told = answer.status === 204 ? null : await answer.json().catch(() => null);
   if (!answer.ok) throw new Refusal(answer.status, told?.error);
+  const tag = answer.headers.get("etag");
+  if (tag) answers.set(path, { tag, told });
   return told;
 }
 
