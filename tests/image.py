@@ -59,15 +59,15 @@ def build(folder: Path, flavour: str = "cpu") -> Image:
     for word, rest in _steps():
         text = _filled(rest, r"\$\{(\w+)\}", arguments)
         if word == "FROM":
-            _, _, name = text.partition(" AS ")
+            begins, _, name = text.partition(" AS ")
             stage = folder / (name or "image")
             stages[name] = stage
-            subprocess.run(["cp", "-a", base, stage], check=True)
+            subprocess.run(["mkdir", stage] if begins == "scratch" else ["cp", "-a", base, stage], check=True)
             image = Image(stage, {"PATH": _PATH}, [], "0:0")
         elif word == "ENV":
             image.environment |= _pairs(_filled(text, r"\$(\w+)", image.environment))
         elif word == "RUN":
-            _run(stage, text, image.environment)
+            _run(stage, re.sub(r"--mount=\S+ ", "", text), image.environment)
         elif word == "COPY":
             _copy(stage, text.split(), stages)
         elif word == "USER":
