@@ -6,6 +6,7 @@ import functools
 import hashlib
 import math
 import os
+import secrets
 import shutil
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -153,8 +154,8 @@ def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
     """Yield a hidden name beside `path` to write to. The file appears as `path` when the block ends without error."""
-    part = path.with_name(f".part{os.getpid()}-{path.name}")
-    part.unlink(missing_ok=True)  # a link there would be followed
+    # Another thread may write the same file, and a name that can be guessed may be a link.
+    part = path.with_name(f".part{secrets.token_hex(8)}-{path.name}")
     try:
         yield part
         part.replace(path)
