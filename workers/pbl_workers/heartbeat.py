@@ -140,9 +140,9 @@ def cron_pass(name: str, busy: int) -> Iterator[None]:
         yield
     except BaseException as error:
         status = getattr(error, "exit_code", 1)
-        text = f"exit status {status}" if hasattr(error, "exit_code") else f"{type(error).__name__}: {error}"
-        text = error.short() if isinstance(error, PblError) else text
-        failed = None if status == busy else text[:500] if status else ""
+        # Without the details, which its log has: they may name a person.
+        text = f"exit status {status}" if hasattr(error, "exit_code") else getattr(error, "code", type(error).__name__)
+        failed = None if status == busy else str(text) if status else ""
         raise
     finally:
         over.set()

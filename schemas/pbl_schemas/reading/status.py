@@ -117,7 +117,7 @@ class LeftOut:
 @dataclasses.dataclass(frozen=True)
 class Cron:
     """The regular work `pbl cron NAME`. Ages (s) by the server's clock: of its last sign of life and of the last pass
-    that succeeded, None: none yet. failed: code and reason if the last pass did not."""
+    that succeeded, None: none yet. failed: code or exit status of the last pass if it did not succeed."""
 
     name: str
     seen_s: float
@@ -127,7 +127,7 @@ class Cron:
     def text(self) -> str:
         """State for people."""
         good = "never succeeded" if self.good_s is None else f"succeeded {span(self.good_s)} ago"
-        return f"{good}; last {span(self.seen_s)} ago: {self.failed}" if self.failed else good
+        return f"{good}; failed {span(self.seen_s)} ago ({self.failed}, see its log)" if self.failed else good
 
 
 @dataclasses.dataclass(frozen=True)
@@ -285,7 +285,7 @@ def worker_counts(server: Any) -> tuple[int, int]:
 
 
 def cron_passes(server: Any) -> list[Cron]:
-    """Return what is known of each kind of regular work that ran."""
+    """Return the state of each kind of regular work that ran."""
     age = "TIMESTAMPDIFF(SECOND, {}, CURRENT_TIMESTAMP)".format
     rows = server.query(
         f"SELECT worker, {age('worker_seen')}, {age('worker_stopped')}, worker_doing"  # noqa: S608
