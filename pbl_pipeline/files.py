@@ -6,6 +6,7 @@ import functools
 import hashlib
 import math
 import os
+import secrets
 import shutil
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -77,7 +78,7 @@ def one_process(path: Path, timeout_s: float = math.inf) -> Iterator[None]:
         yield
         return
     deadline = time.monotonic() + timeout_s
-    with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags, 0o660)) as file:
+    with open(path, "a", encoding="utf-8", opener=lambda p, flags: os.open(p, flags | os.O_NOFOLLOW, 0o660)) as file:
         while True:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -153,12 +154,22 @@ def picture_size(path: str | Path, size_px: np.ndarray) -> tuple[int, int]:
 @contextmanager
 def complete_file(path: Path) -> Iterator[Path]:
     """Yield a hidden name beside `path` to write to. The file appears as `path` when the block ends without error."""
-    part = path.with_name(f".part{os.getpid()}-{path.name}")
+    # Another thread may write the same file, and a name that can be guessed may be a link.
+    part = path.with_name(f".part{secrets.token_hex(8)}-{path.name}")
     try:
         yield part
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def check_no_link(top: Path, folder: Path) -> None:
+    """Raise `PblError` FILE_UNWRITABLE if `folder` or one between it and `top` is a link, which leads elsewhere."""
+    for path in (folder, *folder.parents):
+        if path == top:
+            return
+        if path.is_symlink():
+            raise _unwritable("a link", "a folder: nothing is written to where links lead", key=path)
 
 
 def check_out_folder(path: Path, room_mb: int = _ROOM_MB) -> None:

@@ -138,11 +138,15 @@ CLIENTS: dict[str, type[Package]] = {"pip": Wheel, "npm": NpmPackage}
 
 #: Of a failed connection, and of an answer without packages: a network shows its page to sign in at every address.
 _UNREACHABLE = "ENOTFOUND|ECONNREFUSED|EAI_AGAIN|ETIMEDOUT|ECONNRESET|connection broken|ConnectionError"
+_UNTRUSTED = "CERTIFICATE_VERIFY_FAILED|SELF_SIGNED_CERT|self-signed certificate|UNABLE_TO_(?:GET_ISSUER|VERIFY)"
 _OTHER_ANSWER = "invalid json response|from versions: none"
 
 
 def _explained(reason: str, printed: str) -> str:
     """The error of pip or npm with its cause: after either of the two, pip says only that nothing matches."""
+    if re.search(_UNTRUSTED, printed):
+        advice = "name the file with the certificate of your proxy's authority in PIP_CERT and NODE_EXTRA_CA_CERTS"
+        return f"the registry's certificate is not trusted: {advice} ({reason})"
     if re.search(_UNREACHABLE, printed):
         causes = re.findall("connection broken by (.*): /", printed)
         return f"no connection to the package registry ({'; '.join([reason, *causes[-1:]])})"

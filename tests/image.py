@@ -6,6 +6,7 @@ user, environment, volumes, secrets and tmpfs, no capabilities and no new privil
 The base image is Debian with its own Python of the same minor version, in the place of python:3.11-slim-bookworm.
 """
 
+import contextlib
 import dataclasses
 import fnmatch
 import os
@@ -13,7 +14,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -59,15 +60,16 @@ def build(folder: Path, flavour: str = "cpu") -> Image:
     for word, rest in _steps():
         text = _filled(rest, r"\$\{(\w+)\}", arguments)
         if word == "FROM":
-            _, _, name = text.partition(" AS ")
+            begins, _, name = text.partition(" AS ")
             stage = folder / (name or "image")
             stages[name] = stage
-            subprocess.run(["cp", "-a", base, stage], check=True)
+            subprocess.run(["mkdir", stage] if begins == "scratch" else ["cp", "-a", base, stage], check=True)
             image = Image(stage, {"PATH": _PATH}, [], "0:0")
         elif word == "ENV":
             image.environment |= _pairs(_filled(text, r"\$(\w+)", image.environment))
         elif word == "RUN":
-            _run(stage, text, image.environment)
+            with _build_secret(stage if "id=build_ca" in text else None):
+                _run(stage, re.sub(r"--mount=\S+ ", "", text), image.environment)
         elif word == "COPY":
             _copy(stage, text.split(), stages)
         elif word == "USER":
@@ -78,6 +80,21 @@ def build(folder: Path, flavour: str = "cpu") -> Image:
             assert word in ("ARG", "LABEL", "STOPSIGNAL", "CMD"), word
             arguments |= {k: v for k, v in _pairs(text).items() if word == "ARG" and k not in arguments}
     return image
+
+
+@contextlib.contextmanager
+def _build_secret(stage: Path | None) -> Iterator[None]:
+    """The authority of this machine's proxy, if it has one, as the build secret `build_ca` of a step."""
+    if stage is None or not (authority := os.environ.get("NODE_EXTRA_CA_CERTS")):
+        yield
+        return
+    secret = stage / "run" / "secrets" / "build_ca"
+    secret.parent.mkdir(exist_ok=True)
+    shutil.copyfile(authority, secret)
+    try:
+        yield
+    finally:
+        secret.unlink()
 
 
 def _steps() -> list[tuple[str, str]]:

@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import shutil
+import socket
 import sys
 import tempfile
 import warnings
@@ -26,6 +27,8 @@ OK, NOTE, MISSING = "ok", "note", "missing"
 
 #: Free space (GB) below which a session of videos will not fit.
 _MIN_FREE_GB = 2.0
+#: How long a database server may take to greet (s).
+_ANSWER_S = 4.0
 #: Folders where distributions install the server, which is often not on a user's PATH.
 _SERVER_PLACES = ("/usr/sbin", "/usr/local/sbin", "/usr/libexec", "/opt/homebrew/bin", "/usr/local/bin")
 
@@ -236,9 +239,8 @@ def _codecs() -> Finding:
 
 def _database() -> Finding:
     """Check for a server program, or the server in DJ_HOST, without the tables: the library does not import them."""
-    host = os.environ.get("DJ_HOST")
-    if host:
-        return Finding("database", NOTE, f"DJ_HOST is {host}; not contacted", "`pbl db status` checks it")
+    if os.environ.get("DJ_HOST"):
+        return _server(os.environ["DJ_HOST"])
     unpacked = settings.home_dir() / "server" / "usr" / "sbin"
     places = os.pathsep.join([os.environ.get("PATH", os.defpath), *_SERVER_PLACES, str(unpacked)])
     server = shutil.which("mariadbd", path=places)
@@ -252,6 +254,24 @@ def _database() -> Finding:
         f"{found} (`pbl run`, `detect`, `fit`, `events` and `gait` work without)",
         "`pbl db init` installs it (apt), or set DJ_HOST to a running server",
     )
+
+
+def _server(address: str) -> Finding:
+    """Check that a database server greets at HOST or HOST:PORT; it ends the connection itself, without a login."""
+    host, _, port = address.partition(":")
+    try:
+        with socket.create_connection((host, int(port or os.environ.get("DJ_PORT") or 3306)), _ANSWER_S) as server:
+            server.settimeout(_ANSWER_S)
+            greeting = server.recv(200)
+    except (OSError, ValueError) as error:
+        advice = "start the server, or correct DJ_HOST and DJ_PORT"
+        return Finding("database", MISSING, f"DJ_HOST is {address}, which does not answer: {error}", advice)
+    if greeting[4:5] != b"\n":  # the version of the protocol, 10; 255: a refusal with its reason
+        text = greeting[7:].decode("utf-8", "replace") if greeting[4:5] == b"\xff" else "another program"
+        advice = "correct DJ_HOST and DJ_PORT, or ask the server's administrator"
+        return Finding("database", MISSING, f"DJ_HOST is {address}, which is no database server for us: {text}", advice)
+    version = greeting[5:].split(b"\0")[0].decode("ascii", "replace")
+    return Finding("database", OK, f"DJ_HOST is {address}, which answers ({version}); `pbl db status` tries the login")
 
 
 def _assets(errors: dict[str, PblError]) -> Iterator[Finding]:

@@ -4,6 +4,7 @@ Scientific Data 11:716), which `bids-validator` accepts."""
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -71,7 +72,7 @@ def bids_files(
     root
         Folder of the data set. An existing README, description and list of participants are kept.
     """
-    out = {name: data for name, data in _of_data_set().items() if not (root / name).exists()}
+    out = {name: data for name, data in _of_data_set().items() if not os.path.lexists(root / name)}
     out[_PARTICIPANTS] = _with_participant(root / _PARTICIPANTS, f"sub-{labels.participant}")
     tasks = [_task(t) for t in trials]
     for i, (trial, task) in enumerate(zip(trials, tasks, strict=True)):
@@ -98,6 +99,8 @@ def bids_files(
 
 def _with_participant(path: Path, participant: str) -> bytes:
     """Return the table of participants with a row for one of them, and its existing rows and columns."""
+    if path.is_symlink():
+        raise _no_table(path, "a link")
     try:
         lines = read_text(path).splitlines() if path.exists() else ["participant_id"]
     except (OSError, ValueError) as error:
@@ -114,7 +117,7 @@ def _no_table(path: Path, found: str) -> PblError:
     return PblError(
         "EXPORT_INPUT",
         found=found,
-        expected="a table in UTF-8 with tabs between its columns, the first of them participant_id",
+        expected="a file, a table in UTF-8 with tabs between its columns, the first of them participant_id",
         next_step="correct the table, or pass another --out",
         key=str(path),
     )

@@ -17,7 +17,7 @@ from pbl_pipeline.body import Body, load_body
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.extras import needed
-from pbl_pipeline.files import check_out_folder, complete_file
+from pbl_pipeline.files import check_no_link, check_out_folder, complete_file, one_process
 from pbl_pipeline.fit import METHODS, TrialFit
 from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, TrialMetrics
 from pbl_pipeline.methods import Stage
@@ -169,9 +169,9 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
 
     `<recording>/<recording>.trc` and so on for each; the tables with their data dictionary and `export.json` in `out`.
 
-    Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`); EXPORT_INPUT: a fit that failed, without
-    one pose, of another body, measures whose events or cycles are missing, or names that a format cannot hold;
-    MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
+    Raises `PblError` USAGE, PACKAGE_MISSING, FILE_UNWRITABLE (`check_export`, or a folder is a link); EXPORT_INPUT: a
+    fit that failed, without one pose, of another body, measures whose events or cycles are missing, or names that a
+    format cannot hold; MARKER_SET_UNKNOWN: the body lacks the fit's markers. Nothing is written then.
     """
     options = options or ExportOptions()
     formats = [f for f in FORMATS if f in formats] + [f for f in formats if f not in FORMATS]
@@ -183,6 +183,9 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     root, labels = options.bids or (out / "bids", Labels.of(options.name or "01", ""))
     if "bids" in formats:
         check_labels(root, labels, options.overwrite)
+        check_no_link(root.parent, root / labels.folder / "motion")
+    for trial in trials:
+        check_no_link(out, out / trial.name)
     body, paths, about, grounds, origins = load_body(), [], {}, {}, {}
     for trial in trials:
         origin = origin_of(trial, body)
@@ -202,10 +205,12 @@ def write_export(visit: Visit, formats: Sequence[str], out: Path, options: Expor
     out.mkdir(parents=True, exist_ok=True)
     paths += _write_tables(trials, visit, formats, out, _common(about))
     if "bids" in formats:
-        for name, data in bids_files(trials, origins, labels, root).items():
-            path = root / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            paths.append(_written(path, lambda part, data=data: part.write_bytes(data)))
+        root.mkdir(parents=True, exist_ok=True)
+        with one_process(root / ".participants.lock"):  # another export may add a participant
+            for name, data in bids_files(trials, origins, labels, root).items():
+                path = root / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                paths.append(_written(path, lambda part, data=data: part.write_bytes(data)))
     content = {
         "software": f"pbl-pipeline {code_version()}",
         "exported": datetime.datetime.now(tz=datetime.UTC).date().isoformat(),

@@ -39,6 +39,8 @@ from .tflite import LiteModel, read_network
 BATCH, LEAST_BATCH = 16, 4
 #: Time without connections (s) after which the process ends.
 IDLE_S = 60.0
+#: Time for a client to send what it begins a connection with, and to take its answers (s); then it is dropped.
+CLIENT_S = 10.0
 #: Largest difference from LiteRT, as a fraction of the largest value of an output, that is taken for rounding.
 MOST_DIFFERENCE = 1e-3
 #: Number of networks that use the device at a time, and of videos that are decoded.
@@ -115,12 +117,14 @@ class _Served:
         # One batch is filled while the other is computed; allocating memory for each would take longer than receiving.
         self._images, self._spare = (np.zeros((program.batch, *program.image_shape), np.uint8) for _ in range(2))
         self._owners = list[socket.socket]()
-        self.n_connections = 0
         for work in (self._collect, self._compute):
             threading.Thread(target=work, daemon=True).start()
 
+    @property
+    def n_connections(self) -> int:
+        return len(self._selector.get_map() or ())
+
     def add(self, connection: socket.socket, memory: np.ndarray) -> None:
-        self.n_connections += 1
         pictures = memory.reshape(-1, *self._program.image_shape)
         self._selector.register(connection, selectors.EVENT_READ, (connection, pictures))
 
@@ -135,8 +139,9 @@ class _Served:
             for key, _ in self._selector.select(1.0):
                 connection, pictures = key.data
                 places = _places(connection)
-                if not places:
+                if not places or max(places) >= len(pictures):
                     self._drop(connection)
+                    continue
                 for place in places:
                     with self._changed:
                         self._changed.wait_for(lambda: len(self._owners) < len(self._images))
@@ -148,7 +153,6 @@ class _Served:
         try:
             self._selector.unregister(connection)
             connection.close()
-            self.n_connections -= 1
         except (KeyError, OSError, ValueError):  # already closed
             return
 
@@ -163,7 +167,7 @@ class _Served:
                     self._changed.notify()
                 try:
                     found = self._program(images)
-                except RuntimeError as error:  # the GPU failed: the clients fall back to LiteRT
+                except Exception as error:  # noqa: BLE001 - the GPU failed: the clients fall back to LiteRT
                     sys.stderr.write(f"the GPU does not compute: {error}\n")
                     sys.stderr.flush()
                     os._exit(1)
@@ -171,8 +175,8 @@ class _Served:
             for owner, outputs in zip(owners, found, strict=False):
                 try:
                     owner.sendall(outputs.data)
-                except (OSError, ValueError):
-                    continue
+                except (OSError, ValueError):  # it ended, or takes no answers
+                    self._drop(owner)
 
 
 def _places(connection: socket.socket) -> bytes:
@@ -214,7 +218,10 @@ class Server:
             try:
                 connection, _ = self._listener.accept()
             except OSError:
-                return
+                if self._listener.fileno() < 0:  # closed
+                    return
+                time.sleep(0.1)  # too many open files: others end
+                continue
             self._openers.submit(self._open, connection)
 
     def close(self) -> None:
@@ -226,8 +233,10 @@ class Server:
     def _open(self, connection: socket.socket) -> None:
         self._opening += 1
         try:
+            connection.settimeout(CLIENT_S)
             given = json.loads(receive_line(connection))
             if given == DECODING:
+                connection.settimeout(None)  # the next video may come late
                 threading.Thread(target=self._read_videos, args=[connection], daemon=True).start()
                 return
             outputs = None if given["outputs"] is None else tuple(given["outputs"])
@@ -246,7 +255,7 @@ class Server:
             shape = program.image_shape
             send_line(connection, {"device": program.device, "sizes": program.sizes, "shape": shape})
             served.add(connection, shared_memory(connection))
-        except (EOFError, OSError, ValueError):
+        except Exception:  # noqa: BLE001 - it does not keep to the protocol, or has ended
             connection.close()
         finally:
             self._opening -= 1
@@ -264,8 +273,8 @@ class Server:
                 with self._decoder.pinned(memory):
                     while line := asked.readline():
                         send_line(connection, self._decode(self._decoder, json.loads(line), asked, memory))
-        except (OSError, RuntimeError, ValueError) as error:  # the reader falls back to FFmpeg
-            sys.stderr.write(f"no further videos are decoded for a process: {error}\n")
+        except Exception as error:  # noqa: BLE001 - of the GPU or of the request: the reader falls back to FFmpeg
+            sys.stderr.write(f"no further videos are decoded for a process: {error!r}\n")
         finally:
             self._readers.discard(connection)
 

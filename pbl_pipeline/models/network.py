@@ -30,6 +30,10 @@ from .tflite import NUM_THREADS, LiteModel
 DECODING = {"decoding": True}
 #: Pictures of a process that the GPU process holds at once for a network; they keep it busy while others are cropped.
 AT_ONCE = 16
+#: Time to wait for an answer of the process that owns the GPU (s), which may compile; then the CPU computes.
+PATIENCE_S = 120.0
+#: Bytes of a line; that with the stamps of an hour has 2 MB.
+_LONGEST_LINE = 1 << 24
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +135,7 @@ class _Remote:
 
     def __init__(self, address: str, spec: NetworkSpec) -> None:
         self._connection = socket.socket(socket.AF_UNIX)
+        self._connection.settimeout(PATIENCE_S)
         self._connection.connect(address)
         send_line(self._connection, dataclasses.asdict(spec))
         reply = json.loads(receive_line(self._connection))
@@ -145,6 +150,7 @@ class _Remote:
         self._sending = threading.Lock()
         self._waiting: deque[Future[np.ndarray]] = deque()
         self._broken: BaseException | None = None
+        self._connection.settimeout(None)  # answers are waited for in `__call__`
         threading.Thread(target=self._listen, name="gpu-network", daemon=True).start()
 
     def __call__(self, image: np.ndarray) -> dict[int, np.ndarray]:
@@ -157,7 +163,12 @@ class _Remote:
                     raise self._broken
                 self._waiting.append(future)
                 self._connection.sendall(bytes([place]))
-            parts = np.split(future.result(), np.cumsum(self._sizes)[:-1])
+            try:
+                reply = future.result(PATIENCE_S)
+            except TimeoutError as error:
+                self._connection.shutdown(socket.SHUT_RDWR)  # the other calls need not wait as long
+                raise RuntimeError(f"the process that owns the GPU did not answer within {PATIENCE_S:g} s") from error
+            parts = np.split(reply, np.cumsum(self._sizes)[:-1])
         finally:
             self._free.put(place)
         return dict(zip(self._sizes, parts, strict=True))
@@ -176,7 +187,7 @@ class _Remote:
 
 def share_memory(connection: socket.socket, size: int) -> mmap.mmap:
     """Return new memory, which the other side of a connection gets by `shared_memory`."""
-    file = os.memfd_create("pictures")
+    file = os.memfd_create("pictures", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         os.ftruncate(file, size)
         memory = mmap.mmap(file, size)
@@ -189,9 +200,13 @@ def share_memory(connection: socket.socket, size: int) -> mmap.mmap:
 
 
 def shared_memory(connection: socket.socket) -> np.ndarray:
-    """Return the memory (size,) uint8 that the other side shares."""
+    """Return the memory (size,) uint8 that the other side shares and can no longer shorten. Raises ValueError, OSError:
+    it sends no such memory."""
+    import fcntl  # not on Windows
+
     _, (file,), _, _ = socket.recv_fds(connection, 1, 1)
     try:
+        fcntl.fcntl(file, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
         return np.frombuffer(mmap.mmap(file, 0), np.uint8)
     finally:
         os.close(file)
@@ -211,13 +226,15 @@ def send_line(connection: socket.socket, value: object) -> None:
 
 
 def receive_line(connection: socket.socket) -> bytes:
-    """Return the next line. Raises EOFError if the other side has ended."""
+    """Return the next line. Raises EOFError if the other side has ended, ValueError for one without an end."""
     line = b""
     while not line.endswith(b"\n"):
         byte = connection.recv(1)
         if not byte:
             raise EOFError("the process that owns the GPU ended")
         line += byte
+        if len(line) > _LONGEST_LINE:
+            raise ValueError(f"a line of more than {_LONGEST_LINE} bytes")
     return line
 
 

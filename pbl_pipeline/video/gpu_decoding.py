@@ -18,7 +18,7 @@ import numpy as np
 from av.bitstream import BitStreamFilterContext
 
 from pbl_pipeline.models import gpu_address
-from pbl_pipeline.models.network import DECODING, receive_line, send_line, share_memory
+from pbl_pipeline.models.network import DECODING, PATIENCE_S, receive_line, send_line, share_memory
 from pbl_pipeline.models.nvdec import CODECS
 
 from .coded_units import is_damaged
@@ -26,8 +26,6 @@ from .decode import FFMPEG_ERRORS, Decoder
 
 #: Formats of the pictures: colour at half the resolution, 8 bits.
 _FORMATS = ("yuv420p", "yuvj420p")
-#: Time to wait for the pictures of a video (s) before FFmpeg decodes it.
-_PATIENCE_S = 120.0
 
 
 class _Connection:
@@ -36,7 +34,7 @@ class _Connection:
     def __init__(self, size: int) -> None:
         self.size = size
         self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.settimeout(_PATIENCE_S)
+        self._socket.settimeout(PATIENCE_S)
         self._socket.connect(gpu_address.running_server(gpu_address.DECODER))
         send_line(self._socket, DECODING)
         self._receive()

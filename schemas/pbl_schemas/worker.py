@@ -10,6 +10,9 @@ from typing import Any
 from .datajoint_setup import dj
 
 schema = dj.Schema()
+#: `worker_resource` of rows of regular work, one for each kind of `pbl cron`: worker_seen is its last sign of life,
+#: worker_stopped when it last succeeded, worker_doing how the last pass failed ("": it did not).
+CRON = "cron"
 
 
 @schema

@@ -146,6 +146,12 @@ def test_pip_failures_are_told(index):
             "no connection to the package registry (ERROR: No matching distribution found for carrier==1.0; 'OSError("
             "'Tunnel connection failed: 403 Forbidden')')",
         ),
+        (  # a proxy that signs with its own authority; pip 26.3
+            "WARNING: Retrying after connection broken by 'SSLError(SSLCertVerificationError(1, '[SSL: "
+            "CERTIFICATE_VERIFY_FAILED] certificate verify failed: self-signed certificate in certificate chain"
+            "')': /simple/carrier/\nERROR: No matching distribution found for carrier==1.0\n",
+            "the registry's certificate is not trusted: name the file with the certificate of your proxy's authority",
+        ),
         (  # a disk that another program fills meanwhile
             "ERROR: Exception:\nTraceback (most recent call last):\nOSError: [Errno 28] No space left on device\n",
             "could not be downloaded: OSError: [Errno 28] No space left on device",

@@ -1,9 +1,11 @@
 """The files that bring workers onto machines: valid, without passwords, and calling commands that exist."""
 
+import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from pathlib import Path
@@ -13,7 +15,7 @@ import click
 import pytest
 import yaml
 
-from pbl_pipeline import __version__
+from pbl_pipeline import __version__, assets
 from pbl_pipeline.cli.command_line import cli
 from pbl_workers.supervisor import LAST_S
 from tests.command import program
@@ -215,6 +217,43 @@ def test_the_entrypoint_seeds_an_empty_cache_and_runs_pbl(tmp_path: Path):
     assert (done.returncode, done.stdout) == (7, "pbl worker --resource a b\n"), done.stderr
     found = {p.name: p.read_text() for p in cache.rglob("*") if p.is_file()}
     assert found == {"model.tflite": "model", "other": "there already"}
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can become another user")
+@pytest.mark.parametrize("user", ["1000:1000", "10001:10001", "1234:5678"])
+def test_the_image_starts_as_any_user(user: str, monkeypatch: pytest.MonkeyPatch):
+    """The models lie in the image with the rights that root's build leaves, locks included."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's own folders are closed to others
+        folder, before = Path(name), os.umask(0o022)
+        folder.chmod(0o755)
+        try:
+            monkeypatch.setenv("PBL_CACHE", str(folder / "seed"))
+            monkeypatch.setattr(assets, "_bring", lambda asset: asset.path.write_text("model"))
+            monkeypatch.setattr(assets, "_is_pinned", lambda path, sha256: path.is_file())
+            model = assets.fetch("blazepose_detector").name
+            (folder / "seed/assets/.lock").touch()
+            volume = folder / "volume"
+            volume.mkdir()
+            volume.chmod(0o1777)
+            script = folder / "entrypoint.sh"
+            script.write_bytes((DEPLOY / "entrypoint.sh").read_bytes())
+            program(folder, "pbl", 'cat "$PBL_CACHE/assets/"*\n')
+        finally:
+            os.umask(before)
+        environment = {"PATH": f"{name}:/usr/bin:/bin", "PBL_SEED": f"{name}/seed", "PBL_CACHE": str(volume)}
+        uid, gid = user.split(":")
+        start = ["setpriv", f"--reuid={uid}", f"--regid={gid}", "--clear-groups", "sh", str(script)]
+        for _ in range(2):  # and again
+            done = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+            assert (done.returncode, done.stdout, done.stderr) == (0, "model", "")
+        assert [p.name for p in volume.rglob("*") if p.is_file()] == [model]
+        (folder / "seed/assets/another").write_text("x")
+        (folder / "seed/assets/another").chmod(0o600)
+        done = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert "ASSET_MISSING: " in done.stderr
+        assert "  next: " in done.stderr
+        assert [p.name for p in volume.rglob("*") if p.is_file()] == [model]
 
 
 def test_the_cron_loop_goes_by_the_clock_and_on_after_a_job_that_fails(tmp_path: Path):

@@ -1,8 +1,10 @@
 """`pbl doctor` on made-up machines: what it finds, what it advises, how it ends."""
 
 import os
+import socket
 import subprocess
 import sys
+import threading
 
 import pytest
 from click.testing import CliRunner, Result
@@ -105,10 +107,29 @@ def test_no_database(machine, monkeypatch):
     assert "no MariaDB" in finding.detail
     program(machine / "bin", "mysqld", "")
     assert "is MySQL" in module._database().detail
-    monkeypatch.setenv("DJ_HOST", "db.example.org")
-    finding = module._database()
-    assert finding.state == module.NOTE
-    assert "db.example.org" in finding.detail
+
+
+@pytest.mark.parametrize(
+    ("greeting", "state", "said"),
+    [
+        (b"J\0\0\0\n8.4.8\0rest", "ok", "answers (8.4.8)"),
+        (b"E\0\0\0\xff\x69\x04Host '10.0.0.7' is not allowed", "missing", "Host '10.0.0.7' is not allowed"),
+        (b"HTTP/1.1 400 Bad Request", "missing", "another program"),
+        (None, "missing", "does not answer"),
+    ],
+)
+def test_the_server_that_dj_host_names_is_contacted(
+    machine, monkeypatch, greeting: bytes | None, state: str, said: str
+):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setenv("DJ_HOST", f"127.0.0.1:{server.getsockname()[1]}")
+        if greeting is None:
+            server.close()
+        else:
+            threading.Thread(target=lambda: server.accept()[0].sendall(greeting), daemon=True).start()
+        found = line(doctor(), "database")
+    assert f" {state} " in found
+    assert said in found
 
 
 def test_a_server_unpacked_into_home_counts(machine):

@@ -6,6 +6,9 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +17,15 @@ import pandas as pd
 import pytest
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.export import ExportOptions, Labels, write_export
+from pbl_pipeline.export import ExportOptions, Labels, bids, write_export
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Condition, gait_metrics
 from pbl_pipeline.visit import Recording, Visit
 from tests.exported import marked_fit
 
 _PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+#: Beside the table of participants; validators leave hidden files out.
+LOCK = ".participants.lock"
 _VALIDATOR = shutil.which("bids-validator-deno", path=_PATH)
 
 
@@ -53,7 +58,7 @@ def dataset(visit: Visit, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_names_of_the_files(dataset: Path):
-    found = sorted(p.relative_to(dataset).as_posix() for p in dataset.rglob("*") if p.is_file())
+    found = sorted(p.relative_to(dataset).as_posix() for p in dataset.rglob("*") if p.is_file() and p.name != LOCK)
     of_visit = [
         f"task-{task}{system}{run}_{table}.{ending}"
         for task, run in (("unknown", ""), ("walking", "_run-1"), ("walking", "_run-2"))
@@ -137,6 +142,65 @@ def test_a_table_of_participants_that_cannot_be_read_is_left(visit: Visit, tmp_p
         write_export(visit, ["bids"], tmp_path, ExportOptions(overwrite=True))
     assert (tmp_path / "bids/participants.tsv").read_bytes() == table
     assert not list((tmp_path / "bids").rglob("*_motion.tsv"))
+
+
+@pytest.mark.parametrize(
+    ("link", "code"),
+    [
+        ("bids/sub-P001", "FILE_UNWRITABLE"),
+        ("bids/sub-P001/ses-1/motion", "FILE_UNWRITABLE"),
+        ("bids", "FILE_UNWRITABLE"),
+        ("out/walk2", "FILE_UNWRITABLE"),
+        ("bids/participants.tsv", "EXPORT_INPUT"),
+    ],
+)
+def test_nothing_is_written_to_where_a_link_leads(visit: Visit, tmp_path: Path, link: str, code: str):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "participants.tsv").write_text("participant_id\n")
+    place = tmp_path / link
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.symlink_to(elsewhere / "participants.tsv" if place.suffix else elsewhere)
+    options = ExportOptions(bids=(tmp_path / "bids", Labels("P001", "1")), overwrite=True)
+    with pytest.raises(PblError, match=rf"^{code}: "):
+        write_export(visit, ["mot", "bids"], tmp_path / "out", options)
+    assert place.is_symlink()
+    assert [p.name for p in elsewhere.iterdir()] == ["participants.tsv"]
+    assert (elsewhere / "participants.tsv").read_text() == "participant_id\n"
+
+
+def test_links_in_the_place_of_files_are_replaced_and_a_lab_s_own_are_kept(visit: Visit, tmp_path: Path):
+    """DataLad keeps a data set's files as links, which lead nowhere as long as their content is not here."""
+    for name in ("bids/README.md", "out/export.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).symlink_to(tmp_path / "secret")
+    options = ExportOptions(bids=(tmp_path / "bids", Labels("P001", "1")), overwrite=True)
+    write_export(visit, ["bids"], tmp_path / "out", options)
+    assert (tmp_path / "bids/README.md").is_symlink()
+    assert not (tmp_path / "out/export.json").is_symlink()
+    assert not (tmp_path / "secret").exists()
+
+
+def test_exports_at_the_same_time_lose_no_participant(visit: Visit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    real, read = bids._with_participant, threading.Event()
+
+    def slowly(path: Path, participant: str) -> bytes:
+        found = real(path, participant)
+        first, _ = not read.is_set(), read.set()
+        time.sleep(0.5 * first)  # the first export has read the table when the second begins
+        return found
+
+    def export(name: str) -> None:
+        write_export(visit, ["bids"], tmp_path / name, ExportOptions(bids=(tmp_path / "bids", Labels(name, "1"))))
+
+    monkeypatch.setattr(bids, "_with_participant", slowly)
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(export, "P001")
+        assert read.wait(60)
+        second = threads.submit(export, "P002")
+        first.result()
+        second.result()
+    assert (tmp_path / "bids/participants.tsv").read_text() == "participant_id\nsub-P001\nsub-P002\n"
 
 
 def test_a_visit_of_its_own_is_in_the_folder_bids(visit: Visit, tmp_path: Path):

@@ -1,5 +1,9 @@
 """TensorFlow Lite graphs as JAX functions and the process that owns the GPU, here on the CPU: LiteRT's numbers."""
 
+import dataclasses
+import json
+import os
+import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,9 +17,9 @@ import pytest
 
 from pbl_pipeline import assets
 from pbl_pipeline.keypoints import METHODS
-from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_visible
+from pbl_pipeline.models import LiteModel, Network, gpu_address, gpu_server, gpu_visible, network
 from pbl_pipeline.models.gpu_server import Server
-from pbl_pipeline.models.network import NetworkSpec
+from pbl_pipeline.models.network import AT_ONCE, NetworkSpec, receive_line, share_memory
 from pbl_pipeline.models.tflite import read_network
 from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
@@ -145,6 +149,108 @@ def test_a_graph_that_the_reader_does_not_know_is_left_to_litert(
     network = network_of("blazepose_detector")
     assert not network.on_gpu
     assert "DEPTH_TO_SPACE" in network.note
+
+
+class Sums:
+    """A network without a file: the sum of a picture's bytes, and so many zeros that no socket holds 16 answers."""
+
+    image_shape, sizes, batch, device = (4, 4, 3), [1, 100_000], 4, "none"
+    go_on = threading.Event()
+
+    def __init__(self, *_: object) -> None:
+        self.go_on.set()
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        assert self.go_on.wait(60)
+        found = np.zeros((len(images), sum(self.sizes)), np.float32)
+        found[:, 0] = images.reshape(len(images), -1).sum(1)
+        return found
+
+
+SPEC = NetworkSpec("sums", "", None, 1.0)
+
+
+@pytest.fixture
+def sums(server: Server, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Address of the server with a stand-in for the network; clients and server are patient for a second."""
+    monkeypatch.setattr(gpu_server, "Program", Sums)
+    monkeypatch.setattr(gpu_server, "CLIENT_S", 1.0, raising=False)
+    monkeypatch.setattr(network, "PATIENCE_S", 3.0, raising=False)
+    return gpu_address.running_server(gpu_address.NETWORKS)
+
+
+def opened(address: str, sent: bytes = b"") -> socket.socket:
+    found = socket.socket(socket.AF_UNIX)
+    found.connect(address)
+    found.sendall(sent)
+    return found
+
+
+def connection(address: str, spec: object) -> socket.socket:
+    return opened(address, json.dumps(spec).encode() + b"\n")
+
+
+def joined(address: str, size: int = AT_ONCE * 48) -> socket.socket:
+    """A client after its first lines; `size`: bytes of the memory that it shares."""
+    found = connection(address, dataclasses.asdict(SPEC))
+    receive_line(found)
+    share_memory(found, size)
+    return found
+
+
+def shortened(address: str) -> socket.socket:
+    """A client whose memory has become shorter than it was."""
+    found = connection(address, dataclasses.asdict(SPEC))
+    receive_line(found)
+    file = os.memfd_create("pictures")
+    os.ftruncate(file, AT_ONCE * 48)
+    socket.send_fds(found, [b"m"], [file])
+    found.settimeout(5.0)
+    while found.recv(1):  # it is dropped before a picture is read
+        pass
+    return found
+
+
+def asking(place: int, address: str, times: int = 1) -> socket.socket:
+    found = joined(address)
+    found.sendall(bytes([place]) * times)
+    return found
+
+
+BROKEN = {
+    "a place that does not exist": lambda at: asking(200, at),
+    "one place too far": lambda at: asking(AT_ONCE, at),
+    "takes no answers": lambda at: asking(0, at, 64),
+    "memory of another size": lambda at: joined(at, 100),
+    "memory for no picture": lambda at: joined(at, 10),
+    "shortened memory": shortened,
+    "other lines": lambda at: [connection(at, given) for given in ([], 3, {"outputs": 5}, {}, {"outputs": None})],
+    "says nothing": lambda at: [opened(at) for _ in range(20)],
+    "half a line": lambda at: [opened(at, b"{") for _ in range(20)],
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_client_is_dropped_and_others_get_their_answers(sums: str, kind: str) -> None:
+    healthy = network._Remote(sums, SPEC)
+    picture = np.full((4, 4, 3), 7, np.uint8)
+    broken = BROKEN[kind](sums)
+    with ThreadPoolExecutor(20) as threads:
+        jobs = [threads.submit(where, picture) for where in (healthy, network._Remote(sums, SPEC)) for _ in range(10)]
+        assert [job.result(30)[1].item() for job in jobs] == [7 * 48] * 20
+    del broken
+
+
+def test_where_the_gpu_gives_no_answer_clients_go_on_on_the_cpu(sums: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Network, "_load", lambda _: lambda image: {1: image.sum()})
+    asked = Network("sums", "", 1.0)
+    Sums.go_on.clear()
+    with ThreadPoolExecutor(40) as threads:  # more than the process takes at once
+        jobs = [threads.submit(asked, np.ones((4, 4, 3), np.uint8)) for _ in range(40)]
+        assert [job.result(30)[1] for job in jobs] == [48] * 40
+    Sums.go_on.set()
+    assert not asked.on_gpu
+    assert "no" in asked.note
 
 
 @pytest.mark.long

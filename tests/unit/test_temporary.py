@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pbl_pipeline import temporary
+from pbl_pipeline.files import complete_file
 from pbl_schemas.operations.folders import write_json
 from tests.command import pbl
 from tests.source import PACKAGES, files
@@ -106,4 +107,16 @@ def test_what_cannot_be_written_leaves_the_old_file(tmp_path: Path, monkeypatch:
     with pytest.raises(OSError, match="No space"):
         write_json(path, {"a": 2})
     assert json.loads(path.read_text()) == {"a": 1}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_two_write_at_once_is_whole(tmp_path: Path):
+    path = tmp_path / "a.txt"
+    with complete_file(path) as first:
+        first.write_text("half ")
+        with complete_file(path) as second:
+            second.write_text("the second")
+        with first.open("a") as file:
+            file.write("of the first")
+    assert path.read_text() == "half of the first"
     assert list(tmp_path.iterdir()) == [path]

@@ -1,6 +1,7 @@
 """The supervisor and its figures: jobs in hand are those of processes that live, whatever these said, however they
 ended; and neither waits for a database that does not answer."""
 
+import contextlib
 import multiprocessing
 import os
 import socket
@@ -14,11 +15,11 @@ from unittest import mock
 
 import pymysql
 import pytest
+from prometheus_client.core import GaugeMetricFamily
 
-from pbl_schemas import connection, fit
-from pbl_schemas.reading import status
+from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
-from pbl_workers import process, recover, registry, selftest
+from pbl_workers import metrics, process, recover, registry, selftest
 from pbl_workers.metrics import Metrics
 from pbl_workers.process import VISIBLE, Options, given_gpus
 from pbl_workers.queue import Claim
@@ -129,16 +130,17 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
     answers = threading.Event()
     answers.set()
 
-    def queue_counts(_: object) -> dict[str, dict[str, int]]:
+    def figures(_: object) -> list[GaugeMetricFamily]:
         assert answers.wait(30)
-        return {"SessionFit": {"pending": 7}}
+        return [GaugeMetricFamily("pbl_workers", "", 7)]
 
-    monkeypatch.setattr(status, "queue_counts", queue_counts)
+    monkeypatch.setattr(metrics, "figures", figures)
+    monkeypatch.setattr(worker, "installation_lock", lambda *_: contextlib.nullcontext(True))
     monkeypatch.setattr("pbl_workers.metrics.READ_EVERY_S", 0.01)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    Metrics().serve(port, "127.0.0.1", object)
+    Metrics().serve(port, "127.0.0.1", mock.MagicMock)
 
     def asked(line: str) -> bool:
         """Whether the answer comes to have this line, each time without waiting for the database."""
@@ -151,7 +153,7 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
         return False
 
     assert asked("pbl_database_up 1.0")
-    assert asked('pbl_queue_jobs{status="pending",table="SessionFit"} 7.0')
+    assert asked("pbl_workers 7.0")
     monkeypatch.setattr("pbl_workers.metrics.FRESH_S", 0.2)
     answers.clear()
     assert asked("pbl_database_up 0.0")

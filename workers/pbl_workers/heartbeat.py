@@ -12,6 +12,7 @@ import platform
 import secrets
 import threading
 from collections import defaultdict
+from collections.abc import Iterator
 from typing import Any
 
 import pymysql
@@ -120,3 +121,46 @@ class Heartbeat(Silent):
         finally:
             for stage, (done, failed, busy) in counts.items():  # not written yet: with the next beat
                 self.count(stage, int(done), int(failed), float(busy))
+
+
+@contextlib.contextmanager
+def cron_pass(name: str, busy: int) -> Iterator[None]:
+    """Keep the row of regular work up to date (`worker.CRON`) while it runs, and note how it ended. Nothing is noted
+    while the database is unavailable, which shows by the row's age. `busy`: exit status that is neither a success nor a
+    failure."""
+    over = threading.Event()
+    failed: str | None = ""
+
+    def beat() -> None:
+        while not over.wait(PERIOD_S):
+            _note(name, None)
+
+    threading.Thread(target=beat, name="heartbeat", daemon=True).start()
+    try:
+        yield
+    except BaseException as error:
+        status = getattr(error, "exit_code", 1)
+        # Without the details, which its log has: they may name a person.
+        text = f"exit status {status}" if hasattr(error, "exit_code") else getattr(error, "code", type(error).__name__)
+        failed = None if status == busy else str(text) if status else ""
+        raise
+    finally:
+        over.set()
+        _note(name, failed)
+
+
+def _note(name: str, failed: str | None) -> None:
+    """Note that regular work lives, and how it ended unless `failed` is None."""
+    ended = "" if failed is None else ", worker_doing=VALUES(worker_doing)"
+    with contextlib.suppress(pymysql.err.Error, dj.DataJointError, PblError, OSError):
+        table = worker.Worker.full_table_name  # unknown if the work ended before it knew the tables
+        with contextlib.closing(connection.another()) as server:
+            server.query(
+                f"INSERT INTO {table} (worker, worker_host, worker_pid, worker_resource, worker_version,"  # noqa: S608
+                " worker_started, worker_seen, worker_stopped, worker_doing) VALUES (%s, %s, 0, %s, %s,"
+                " CURRENT_TIMESTAMP(3), CURRENT_TIMESTAMP(3), IF(%s, CURRENT_TIMESTAMP(3), NULL), %s)"
+                " ON DUPLICATE KEY UPDATE worker_host=VALUES(worker_host), worker_version=VALUES(worker_version),"
+                " worker_seen=VALUES(worker_seen), worker_stopped=COALESCE(VALUES(worker_stopped), worker_stopped)"
+                f"{ended}",
+                args=(f"cron {name}", platform.node(), worker.CRON, code_version(), failed == "", failed or ""),
+            )

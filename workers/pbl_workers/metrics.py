@@ -1,7 +1,8 @@
-"""Prometheus metrics of a worker: finished jobs, their duration, and the lengths of the queues."""
+"""Prometheus metrics of a worker: finished jobs and their duration; and those of the installation."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -12,13 +13,17 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, star
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from pbl_schemas import worker
+from pbl_schemas.operations.archive import disks
+from pbl_schemas.reading import status
+
 from .queue import Claim
 from .run_job import Outcome
 
 #: Upper ends of the duration classes (s): from a light job to a long video.
 SECONDS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 
-#: Seconds between two looks at the lengths of the queues, and after which a look counts as too old: the database hangs.
+#: Seconds between two looks at the database, and after which a look counts as too old: the database hangs.
 READ_EVERY_S, FRESH_S = 15.0, 45.0
 
 
@@ -40,8 +45,8 @@ class Metrics:
             self.seconds.labels(job.table.__name__).observe(outcome.seconds)
 
     def serve(self, port: int, host: str, connect: Callable[[], Any]) -> None:
-        """Start the endpoint in a thread. `connect` returns a database connection for the lengths of the queues."""
-        self.registry.register(_Queues(connect))
+        """Start the endpoint in a thread. `connect` returns a connection for the installation's figures."""
+        self.registry.register(_Installation(connect))
         start_http_server(port, addr=host, registry=self.registry)
 
 
@@ -58,36 +63,87 @@ class KeptReports(Metrics):
         super().heard(job, outcome)
 
 
-class _Queues(Collector):
-    """Job rows by table and status, as a thread last read them: a request never waits for the database."""
+class _Installation(Collector):
+    """Figures of the installation, as a thread last read them: a request never waits for the database or a disk.
+
+    One worker of all shows the database's, so that they sum up right; each shows the disks of its machine.
+    """
 
     def __init__(self, connect: Callable[[], Any]) -> None:
         self._connect = connect
-        self._counts: dict[str, dict[str, int]] = {}
+        self._figures: list[GaugeMetricFamily] = []
+        self._disks: list[GaugeMetricFamily] = []
         self._read = -math.inf  # time of the last answer
-        threading.Thread(target=self._run, name="queues", daemon=True).start()
+        threading.Thread(target=self._run, name="installation", daemon=True).start()
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
-        """The counts, while they are not too old, and whether they are."""
-        rows = GaugeMetricFamily("pbl_queue_jobs", "Jobs by table and status", labels=["table", "status"])
-        up = GaugeMetricFamily("pbl_database_up", "1 when the database answers")
+        """The figures, while they are not too old, and whether they are."""
         answers = time.monotonic() - self._read < FRESH_S
-        if answers:
-            for table, counts in self._counts.items():
-                for status, n in counts.items():
-                    rows.add_metric([table, status], n)
-        up.add_metric([], int(answers))
-        yield rows
-        yield up
+        yield from (self._figures if answers else ())
+        yield from self._disks
+        yield GaugeMetricFamily("pbl_database_up", "1 when the database answers", int(answers))
 
     def _run(self) -> None:
-        from pbl_schemas.reading.status import queue_counts
-
-        connection = None
         while True:
             try:
-                connection = connection or self._connect()
-                self._counts, self._read = queue_counts(connection), time.monotonic()
+                with contextlib.closing(self._connect()) as server:
+                    self._look(server)
             except Exception:  # noqa: BLE001  away: it is asked again, for as long as the process lives
-                connection, self._read = None, -math.inf
+                self._figures, self._read = [], -math.inf
+                self._disks = disk_figures()
             time.sleep(READ_EVERY_S)
+
+    def _look(self, server: Any) -> None:
+        """Read the figures for as long as this is the worker that shows them, else note that the database answers."""
+        # The server then soon ends the connection, and with it the lock, of a machine that is gone.
+        server.query(f"SET SESSION wait_timeout = {max(1, int(4 * READ_EVERY_S))}")
+        number = server.query("SELECT CONNECTION_ID()").fetchone()[0]
+        with worker.installation_lock("metrics", server) as ours:
+            # A connection that was made anew has lost the lock.
+            while server.query("SELECT CONNECTION_ID()").fetchone()[0] == number:
+                self._figures = figures(server) if ours else []
+                self._disks, self._read = disk_figures(), time.monotonic()
+                if not ours:
+                    return
+                time.sleep(READ_EVERY_S)
+        self._figures = []
+
+
+def disk_figures() -> list[GaugeMetricFamily]:
+    """Free and total bytes of the disks of this machine."""
+    free = GaugeMetricFamily("pbl_disk_free_bytes", "Free space of a disk", labels=["disk"])
+    size = GaugeMetricFamily("pbl_disk_size_bytes", "Size of a disk", labels=["disk"])
+    with contextlib.suppress(OSError):
+        for name, free_gb, size_gb in disks():
+            free.add_metric([name], 1e9 * free_gb)
+            size.add_metric([name], 1e9 * size_gb)
+    return [free, size]
+
+
+def figures(server: Any) -> list[GaugeMetricFamily]:
+    """Queues, errors, workers and regular work, read by a connection that no other thread uses."""
+    counts = status.queue_counts(server)
+    alive, lost = status.worker_counts(server)
+    jobs = GaugeMetricFamily("pbl_queue_jobs", "Jobs by table and status", labels=["table", "status"])
+    errors = GaugeMetricFamily("pbl_queue_errors", "Jobs in error, since ever", labels=["table", "code"])
+    oldest = GaugeMetricFamily("pbl_queue_oldest_seconds", "Age of the oldest pending job", labels=["table"])
+    seen = GaugeMetricFamily("pbl_cron_seen_age_seconds", "Since the last sign of life", labels=["cron"])
+    good = GaugeMetricFamily("pbl_cron_good_age_seconds", "Since the last success", labels=["cron"])
+    ok = GaugeMetricFamily("pbl_cron_ok", "1 if the last pass did not fail", labels=["cron"])
+    for table, of_table in counts.items():
+        for state, n in of_table.items():
+            jobs.add_metric([table, state], n)
+    for of_code, n in status.error_counts(server, counts).items():
+        errors.add_metric(of_code, n)
+    for table, age in status.oldest_jobs(server, counts).items():
+        oldest.add_metric([table], age)
+    for one in status.cron_passes(server):
+        seen.add_metric([one.name], one.seen_s)
+        ok.add_metric([one.name], int(not one.failed))
+        if one.good_s is not None:
+            good.add_metric([one.name], one.good_s)
+    return [
+        *(jobs, errors, oldest, seen, good, ok),
+        GaugeMetricFamily("pbl_workers", "Workers with a heartbeat", alive),
+        GaugeMetricFamily("pbl_workers_lost", "Workers whose heartbeat ended in the last hour, not in order", lost),
+    ]

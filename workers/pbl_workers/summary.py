@@ -5,21 +5,17 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import html
-import shutil
 from pathlib import Path
 
-from pbl_pipeline import settings
 from pbl_pipeline.code_version import code_version
 from pbl_schemas import computed_tables, session, video
-from pbl_schemas.operations.archive import archive_dir
 from pbl_schemas.reading.status import Status, pipeline_status
 from pbl_schemas.rows import utc_now
 
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """Figures of the time since `since` (UTC): rows per table, new videos and sessions; the state now; disks as
-    (name, free GB, total GB)."""
+    """Figures of the time since `since` (UTC): rows per table, new videos and sessions; the state now."""
 
     since: datetime.datetime
     until: datetime.datetime
@@ -27,7 +23,6 @@ class Summary:
     new_sessions: int
     done: dict[str, int]
     status: Status
-    disks: list[tuple[str, float, float]]
 
 
 def make_summary(hours: float = 24.0) -> Summary:
@@ -46,21 +41,7 @@ def make_summary(hours: float = 24.0) -> Summary:
         len(session.Session & f"session_created >= {text}"),
         done,
         pipeline_status(most=1000),
-        disks(),
     )
-
-
-def disks() -> list[tuple[str, float, float]]:
-    """Free and total GB of the disks that hold the database, the arrays and the recordings."""
-    out, seen = [], set()
-    for name, path in (("home", settings.home_dir()), ("store", settings.store_dir()), ("archive", archive_dir())):
-        there = next(p for p in (path, *path.parents) if p.exists())
-        device = there.stat().st_dev
-        if device not in seen:
-            seen.add(device)
-            usage = shutil.disk_usage(there)
-            out.append((f"{name} ({path})", usage.free / 1e9, usage.total / 1e9))
-    return out
 
 
 def rows(found: Summary) -> list[tuple[str, str]]:
@@ -81,8 +62,10 @@ def rows(found: Summary) -> list[tuple[str, str]]:
     for error in state.errors:
         codes[error.code] = codes.get(error.code, 0) + 1
     out += [(f"error {code}", str(n)) for code, n in sorted(codes.items(), key=lambda c: -c[1])]
-    out.append(("workers alive", str(len(state.workers))))
-    out += [(f"disk {name}", f"{free:.1f} of {total:.1f} GB free") for name, free, total in found.disks]
+    lost = f", {state.workers_lost} lost in the last hour" if state.workers_lost else ""
+    out.append(("workers alive", f"{len(state.workers)}{lost}"))
+    out += [(f"cron {one.name}", one.text()) for one in state.cron]
+    out += [(f"disk {name}", f"{free:.1f} of {total:.1f} GB free") for name, free, total in state.disks]
     return out
 
 

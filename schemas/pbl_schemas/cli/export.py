@@ -139,6 +139,7 @@ def _write_many(
     import pbl_schemas
     from pbl_pipeline import progress
     from pbl_pipeline.export import GAIT_FORMATS, Labels, write_export
+    from pbl_pipeline.files import check_no_link
     from pbl_schemas.reading import list_fitted, load_visits
 
     pbl_schemas.activate(methods=False)
@@ -151,6 +152,7 @@ def _write_many(
                 if isinstance(visit, PblError):
                     raise visit
                 labels = Labels.of(row["subject"], row["session_label"])
+                check_no_link(out, out / row["folder"])
                 own = dataclasses.replace(options, bids=(out / "bids", labels))
                 write_export(visit, formats, out / row["folder"], own)
             except PblError as error:

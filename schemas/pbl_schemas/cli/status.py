@@ -57,6 +57,10 @@ def lines(state: Status) -> list[str]:
     for w in state.workers:
         doing = w["worker_doing"] or "-"
         out.append(f"worker {w['worker_host']}:{w['worker_pid']} ({w['worker_resource']}): {doing}")
+    if state.workers_lost:
+        out.append(f"{state.workers_lost} workers lost in the last hour: their heartbeats ended, they did not")
+    out += [f"cron {one.name}: {one.text()}" for one in state.cron]
+    out += [f"disk {name}: {free:.1f} of {total:.1f} GB free" for name, free, total in state.disks]
     if state.errors:
         n = sum(t.error for t in state.tables)
         shown = "" if n == len(state.errors) else f", {len(state.errors)} of {n}"

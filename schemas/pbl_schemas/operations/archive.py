@@ -38,6 +38,22 @@ def archive_dir() -> Path:
     return Path(os.environ.get("PBL_ARCHIVE") or settings.home_dir() / "recordings").absolute()
 
 
+def disks() -> list[tuple[str, float, float]]:
+    """Name, free and total GB of each disk that holds the database, the arrays, the recordings or the backups."""
+    out, seen = [], set()
+    places = {"home": settings.home_dir(), "store": settings.store_dir(), "archive": archive_dir()}
+    if backups := os.environ.get("PBL_BACKUP"):
+        places["backup"] = Path(backups).absolute()
+    for name, path in places.items():
+        there = next(p for p in (path, *path.parents) if p.exists())
+        device = there.stat().st_dev
+        if device not in seen:
+            seen.add(device)
+            usage = shutil.disk_usage(there)
+            out.append((f"{name} ({path})", usage.free / 1e9, usage.total / 1e9))
+    return out
+
+
 def folder_of(archive: Path, part: str, subject: str) -> Path:
     """Return the folder of a person in a part of the archive ("", `REFUSED`, `PHONE`, `COPIES`); made if missing.
     Raises OSError if it cannot be made."""

@@ -15,10 +15,13 @@ from .. import computed_tables, connection, keypoints, tracking, video, worker
 from ..decisions import not_usable
 from ..job_errors import error_code, error_found, error_next_step
 from ..jobs import jobs_of
+from ..operations.archive import disks
 from ..operations.catalog import quote
 
 #: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
+#: Age of a heartbeat (s) after which its worker counts as lost.
+LOST_S = 180.0
 
 #: Columns that mean "ran well, nothing to produce": table -> (status, values, column of the reason or None).
 EMPTY_COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
@@ -112,6 +115,22 @@ class LeftOut:
 
 
 @dataclasses.dataclass(frozen=True)
+class Cron:
+    """The regular work `pbl cron NAME`. Ages (s) by the server's clock: of its last sign of life and of the last pass
+    that succeeded, None: none yet. failed: code or exit status of the last pass if it did not succeed."""
+
+    name: str
+    seen_s: float
+    good_s: float | None
+    failed: str
+
+    def text(self) -> str:
+        """State for people."""
+        good = "never succeeded" if self.good_s is None else f"succeeded {span(self.good_s)} ago"
+        return f"{good}; failed {span(self.seen_s)} ago ({self.failed}, see its log)" if self.failed else good
+
+
+@dataclasses.dataclass(frozen=True)
 class Status:
     """The whole state."""
 
@@ -125,6 +144,10 @@ class Status:
     #: Source of the focal length (file, measured, metadata, preset, guess) -> number of keypoints with it.
     cameras: dict[str, int] = dataclasses.field(default_factory=dict)
     not_usable: list[LeftOut] = dataclasses.field(default_factory=list)
+    workers_lost: int = 0
+    cron: list[Cron] = dataclasses.field(default_factory=list)
+    #: Name, free and total GB of each disk of this machine.
+    disks: list[tuple[str, float, float]] = dataclasses.field(default_factory=list)
 
 
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
@@ -150,7 +173,20 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     marked = [
         LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in not_usable.all_unusable(most)
     ]
-    return Status(n_videos, tables, errors, _empty(empty, most), waiting, live_workers(), exact, cameras, marked)
+    return Status(
+        n_videos,
+        tables,
+        errors,
+        _empty(empty, most),
+        waiting,
+        live_workers(),
+        exact,
+        cameras,
+        marked,
+        worker_counts(server)[1],
+        cron_passes(server),
+        disks(),
+    )
 
 
 def _table_status(
@@ -233,10 +269,53 @@ def throughput(server: Any, minutes: int = 60) -> dict[str, float]:
 
 def live_workers(seen_within_s: float = 60.0) -> list[dict[str, Any]]:
     """Return the workers with a recent heartbeat: host, process, resource, current job."""
-    alive = worker.Worker & "worker_stopped IS NULL"
+    alive = worker.Worker & "worker_stopped IS NULL" & f"worker_resource != '{worker.CRON}'"
     alive = alive & f"worker_seen > CURRENT_TIMESTAMP(3) - INTERVAL {float(seen_within_s)} SECOND"
     names = ("worker_host", "worker_pid", "worker_resource", "worker_doing")
     return [{n: r[n] for n in names} for r in alive.to_dicts(order_by="worker_host, worker_pid")]
+
+
+def worker_counts(server: Any) -> tuple[int, int]:
+    """Return the numbers of workers that live, and of those whose heartbeat ended within the last hour without that
+    they did in order."""
+    silent = f"TIMESTAMPDIFF(SECOND, worker_seen, CURRENT_TIMESTAMP) FROM {worker.Worker.full_table_name}"
+    rows = server.query(f"SELECT {silent} WHERE worker_stopped IS NULL AND worker_resource != %s", args=(worker.CRON,))
+    ages = [float(age) for (age,) in rows.fetchall()]
+    return sum(age < LOST_S for age in ages), sum(LOST_S <= age < 3600.0 for age in ages)
+
+
+def cron_passes(server: Any) -> list[Cron]:
+    """Return the state of each kind of regular work that ran."""
+    age = "TIMESTAMPDIFF(SECOND, {}, CURRENT_TIMESTAMP)".format
+    rows = server.query(
+        f"SELECT worker, {age('worker_seen')}, {age('worker_stopped')}, worker_doing"  # noqa: S608
+        f" FROM {worker.Worker.full_table_name} WHERE worker_resource = %s ORDER BY worker",
+        args=(worker.CRON,),
+    ).fetchall()
+    return [
+        Cron(str(name).removeprefix("cron "), float(seen), None if good is None else float(good), str(failed))
+        for name, seen, good, failed in rows
+    ]
+
+
+def oldest_jobs(server: Any, counts: dict[str, dict[str, int]]) -> dict[str, float]:
+    """Return the age (s) of the oldest pending job of each table that has one. `counts`: as of `queue_counts`."""
+    waiting = [t for t in computed_tables() if counts[t.__name__]["pending"]]
+    return {t.__name__: age for t in waiting if (age := _age(t, server)) is not None}
+
+
+def error_counts(server: Any, counts: dict[str, dict[str, int]]) -> dict[tuple[str, str], int]:
+    """Return how many jobs of a table are in error with a code, by the two. `counts`: as of `queue_counts`."""
+    out: dict[tuple[str, str], int] = {}
+    for table in (t for t in computed_tables() if counts[t.__name__]["error"]):
+        found = "SUBSTRING_INDEX(error_message, ':', 2)"
+        rows = server.query(
+            f"SELECT {found}, COUNT(*) FROM {quote(*queue_name(table))} WHERE status='error' GROUP BY {found}"  # noqa: S608
+        )
+        for message, n in rows.fetchall():
+            name = (table.__name__, error_code(str(message)))
+            out[name] = out.get(name, 0) + int(n)
+    return out
 
 
 def running(most: int = 200) -> list[Running]:
@@ -266,14 +345,19 @@ def span(seconds: float | None) -> str:
 def _oldest(table: Any) -> tuple[float | None, str]:
     """Return the age (s) of the oldest pending job, and the reason for which jobs were put back."""
     jobs, server = quote(*queue_name(table)), table.connection
-    age = server.query(
-        f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
-    ).fetchone()[0]
     why = server.query(
         f"SELECT error_message FROM {jobs} WHERE status='pending' AND scheduled_time > CURRENT_TIMESTAMP(3)"  # noqa: S608
         " ORDER BY scheduled_time LIMIT 1"
     ).fetchone()
-    return (None if age is None else float(age)), (str(why[0]) if why else "")
+    return _age(table, server), (str(why[0]) if why else "")
+
+
+def _age(table: Any, server: Any) -> float | None:
+    jobs = quote(*queue_name(table))
+    age = server.query(
+        f"SELECT TIMESTAMPDIFF(SECOND, MIN(created_time), CURRENT_TIMESTAMP) FROM {jobs} WHERE status='pending'"  # noqa: S608
+    ).fetchone()[0]
+    return None if age is None else float(age)
 
 
 def _rows(table: Any, server: Any) -> tuple[int, int, int]:

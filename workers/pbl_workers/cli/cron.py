@@ -13,9 +13,25 @@ from pbl_pipeline.errors import PblError, harmless
 AT_MOST_S = 1800
 #: How many names of ignored files `pbl cron import` prints.
 _MOST_IGNORED = 100
+#: Exit status where another process does the work now: neither a success nor a failure.
+BUSY = 75
 
 
-@click.group()
+class _Pass(click.Command):
+    """A command that notes how it ended, for `pbl status`, the summary and the metrics."""
+
+    def invoke(self, ctx: click.Context) -> None:
+        from pbl_workers.heartbeat import cron_pass
+
+        with cron_pass(str(ctx.info_name), BUSY):
+            super().invoke(ctx)
+
+
+class _Cron(click.Group):
+    command_class = _Pass
+
+
+@click.group(cls=_Cron)
 def cron() -> None:
     """Regular jobs; each may run at any time, also twice. docs/deployment.md has a crontab and systemd timers.
 
@@ -45,7 +61,7 @@ def import_(settled_s: float) -> None:
         signal.alarm(0)
     if taken is None:
         click.echo("another process takes uploads over now", err=True)
-        raise click.exceptions.Exit(75)
+        raise click.exceptions.Exit(BUSY)
     click.echo(
         f"{len(taken.registered)} registered, {len(taken.known)} known, {len(taken.refused)} refused, "
         f"{len(taken.left)} left, {taken.later} for the next run, {taken.uploading} not whole yet, "
@@ -122,6 +138,8 @@ def reprocess() -> None:
 def backup(keep: int) -> None:
     """Save database, store and recordings into a new folder of PBL_BACKUP, and remove the oldest.
 
+    Exit code 75 when another process does so now.
+
     A person who was forgotten is also gone from the backups once the last older one is removed.
 
     Example: PBL_BACKUP=/backup pbl cron backup --keep 7
@@ -133,9 +151,9 @@ def backup(keep: int) -> None:
     pbl_schemas.activate(methods=False)
     made = backup_regularly(backup_folder(), keep, click.echo)
     if made is None:
-        click.echo("another process is doing this now")
-    else:
-        say(made)
+        click.echo("another process is doing this now", err=True)
+        raise click.exceptions.Exit(BUSY)
+    say(made)
 
 
 @cron.command()
@@ -170,8 +188,8 @@ def disk(days: float | None, least_gb: float) -> None:
     Example: pbl cron disk --remove-older-than 30
     """
     import pbl_schemas
+    from pbl_schemas.operations.archive import disks
     from pbl_schemas.operations.orphans import orphans, remove
-    from pbl_workers.summary import disks
 
     pbl_schemas.activate(methods=False)
     found = orphans()

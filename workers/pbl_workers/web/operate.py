@@ -20,7 +20,6 @@ from pbl_schemas.reading.status import ErrorRow, pipeline_status, running, span
 from pbl_schemas.transactions import in_transaction
 
 from ..requeue import retry
-from ..summary import disks
 from .access import Refused, form_of, sender
 from .address import Address
 from .pages import Pages
@@ -39,16 +38,13 @@ class Group:
 
 def routes(pages: Pages, tables: Tables) -> list[Address]:
     async def show(request: Request) -> Response:
-        state, jobs, server, free = await tables.ask(
-            lambda: (pipeline_status(most=MOST), running(MOST), database_status(), disks())
-        )
+        state, jobs, server = await tables.ask(lambda: (pipeline_status(most=MOST), running(MOST), database_status()))
         return pages.show(
             request,
             "operate.html",
             state=state,
             jobs=jobs,
             server=server,
-            disks=free,
             groups=groups_of(state.errors),
             n_errors=sum(t.error for t in state.tables),
             retried=whole_number(request.query_params.get("retried", "")),
