@@ -100,8 +100,9 @@ def workers_of_other_versions() -> list[str]:
         return []
     rows = connection.connect().query(
         f"SELECT worker_host, worker_pid, worker_version FROM `{connection.schema_name('worker')}`.worker"  # noqa: S608
-        " WHERE worker_stopped IS NULL AND worker_seen > NOW(3) - INTERVAL %s SECOND AND worker_version <> %s",
-        args=(SEEN_S, code_version()[:64]),
+        " WHERE worker_stopped IS NULL AND worker_resource <> 'cron' AND worker_version <> %s"
+        " AND worker_seen > NOW(3) - INTERVAL %s SECOND",
+        args=(code_version()[:64], SEEN_S),
     )
     return [f"process {pid} on {host}, pbl-pipeline {version}" for host, pid, version in rows.fetchall()]
 
