@@ -51,6 +51,7 @@ def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | Non
     info = probe(recording.video) if recording.video else None
     size = (info.width_px, info.height_px) if info else recording.size_px
     rate = info.fps if info else recording.rate_hz
+    poses = read_poses(path, rate or 30.0, table)
     if size is None or (info and (recording.size_px or recording.rate_hz)):
         raise _usage(
             "a video together with a rate or a size" if size else "no size of the picture",
@@ -58,7 +59,6 @@ def read_keypoints(path: Path, recording: RecordingFacts, table: MarkerSet | Non
             f"pass the video of {path.name}, or its rate and size",
             key=str(path),
         )
-    poses = read_poses(path, rate or 30.0, table)
     stated = poses.rate_hz if np.isfinite(poses.rate_hz) else None
     if (rate or stated) is None or (stated and rate and abs(rate / stated - 1) > _SAME_RATE):
         found = f"{rate:g} frames a second, {stated:g} in the file" if rate and stated else "no frame rate"

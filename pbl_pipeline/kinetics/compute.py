@@ -17,7 +17,7 @@ from pbl_pipeline.gait import GaitCycle, GaitEvent, far_leg_of, legs_check
 from pbl_pipeline.gait.cycle_measures import measure_of, sampling_sd
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
 from pbl_pipeline.methods import Method
-from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
+from pbl_pipeline.qc import EMPTY, PASS, Check, in_order, warn_if
 from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
 
@@ -347,8 +347,10 @@ def _checks(
     unexplained = "much of the force that the motion needs is carried by no foot: look at the events and at the fit"
     sized = all(is_metric(f) or np.isfinite(f.height_m) for f in fits)
     assumed = "accelerations are scaled by an assumed body size: state the measured height"
-    return (
-        warn_if(residual > MAX_RESIDUAL_BW, "kinetics_residual", round(residual, 4), MAX_RESIDUAL_BW, unexplained),
-        warn_if(not sized, "kinetics_scale", None, None, assumed),
-        legs_check(cycles),
+    return in_order(
+        (
+            warn_if(residual > MAX_RESIDUAL_BW, "kinetics_residual", round(residual, 4), MAX_RESIDUAL_BW, unexplained),
+            warn_if(not sized, "kinetics_scale", None, None, assumed),
+            legs_check(cycles),
+        )
     )
