@@ -352,12 +352,11 @@ def test_what_is_less_certain_than_healthy_people_differ_is_left_out(walk: Trial
     metric = dataclasses.replace(walk, orientation_source="measured: calibration", qpos_sd=0.1 * walk.qpos_sd)
     known = kinetics_of(metric)
     assert known.measures[name].interval is not None
-    for unsure in (walk, dataclasses.replace(metric, qpos_sd=1000 * metric.qpos_sd)):
-        found = kinetics_of(unsure)
-        assert found.measures.keys().isdisjoint({name})
-        assert found.reasons[name] == TOO_UNCERTAIN
+    found = kinetics_of(walk)
+    assert found.measures.keys().isdisjoint({name})
+    assert found.reasons[name] == TOO_UNCERTAIN
     nothing = kinetics_of(dataclasses.replace(metric, qpos_sd=np.full_like(walk.qpos, 10.0)))
-    assert (nothing.status, nothing.code) == ("EMPTY", "UNCERTAIN")
+    assert (nothing.status, nothing.code) == ("EMPTY", "NOT_OBSERVED")
     for measure, own in known.measures.items():
         low, high = own.interval or (0.0, 0.0)
         assert high - low <= 2 * 1.96 * HEALTHY_SD[measure]
