@@ -37,11 +37,12 @@ def seen(keypoints: Keypoints, points: str, camera: str) -> Keypoints:
     return dataclasses.replace(keypoints, xy_px=xy, confidence=confidence, xyz_cam_m=nothing, crop_px=None, camera=lens)
 
 
-@click.command(help=__doc__.replace("\n\n", "\n\n\b\n", 1))
+@click.command()
 @click.option("--points", type=click.Choice(list(LACKS)), multiple=True, default=("BODY_25",), show_default=True)
 @click.option("--camera", type=click.Choice(["true", "guessed"]), default="true", show_default=True)
 @click.option("--seeds", type=click.IntRange(1), default=2, show_default=True, help="Walks of each view.")
 def main(points: tuple[str, ...], camera: str, seeds: int) -> None:
+    """Print the errors of each set of points and view."""
     method = METHODS[METHODS.default]
     click.echo(f"{'points':9} {'view':9} " + " ".join(f"{j:>14}" for j in JOINTS) + "  in 90 %  failed")
     for name in points:

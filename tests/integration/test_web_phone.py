@@ -675,8 +675,9 @@ def test_parts_of_a_recording_that_did_not_go_on_give_their_room_back(visit: int
     for one in (whole, other):
         put(browser, begin(browser, one)["number"], 0, parts_of(one)[0], len(one))
     old, new = sorted((tmp_path / "archive" / "_phone" / "P001").iterdir())
+    week_ago = time.time() - 8 * 86_400
     for path in (old / "0", old):
-        os.utime(path, times=(time.time() - 8 * 86_400,) * 2)
+        os.utime(path, times=(week_ago, week_ago))
     done = CliRunner().invoke(cron, ["release"])
     assert "removed 1 recordings" in done.output
     assert (old.exists(), new.exists()) == (False, True)

@@ -502,7 +502,7 @@ def test_our_reader_of_laboratories_finds_the_same_walk(pig, walk):
     np.testing.assert_allclose([e.time_s for e in found.events.events], [e.time_s for e in events], atol=1e-4)
     again = gait_metrics([found])
     for name in ("cadence_steps_per_min", "stance_percent", "stride_length_m", "speed_m_per_s"):
-        own, read = (not_none(m.spatiotemporal.measures[name].mean) for m in (measures, again))
+        own, read = (not_none(m.spatiotemporal.measures[name]).mean for m in (measures, again))
         assert read == pytest.approx(own, rel=1e-3), name
 
 

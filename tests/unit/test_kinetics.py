@@ -338,7 +338,7 @@ def test_a_vertical_that_is_off_hardly_changes_the_excursion(tilt_deg: float) ->
     known = dataclasses.replace(synthetic_walk(3).fit(), orientation_source="measured: phone")
     true, off = (kinetics_of(f).measures["centre_of_mass_excursion_m"] for f in (known, tilted(known, tilt_deg)))
     assert 0.02 < true.mean < 0.07
-    np.testing.assert_allclose([off.left, off.right], [true.left, true.right], atol=0.003)
+    assert (off.left, off.right) == pytest.approx((true.left, true.right), abs=0.003)
 
 
 def test_the_result_is_the_same_every_time_and_needs_no_mass(walk: TrialFit, found: Kinetics) -> None:

@@ -149,7 +149,7 @@ def test_parts_do_not_depend_on_how_the_person_sits_or_on_the_angle_of_a_turn(se
 def test_what_is_not_two_half_turns_has_no_parts():
     plain = motion([(1.0, 1.0)], [(16.0, 1.0)], 19.0)
     t = plain.time_s
-    found, reasons = parts(180.0 * sum(ease((t - at) / 1.5) for at in (4.0, 8.0, 12.0)), plain)
+    found, reasons = parts(180.0 * np.sum([ease((t - at) / 1.5) for at in (4.0, 8.0, 12.0)], axis=0), plain)
     assert (found, reasons["turn_time_s"]) == ([None] * 4, "the person turned more often than twice")
     found, reasons = parts(180.0 * ease((t - 4.0) / 1.5) + 60.0 * ease((t - 12.0) / 1.5), plain)
     assert (found, reasons["turn_time_s"]) == ([None] * 4, "two half turns are needed, 1 were found")
