@@ -195,6 +195,18 @@ def os_errors_as(code: str, expected: str, next_step: str, key: object = None) -
         raise PblError(code, error.strerror or str(error), expected, next_step, key) from error
 
 
+def unread_file(error: Exception, expected: str, next_step: str, key: object) -> PblError:
+    """The error for a file that could not be read: FILE_MISSING where it is absent or barred, else FILE_FORMAT."""
+    absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
+    return PblError(
+        "FILE_MISSING" if absent else "FILE_FORMAT",
+        found=f"{type(error).__name__}: {error}",
+        expected=expected,
+        next_step="check the path" if absent else next_step,
+        key=str(key),
+    )
+
+
 def harmless(text: str, lines: bool = True) -> str:
     """Text with control characters escaped: a name from outside must not move the reader's cursor, nor (without
     `lines`) begin a line that looks like ours."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from pbl_pipeline.assumptions import SIZES, Origin, check_size, check_steps
 from pbl_pipeline.bounded import count_rows, read_text
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, unread_file
 
 from ._angles import AngleSeries, check_ranges, legs_of, series_of
 from .events import SIDES
@@ -65,14 +65,8 @@ def read_motion(path: str | Path) -> OpenSimMotion:
         column = {n: values[:, i] for i, n in enumerate(names) if n and np.isfinite(values[:, i]).any()}
         time = column.pop("time")
     except (OSError, StopIteration, KeyError, ValueError, IndexError) as error:
-        absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
-        raise PblError(
-            "FILE_MISSING" if absent else "FILE_FORMAT",
-            found=f"{type(error).__name__}: {error}",
-            expected="an OpenSim motion with `inDegrees=yes` or `no`, `endheader`, `time` and each column once",
-            next_step="check the path" if absent else "see docs/validation.md, section The reference",
-            key=str(path),
-        ) from error
+        expected = "an OpenSim motion with `inDegrees=yes` or `no`, `endheader`, `time` and each column once"
+        raise unread_file(error, expected, "see docs/validation.md, section The reference", path) from error
     turns = {n: v for n, v in column.items() if not n.endswith(("_tx", "_ty", "_tz", "_beta"))}
     _check_unit(path, turns, in_degrees)
     angles, knee_sign = {}, knee_sign_of([v for n, v in column.items() if angle_of(n)[1] < 0])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Y_UP_TO_Z_UP, joint_angles, joint_angles_sd, joint_of, load_body
 from pbl_pipeline.bounded import read_json
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import unread_file
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import BodyPoses, read_motion, trial_poses
 
@@ -87,7 +87,7 @@ def reference_of_bodies(path: str | Path) -> Reference:
         pelvis = bodies.position_m["pelvis"] @ Y_UP_TO_Z_UP.T
         angles = body_rotation_angles(bodies.rotation)
     except (KeyError, ValueError) as error:
-        raise _unreadable(Path(path), error, _BODIES) from error
+        raise unread_file(error, _BODIES, _NEXT, path) from error
     name = Path(path).name.split(".")[0]
     return Reference(name, "optical markers", BODY_ROTATIONS, bodies.time_s, angles, pelvis)
 
@@ -104,6 +104,7 @@ class Bodies:
 
 
 _BODIES = "a file with `time` and `bodies`, each with `rotation` and `translation`"
+_NEXT = "see docs/validation.md, section The reference"
 
 
 def load_bodies(path: str | Path) -> Bodies:
@@ -119,7 +120,7 @@ def load_bodies(path: str | Path) -> Bodies:
             {n: np.asarray(b.get("scaleFactors", (1.0, 1.0, 1.0)), float) for n, b in bodies.items()},
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise _unreadable(path, error, _BODIES) from error
+        raise unread_file(error, _BODIES, _NEXT, path) from error
 
 
 def reference_of_mot(path: str | Path, source: str = "optical markers", convention: str = QPOS) -> Reference:
@@ -129,14 +130,3 @@ def reference_of_mot(path: str | Path, source: str = "optical markers", conventi
     """
     read, name = read_motion(path), Path(path).stem
     return Reference(name, source, convention, read.time_s, read.angles_deg, read.pelvis_m, tuple(read.origin.computed))
-
-
-def _unreadable(path: Path, error: Exception, expected: str) -> PblError:
-    absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
-    return PblError(
-        "FILE_MISSING" if absent else "FILE_FORMAT",
-        found=f"{type(error).__name__}: {error}",
-        expected=expected,
-        next_step="check the path" if absent else "see docs/validation.md, section The reference",
-        key=str(path),
-    )

@@ -13,7 +13,7 @@ import pandas as pd
 
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.bounded import read_text
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, unread_file
 from pbl_pipeline.gait.normative import BODY_ANGLES, PLUG_IN_GAIT, offset_deg
 
 #: What the ankle of the LBMC recordings (ISB axes, no neutral pose subtracted) is below the body's (deg): the mean of
@@ -195,14 +195,8 @@ def _table(path: Path) -> tuple[pd.DataFrame, bool | None]:
         table = pd.read_csv(io.StringIO(body), sep=r"\s+")
         return table, None if stated is None else stated[1].lower() == "yes"
     except (OSError, ValueError) as error:
-        absent = isinstance(error, FileNotFoundError | IsADirectoryError | NotADirectoryError | PermissionError)
-        raise PblError(
-            "FILE_MISSING" if absent else "FILE_FORMAT",
-            found=f"{type(error).__name__}: {error}",
-            expected="a .mot or .csv of joint angles over time, gzipped or not",
-            next_step="check the path" if absent else "fetch the file again",
-            key=str(path),
-        ) from error
+        expected = "a .mot or .csv of joint angles over time, gzipped or not"
+        raise unread_file(error, expected, "fetch the file again", path) from error
 
 
 def _to_rad(row: Mapping[str, str], in_degrees: bool | None, path: Path) -> float:

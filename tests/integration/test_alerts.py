@@ -1,4 +1,4 @@
-"""What an operator sees at night: each alert rule on the metrics that a worker prints, and how regular work ended."""
+"""Each alert rule on the metrics that a worker prints, and how regular work ended, as an operator sees them."""
 
 import json
 import operator
