@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -191,34 +192,33 @@ def test_figures_of_the_installation_sum_up_over_workers(
     queued(tmp_path, video.VideoInfo)
     jobs = video.VideoInfo.jobs
     monkeypatch.setattr(metrics, "READ_EVERY_S", 0.2)
-    both = [metrics._Installation(connection.another) for _ in range(2)]
+    with ExitStack() as stack:
+        both = [stack.enter_context(closing(metrics._Installation(connection.another))) for _ in range(2)]
 
-    def summed() -> tuple[int, float]:
-        found = [f for one in both for f in one.collect()]
-        up = sum(s.value for f in found if f.name == "pbl_database_up" for s in f.samples)
-        mine = [s for f in found if f.name == "pbl_queue_jobs" for s in f.samples]
-        return int(up), sum(s.value for s in mine if s.labels == {"table": "VideoInfo", "status": "pending"})
+        def summed() -> tuple[int, float]:
+            found = [f for one in both for f in one.collect()]
+            up = sum(s.value for f in found if f.name == "pbl_database_up" for s in f.samples)
+            mine = [s for f in found if f.name == "pbl_queue_jobs" for s in f.samples]
+            return int(up), sum(s.value for s in mine if s.labels == {"table": "VideoInfo", "status": "pending"})
 
-    until = time.monotonic() + 60.0
-    while summed() != (2, 1.0) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert len(jobs.pending) == 1
-    seen = set()
-    for _ in range(20):
-        seen.add(summed())
-        time.sleep(0.05)
-    assert seen == {(2, 1.0)}
-    # The one that shows them loses its connection: the other one does.
-    for one in both:
-        one._connect = connection.another
-    holder = connection.connect().query(
-        f"SELECT turn_connection FROM {worker.Turn.full_table_name} WHERE work='metrics'"
-    )
-    connection.connect().query(f"KILL {int(holder.fetchone()[0])}")
-    until = time.monotonic() + 60.0
-    while summed() != (2, 1.0) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert summed() == (2, 1.0)
+        until = time.monotonic() + 60.0
+        while summed() != (2, 1.0) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert len(jobs.pending) == 1
+        seen = set()
+        for _ in range(20):
+            seen.add(summed())
+            time.sleep(0.05)
+        assert seen == {(2, 1.0)}
+        # The one that shows them loses its connection: the other one does.
+        holder = connection.connect().query(
+            f"SELECT turn_connection FROM {worker.Turn.full_table_name} WHERE work='metrics'"
+        )
+        connection.connect().query(f"KILL {int(holder.fetchone()[0])}")
+        until = time.monotonic() + 60.0
+        while summed() != (2, 1.0) and time.monotonic() < until:
+            time.sleep(0.05)
+        assert summed() == (2, 1.0)
 
 
 def test_errors_are_counted_by_code(healthy: Path, tmp_path: Path):

@@ -74,7 +74,14 @@ class _Installation(Collector):
         self._figures: list[GaugeMetricFamily] = []
         self._disks: list[GaugeMetricFamily] = []
         self._read = -math.inf  # time of the last answer
-        threading.Thread(target=self._run, name="installation", daemon=True).start()
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="installation", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, and with it its connection."""
+        self._closed.set()
+        self._thread.join()
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         """The figures, while they are not too old, and whether they are."""
@@ -84,14 +91,14 @@ class _Installation(Collector):
         yield GaugeMetricFamily("pbl_database_up", "1 when the database answers", int(answers))
 
     def _run(self) -> None:
-        while True:
+        while not self._closed.is_set():
             try:
                 with contextlib.closing(self._connect()) as server:
                     self._look(server)
-            except Exception:  # noqa: BLE001  away: it is asked again, for as long as the process lives
+            except Exception:  # noqa: BLE001  away: it is asked again, until it is closed
                 self._figures, self._read = [], -math.inf
                 self._disks = disk_figures()
-            time.sleep(READ_EVERY_S)
+            self._closed.wait(READ_EVERY_S)
 
     def _look(self, server: Any) -> None:
         """Read the figures for as long as this is the worker that shows them, else note that the database answers."""
@@ -103,9 +110,8 @@ class _Installation(Collector):
             while server.query("SELECT CONNECTION_ID()").fetchone()[0] == number:
                 self._figures = figures(server) if ours else []
                 self._disks, self._read = disk_figures(), time.monotonic()
-                if not ours:
+                if not ours or self._closed.wait(READ_EVERY_S):
                     return
-                time.sleep(READ_EVERY_S)
         self._figures = []
 
 
