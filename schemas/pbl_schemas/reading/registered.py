@@ -146,14 +146,17 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
 
 
 def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
-    """Rows about a visit or one of its videos, with whose visit it is; the columns without their prefix."""
+    """Rows about a visit or one of its videos, with whose visit it is, and without a restriction those about none, such
+    as an instrument; the columns without their prefix."""
     rows = frame_of(table.proj(..., of="session_id"))
     videos = video.Video.proj("session_id") & inside("video_id", rows["video_id"].dropna().astype(int).unique())
     own = frame_of(videos).set_index("video_id")["session_id"]
     rows["session_id"] = rows.pop("of").fillna(rows["video_id"].map(own)).astype("Int64")
     rows["video_id"] = rows["video_id"].astype("Int64")
-    found = frame_of(_visits() & inside("session_id", rows["session_id"].unique()) & restriction)
-    rows = rows.merge(found[["session_id", "subject", "session_label"]], on="session_id")
+    found = frame_of(_visits() & inside("session_id", rows["session_id"].dropna().unique()) & restriction)
+    everything = restriction is True or restriction == {}
+    named = found[["session_id", "subject", "session_label"]].astype({"session_id": "Int64"})
+    rows = rows.merge(named, how="left" if everything else "inner", on="session_id")
     rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True)
     rows.columns = [name.removeprefix(f"{prefix}_") for name in rows.columns]
     first = ["id", "at", "by", "what", "subject", "session_label", "session_id", "video_id"]
