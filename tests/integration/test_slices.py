@@ -13,6 +13,7 @@ from pbl_schemas import fit, gait, gdi, session, study, video
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.intake.records import set_condition
 from pbl_schemas.reading import frames
+from pbl_schemas.review import Decision
 from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
@@ -179,6 +180,41 @@ def test_the_views_of_a_study(cohort: Path):
     videos = (video.Video & own.proj()).proj().to_dicts()
     current = (fit.FitSelection & {"fit_current": True}).proj()
     assert len(cycles) == sum((gait.GaitCycle & current & videos).to_arrays("n_cycles_used"))
+
+
+def test_a_slice_is_looked_at_before_it_is_frozen_and_can_be_withdrawn(cohort: Path):
+    before = sorted(study.StudySlice().to_arrays("study_slice"))
+    asked = ("study", "slice", "planned")
+    assert pbl(*asked).error_code == "DB_NOT_FOUND"  # a check of a name that is not there freezes nothing
+    assert pbl(*asked, "--withdraw").error_code == "DB_NOT_FOUND"
+    assert pbl(*asked, "--all", "--role", "pre").code == 2
+    for more, n in ((("--cohort", "dcm"), 2), (("--all",), 3), ((), 3)):  # C001 is excluded from the cohort
+        planned = pbl(*asked, *more, "--dry-run")
+        assert planned.code == 0, planned.err
+        lines = planned.out.splitlines()
+        assert "P001 pre: counts" in lines
+        assert "P002 pre: does not count: no measures" in lines
+        assert f"would be frozen: 5 visits, {n} count" in lines[-1]
+    assert sorted(study.StudySlice().to_arrays("study_slice")) == before
+    made = pbl(*asked, "--all")
+    assert made.code == 0, made.err
+    digest = made.out.split()[-1]
+    assert pbl(*asked).out == "planned: as it was frozen\n"
+    server, rows = study.StudySlice.connection, study.StudySlice.full_table_name
+    schema = rows.split(".")[0]
+    refers = f"FOREIGN KEY (study_slice) REFERENCES {rows} (study_slice)"
+    server.query(f"CREATE TABLE {schema}.own (study_slice VARCHAR(32), {refers})")
+    try:
+        server.query(f"INSERT INTO {schema}.own VALUES ('planned')")
+        assert pbl(*asked, "--withdraw").error_code == "USAGE"
+        assert pbl(*asked).out == "planned: as it was frozen\n"
+    finally:
+        server.query(f"DROP TABLE {schema}.own")
+    assert pbl(*asked, "--withdraw").out == "planned: withdrawn\n"
+    assert sorted(study.StudySlice().to_arrays("study_slice")) == before
+    (kept,) = (Decision & {"decision_what": "slice"}).to_dicts()
+    assert (kept["decision_about"], kept["decision_before"]["hash"]) == ({"study_slice": "planned"}, digest)
+    assert digest in pbl("list", "decisions").out
 
 
 @pytest.mark.long

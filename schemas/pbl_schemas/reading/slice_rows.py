@@ -18,7 +18,7 @@ def slice_row(name: str) -> dict[str, Any]:
             "DB_NOT_FOUND",
             found=f"no slice {name!r}",
             expected=f"a slice that was frozen ({known})",
-            next_step="`pbl study slice NAME` freezes one",
+            next_step="`pbl study slice NAME --cohort ...` freezes one; --dry-run shows its visits before",
         )
     return {**found[0], "fit_set_kind": found[0]["slice_kind"]}
 

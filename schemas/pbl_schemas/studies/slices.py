@@ -18,8 +18,9 @@ from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import UNUSABLE, unit_of
 
 from .. import fit, gait, gdi, lab, session, study, video
-from ..datajoint_setup import dj
+from ..datajoint_setup import IntegrityError, dj
 from ..decisions.not_usable import unusable
+from ..decisions.review_decisions import record
 from ..method_names import with_keys
 from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
@@ -40,12 +41,14 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """A frozen slice: name, hash, how many visits it has and how many of them count."""
+    """A frozen slice: name, hash, how many visits it has and how many of them count; `visits`: person, visit, and why
+    it does not count, empty where it does."""
 
     name: str
     hash: str
     n: int
     n_included: int
+    visits: tuple[tuple[str, str, str], ...] = ()
 
 
 def freeze(
@@ -55,8 +58,10 @@ def freeze(
     methods: Mapping[str, str] | None = None,
     event: str = "",
     note: str = "",
+    dry_run: bool = False,
 ) -> Slice:
-    """Freeze the visits of a cohort (None: of all people) with the measures that they have now.
+    """Freeze the visits of a cohort (None: of all people) with the measures that they have now; `dry_run`: only return
+    what would be frozen.
 
     Raises `PblError` USAGE for a name that is taken, labels too long, several chains of methods; DB_NOT_FOUND for an
     unknown cohort, no visits, no measures.
@@ -81,7 +86,7 @@ def freeze(
             "USAGE",
             found=f"slice {name!r} is there already",
             expected="a new name: a slice never changes",
-            next_step=f"name it {name}-2, or delete the old one from study.StudySlice",
+            next_step=f"name it {name}-2, or withdraw the old one: pbl study slice {name} --withdraw",
         )
     if cohort is not None and not study.Cohort & {"cohort": cohort}:
         raise _none(
@@ -97,6 +102,10 @@ def freeze(
         about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
+        listed = zip(rows["subject"], rows["visit"], rows["reason"], strict=True)
+        made = Slice(name, digest, len(rows), int(rows["included"].sum()), tuple(listed))
+        if dry_run:
+            return made
         study.StudySlice.insert1(
             {
                 **{k: v for k, v in about.items() if k != "fit_set_kind"},
@@ -119,9 +128,31 @@ def freeze(
             }
             for r in rows.to_dict("records")
         )
-        return Slice(name, digest, len(rows), int(rows["included"].sum()))
+        return made
 
     return in_transaction(work)
+
+
+def withdraw(name: str, by: str) -> None:
+    """Delete a slice, with a row of Decision that keeps its hash. Raises `PblError` DB_NOT_FOUND for an unknown slice,
+    USAGE if rows of another table refer to it."""
+    about = slice_row(name)
+    key = {"study_slice": name}
+
+    def work() -> None:
+        (study.StudySliceVisit & key).delete_quick()
+        (study.StudySlice & key).delete_quick()
+        record("slice", by, key, {"hash": about["slice_hash"], "visits": int(about["slice_n"])}, {})
+
+    try:
+        in_transaction(work)
+    except IntegrityError as error:
+        raise PblError(
+            "USAGE",
+            found=f"rows of another table refer to the slice {name!r}: {error}",
+            expected="a slice to which nothing refers",
+            next_step="keep it, and freeze another one under a new name",
+        ) from None
 
 
 def study_data(name: str, curves: bool = True) -> StudyData:
