@@ -376,7 +376,12 @@ def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch:
         page.locator(".keep").click()
         page.get_by_text("TUG, from any side: 0 of 1; 1 arrived, being checked").wait_for()
         assert page.locator(".complete").inner_text() == ""
-        monkeypatch.setattr(phone_recordings, "verdicts", lambda videos: {v: Usable("usable") for v in videos})
+        activities = ("walking", "tug")
+
+        def judged(videos: list[int]) -> dict[int, Usable]:
+            return {v: Usable("usable", activity=a) for v, a in zip(sorted(videos), activities, strict=True)}
+
+        monkeypatch.setattr(phone_recordings, "verdicts", judged)
         with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
             cursor.execute(f"UPDATE {video.Video.full_table_name} SET video_name = CONCAT(video_name, '.mp4')")
             server.commit()

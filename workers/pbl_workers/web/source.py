@@ -15,6 +15,7 @@ from pbl_schemas import privacy, video
 from pbl_schemas.decisions import candidates, review_decisions
 from pbl_schemas.intake import phone_recordings, protocols
 from pbl_schemas.reading import shown
+from pbl_schemas.reading.usable import usual_seconds
 from pbl_schemas.reading.visit_progress import Progress, visit_progress
 
 from .corrections import Judged, judged
@@ -138,6 +139,7 @@ class TablesSource:
 
         number = about.row.session_id
         film = phone_recordings.filming(number)
+        film |= {"usual": usual_seconds() if film["sent"] else None}
         film |= {"steps": protocols.steps_of(number, film["sent"]), "protocols": protocols.protocols()}
         return {
             "decisions": review_decisions.decisions(number),
