@@ -141,7 +141,7 @@ def test_a_visit_with_an_aid_is_not_judged(visits: None):
         change = not_none(comparison.compare([(1, None), (2, None)]).compared[1].change)
         assert (change.sure, [d.what for d in change.differs]) == (None, ["aid"])
         page = web.client().get("/compare?v=1&v=2").text
-        assert page.count("other walking aid (cane &amp; &lt;b&gt;, before: none)") == 1  # not in each row
+        assert page.count("other walking aid (cane &amp; &lt;b&gt;, before: not stated)") == 1  # not in each row
         assert "+6.0: not comparable</span>" in page
         assert "can change the values as much as the person did" in page
         visit = web.client().get("/visits/2").text

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_height, check_label, check_mass, is_plain, normalised_label
+from pbl_pipeline.texts import code_of
 
 from .. import fit, gait, gdi, kinetics, lab, linking, session, video
 from ..rows import counted, delete_below, inside, number, utc_now
@@ -96,10 +97,10 @@ class VisitRecord:
     mass_kg: float | None = None  # of the person at the visit
 
     def __post_init__(self) -> None:
-        """Normalise the labels, so that all ways into the tables agree."""
+        """Normalise the labels and codes, so that all ways into the tables agree."""
         for name in ("subject", "session_label", "project", "activity", "pace", "population"):
             if isinstance(text := getattr(self, name), str):
-                object.__setattr__(self, name, normalised_label(text))
+                object.__setattr__(self, name, code_of(name, normalised_label(text)))
 
     def check(self, key: object = None) -> None:
         """Raise `PblError` USAGE for a code that could be a name or a label too long; FIT_INPUT for height or mass."""

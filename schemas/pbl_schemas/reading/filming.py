@@ -52,8 +52,8 @@ def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
         out.append(
             Filming(
                 views=views_of(own) if one_camera else (),
-                aid=stated(visit["assistive_device"]),
-                orthosis=stated(visit["orthosis"]),
+                aid=stated("aid", visit["assistive_device"]),
+                orthosis=stated("orthosis", visit["orthosis"]),
                 paces=known(done[v].pool for v in counted),
                 height=(height_word(heights[r["fit_set"], r["fit_method"]]),),
                 cameras=known(v["camera_kind"] for v in about),

@@ -31,8 +31,9 @@ from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video.
-STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
+#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video;
+#: unrecorded: it has none.
+STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable", "unrecorded")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
@@ -127,7 +128,8 @@ class Trend:
 class VisitRow:
     """A visit of the list.
 
-    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed; more: further results of other
+    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed, or where a part of a computed
+    visit did; more: further results of other
     chains of methods or kinds of recordings.
     """
 
@@ -367,17 +369,19 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
                 add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
     if wanted.state in ("computed", "pending"):
         # Queried first: as subqueries the server would evaluate them for each visit.
-        questions = (_waiting(), _failed(), _empty(), _unusable())
+        questions = (_waiting(), _empty(), _unusable(), _unrecorded())
         apart = {int(i) for question in questions for (i,) in _ask(question, [])}
+        failed = {int(i) for (i,) in _ask(_failed(), [])}
         unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
         with_set = f"EXISTS (SELECT 1 FROM {_name(fit.FitSet)} p WHERE p.session_id = s.session_id)"
         if wanted.state == "computed":
             add(with_set)
-            outside(apart | unfinished)
+            found = results_of(failed - apart - unfinished)
+            outside(apart | unfinished | {i for i in failed if not _has_index(found.get(i, ()))})
         else:
             listed = f" OR s.session_id IN ({_places(list(unfinished))})" if unfinished else ""
             add(f"(NOT {with_set}{listed})", *unfinished)
-            outside(apart)
+            outside(apart | failed)
     elif wanted.state:
         only("x", _STATES[wanted.state]())
     return joins, where, [*of_joins, *of_where]
@@ -430,6 +434,17 @@ def _empty() -> str:
     )
 
 
+def _unrecorded() -> str:
+    """Visits without a video."""
+    recorded = f"SELECT 1 FROM {_name(video.Video)} o WHERE o.session_id = n.session_id"
+    return f"SELECT n.session_id FROM {_name(session.Session)} n WHERE NOT EXISTS ({recorded})"
+
+
+def _has_index(results: Sequence[Result]) -> bool:
+    """Return whether the first of the results of a visit, which is shown, has an index."""
+    return bool(results) and results[0].index is not None
+
+
 def _unusable() -> str:
     """Visits whose videos are all marked as not usable."""
     videos, marked = _name(video.Video), _name(video.NotUsable)
@@ -466,7 +481,13 @@ def _failed(column: str = "") -> str:
     return f" {'UNION ALL' if column else 'UNION'} ".join(parts)
 
 
-_STATES = {"waiting": _waiting, "failed": _failed, "empty": _empty, "unusable": _unusable}
+_STATES = {
+    "waiting": _waiting,
+    "failed": _failed,
+    "empty": _empty,
+    "unusable": _unusable,
+    "unrecorded": _unrecorded,
+}
 
 
 # ----------------------------------------------------------------------------------------------------- rows of a page
@@ -503,7 +524,10 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        state = next((name for name, visits in sets.items() if i in visits), "computed" if computed else "pending")
+        of_visit = [name for name, visits in sets.items() if i in visits]
+        if computed and _has_index(found):  # a recording that failed does not make it fail
+            of_visit = [name for name in of_visit if name != "failed"]
+        state = next(iter(of_visit), "computed" if computed else "pending" if videos.get(i) else "unrecorded")
         first = found[0] if found else None
         out.append(
             VisitRow(

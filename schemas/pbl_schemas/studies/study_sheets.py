@@ -14,6 +14,7 @@ from typing import Any
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, normalised_label
+from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
@@ -123,6 +124,8 @@ _DATED = ("date", "birth_date")
 COLUMNS = ("subject", "visit", *_DATED, *VISIT_COLUMNS, "population", "record", "cohort", *MEMBER_COLUMNS)
 SCORE_COLUMNS = ("subject", "visit", "instrument", "value")
 TRIAL_COLUMNS = ("video", "subject", "visit", "activity", "pace")
+#: Columns whose words are codes (`texts.code_of`) -> kind of the codes.
+CODED = {"role": "role", "population": "population", "assistive_device": "aid", "orthosis": "orthosis"}
 #: A cell that removes what is stored; an empty one leaves it.
 CLEAR = "-"
 _LONGEST = {
@@ -258,7 +261,7 @@ class _Plan:
         code = needed(row, "subject")
         stated = self.people.setdefault(code, _Stated(row, {}))
         if population := row.cells.get("population"):
-            self._same(row, stated, "population", population, "population", code)
+            self._same(row, stated, "population", code_of("population", population), "population", code)
         return code
 
     def _same(self, row: Row, stated: _Stated, name: str, value: Any, what: str, whose: str) -> None:
@@ -387,7 +390,10 @@ class _Plan:
 
     def _day(self, key: tuple[str, str]) -> datetime.date | None:
         stated = self.sessions[key].values.get("session_date") if key in self.sessions else None
-        return stated or day_of(key[1]) or self.registered.get(key, {}).get("session_date")
+        return stated or day_of(key[1]) or self._stored_day(key)
+
+    def _stored_day(self, key: tuple[str, str]) -> datetime.date | None:
+        return self.registered.get(key, {}).get("session_date")
 
     def _check_times(self) -> None:
         """Ages and days that follow from dates; refuse what cannot be in time."""
@@ -400,6 +406,11 @@ class _Plan:
         for key, stated in self.sessions.items():
             with self._line(stated.row).about():
                 self._age(key)
+            day, stored = stated.values.get("session_date"), self.stored_visits.get(key)
+            if stored is not None and key not in self.visits and day not in (None, self._stored_day(key)):
+                # Its role has to fit the new day, and days from an event follow from it.
+                values = {"visit_days": None} if stored["intervention_date"] is not None else {}
+                self.visits[key] = _Stated(stated.row, values)
         for key, stated in self.visits.items():
             with self._line(stated.row).about() as line:
                 if line.errors:  # the role may be what is wrong
@@ -585,7 +596,8 @@ def _flag(row: Row, column: str) -> bool:
 
 
 def check_role(text: str, where: str) -> str:
-    """Return a text that can be a role of a visit. Raises `PblError` SHEET_FORMAT."""
+    """Return the role of a visit that a text states. Raises `PblError` SHEET_FORMAT for one that cannot be a role."""
+    text = code_of("role", text)
     if not study.is_role(text):
         expected = "baseline, pre, 6_weeks, 3_months, 6_months, or a word of small letters, digits and _"
         raise refused(f"role {text[:40]!r}", expected, "write it so", where)
@@ -609,7 +621,7 @@ def _visit_value(row: Row, column: str) -> Any:
             raise refused(f"{column} {text}", expected, "correct it", row.where)
         return int(number) if column == "days" else number
     check_label(column, text, _LONGEST[column])
-    return text
+    return code_of(CODED[column], text) if column in CODED else text
 
 
 def _video(row: Row) -> int:

@@ -124,6 +124,7 @@ class Pages:
             significant=significant,
             check_words=check_words,
             stage_words=STAGES,
+            codes=texts.codes,
             measure_words=MEASURES | TASKS,
             angle_words=[title for title, _ in ANGLES.values()],
         )
@@ -146,6 +147,7 @@ class Pages:
         own: dict[str, Any] = {
             "t": functools.partial(texts.text, language),
             "said": functools.partial(texts.on_page, language),
+            "coded": functools.partial(texts.coded, language),
             "named": functools.partial(visit_name, language),
             "language": language,
             "other_language": next(name for name in texts.LANGUAGES if name != language),
