@@ -197,7 +197,7 @@ def test_all_lists_and_filters_take_every_kind_of_row(tables: None, tmp_path: Pa
     about = dict.fromkeys((*gdi.SessionGdi.primary_key, "check", "computed"), "x") | {"qc_no": 1}
     for kind in kinds:
         for of in ({"session_id": visit}, {"video_id": video_id}, {}):
-            review_decisions.record(kind, "A", about, {}, {}, **of)
+            review_decisions.record(kind, "A", about, {}, {}, "", **of)
     review_decisions.mark_not_usable(video_id, "helped")
     for of, number in (("session_id", visit), ("video_id", video_id)):
         review_decisions.record_viewing(of, number, "page", "A")
