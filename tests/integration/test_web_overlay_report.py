@@ -167,6 +167,9 @@ def test_each_input_of_what_is_kept_changes_its_key(visit: Path, monkeypatch: py
     for change in ("session_label = 'x'", "session_date = '2026-01-11'"):
         statement = f"UPDATE {session.Session.full_table_name} SET {change}"
         assert changed({"report": every["report"]}, statement) == {"report"}
+    assert changed(of_visit, f"UPDATE {video.Video.full_table_name} SET activity = 'tug'") == set(of_visit)
+    paced = lambda: video.Pace.insert1({"video_id": 1, "pace": "fast"})  # noqa: E731
+    assert changed({"report": every["report"]}, paced) == {"report"}
     mark = {"unusable_reason": "helped", "unusable_by": "R", "unusable_created": "2026-01-01"}
     assert changed(of_visit, lambda: video.NotUsable.insert1({"video_id": 1, **mark})) == set(of_visit)
     assert every["report"]() != reports.report_key(1, 0, "de")

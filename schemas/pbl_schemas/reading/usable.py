@@ -25,7 +25,7 @@ _RECENT, _FEWEST = 20, 3
 
 @dataclasses.dataclass(frozen=True)
 class Needs:
-    """What a usable recording of an activity has. cycles: True where a gait cycle has to count, False where none may,
+    """Properties of a usable recording of an activity. cycles: True where a gait cycle has to count, False where none may,
     None where it does not matter; measures: of the task, each known and above 0; wanted: without them there is a
     remark."""
 
@@ -96,7 +96,7 @@ def verdicts(videos: Collection[int]) -> dict[int, Usable]:
         checks.setdefault(int(row["video_id"]), []).append(row)
     found, done = _found(where), video.conditions(where)
     left = [v for v in videos if v not in marks]
-    states = whys(v for v in left if v not in checks or v not in found)
+    states = whys(v for v in left if v not in found)
     out = {v: Usable(UNUSABLE, (mark,)) for v, mark in marks.items()}
     for v in left:
         out[v] = _verdict(done[v].activity, checks.get(v, []), found.get(v), states.get(v))
@@ -104,8 +104,8 @@ def verdicts(videos: Collection[int]) -> dict[int, Usable]:
 
 
 def _verdict(activity: str, checks: list[dict[str, Any]], found: _Found | None, state: Why | None) -> Usable:
-    """Return the verdict by the checks of the keypoints and what was measured; state: of a recording without one of
-    them. It is usable once it is measured, not before."""
+    """Return the verdict by the checks of the keypoints and what was measured; state: of a recording that is not
+    measured, and so not usable yet."""
     asking = [c for c in checks if c["keypoints_check_outcome"] != PASS]
     # The worst first: that is what is read.
     asking.sort(key=lambda c: c["keypoints_check_outcome"] != FAIL)
@@ -114,14 +114,14 @@ def _verdict(activity: str, checks: list[dict[str, Any]], found: _Found | None, 
     cycles = found.cycles if found is not None and needs.cycles else None
     if any(c["keypoints_check_outcome"] not in (PASS, "WARN") for c in asking):
         return Usable(UNUSABLE, said, cycles)
-    if found is None or not checks:
+    if found is None:
         assert state is not None
         return Usable(UNUSABLE, (*said, state.verdict)) if state.stops else Usable(PENDING)
     lacks = _lacks(needs, found)
     if lacks is not None:
         return Usable(UNUSABLE, tuple(dict.fromkeys((*lacks, *said))), cycles)
-    missing = (reason for name in needs.wanted for value, reason in [found.measures.get(name, (None, ""))] if reason)
-    said = tuple(dict.fromkeys((*missing, *said)))
+    missing = (found.measures[name][1] for name in needs.wanted if name in found.measures)
+    said = tuple(dict.fromkeys((*filter(None, missing), *said)))
     return Usable(REMARKS if said else USABLE, said, cycles)
 
 
