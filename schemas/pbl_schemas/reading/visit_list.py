@@ -369,7 +369,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
                 add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
     if wanted.state in ("computed", "pending"):
         # Queried first: as subqueries the server would evaluate them for each visit.
-        questions = (_waiting(), _empty(), _unusable(), _unrecorded())
+        questions = (_waiting(), _empty(), _unusable())
         apart = {int(i) for question in questions for (i,) in _ask(question, [])}
         failed = {int(i) for (i,) in _ask(_failed(), [])}
         unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
@@ -381,6 +381,7 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
         else:
             listed = f" OR s.session_id IN ({_places(list(unfinished))})" if unfinished else ""
             add(f"(NOT {with_set}{listed})", *unfinished)
+            add(f"EXISTS (SELECT 1 FROM {_name(video.Video)} o WHERE o.session_id = s.session_id)")
             outside(apart | failed)
     elif wanted.state:
         only("x", _STATES[wanted.state]())
