@@ -25,8 +25,8 @@ _RECENT, _FEWEST = 20, 3
 
 @dataclasses.dataclass(frozen=True)
 class Needs:
-    """Properties of a usable recording of an activity. cycles: True where a gait cycle has to count, False where none may,
-    None where it does not matter; measures: of the task, each known and above 0; wanted: without them there is a
+    """Properties of a usable recording of an activity. cycles: True where a gait cycle has to count, False where none
+    may, None where it does not matter; measures: of the task, each known and above 0; wanted: without them there is a
     remark."""
 
     cycles: bool | None = None

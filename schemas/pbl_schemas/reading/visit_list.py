@@ -128,8 +128,8 @@ class Trend:
 class VisitRow:
     """A visit of the list.
 
-    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it, or a part of it, failed; more: further results of other
-    chains of methods or kinds of recordings.
+    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it, or a part of it, failed; more: further
+    results of other chains of methods or kinds of recordings.
     """
 
     session_id: int
