@@ -43,7 +43,7 @@ rows (`len(A * B)`).
 | of a person | `lab.Subject` | never without `session.Session` between it and results |
 
 **Deleting results of chosen visits.** DataJoint 2.3.5 cannot delete from a table restricted by a query that is itself restricted: "Attribute `pbl_session` is
-not found in query" ([cause](datajoint_delete.md)). Restrict by the keys instead, and let results of the whole visit go along:
+not found in query" ([cause](../research/reports/2026-11-29_datajoint_delete.md)). Restrict by the keys instead, and let results of the whole visit go along:
 
 ```python
 from pbl_schemas import gdi, session
