@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import textwrap
 from typing import Any
 
 from pbl_schemas.chain import references, renamed, tables
@@ -14,14 +15,16 @@ _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "co
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
 #: So many leading columns have to be alike for a table to be described by another one.
 _LEAST_ALIKE = 4
+#: Longer names of columns do not widen the others'.
+_WIDEST = 40
 
 _START = """\
 # Tables
 
 Each section is a schema of the server, `pbl_<section>`, in the order of computing. *Manual* tables are filled by people and
-`pbl ingest`, *lookup* tables hold methods and terms, `pbl populate` fills *computed* ones. A column in bold belongs to the primary key.
-"refers to" names the tables whose keys a table also has; a part always has the key of its table. *origin* stands for the columns that state
-where a computed row comes from: `<prefix>_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed` (UTC).
+`pbl ingest`, *lookup* tables hold methods and terms, `pbl populate` fills *computed* ones. The primary key stands above `---`; `->` is a
+foreign key, whose columns the table also has; a part has the key of its table. *origin* stands for the columns that state where a computed
+row comes from: `<prefix>_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed` (UTC).
 
 Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
 """  # noqa: E501
@@ -91,33 +94,38 @@ def table_map() -> str:
         if name.split(".")[0] != stage:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
-        said = _sentence(name, cls)
-        lines += ["", f"### {name} ({kind(cls)})", "", *([said, ""] if said else []), *_listed(name, cls, written)]
+        lines += ["", f"### {name} ({kind(cls)})", "", *([comment(cls), ""] if comment(cls) else [])]
+        lines += ["```text", *_listed(name, cls, written), "```"]
     return "\n".join(lines) + "\n"
 
 
-def _sentence(name: str, cls: Any) -> str:
-    """What a row is, and the tables that it refers to; a part's own table is not named."""
-    master = name.rpartition(".")[0]
-    refers = ", ".join(other for other in _refers_to(name, cls) if other != master)
-    return ". ".join(filter(None, [comment(cls), refers and f"*Refers to* {refers}"]))
-
-
 def _listed(name: str, cls: Any, written: dict[str, list[tuple[str, str]]]) -> list[str]:
-    """The columns as a list: alike ones in one line, those that a table before has as well by their names only."""
+    """The lines of a definition: alike columns in one, those that a table before has as well by their names only."""
     own = [c for c in columns(cls) if not _is_origin(c[0], cls)]
-    shown = [f"**{column}**" if in_key else column for column, _, _, in_key in own]
     alike, n = _alike(own, written)
     written[name] = _without_key(own)
-    lines = [f"- {', '.join(shown[:n])}: as in {alike}, in this order"] if n else []
-    said = [(_code(type_), text) for _, type_, text, _ in own]
-    for i in range(n, len(own)):
-        if i > n and said[i] == said[i - 1]:
-            first, _, rest = lines[-1].partition(" `")
-            lines[-1] = f"{first}, {shown[i]} `{rest}"
+    rows = [(", ".join(c[0] for c in own[:n]), f"as in {alike}, in this order", "", True)] if n else []
+    for column, type_, text, in_key in own[n:]:
+        said = (type_.replace("', '", "','"), text, in_key)
+        if rows and rows[-1][1:] == said:
+            rows[-1] = (f"{rows[-1][0]}, {column}", *said)
         else:
-            lines.append(f"- {shown[i]} {said[i][0]} {_cell(said[i][1])}".rstrip())
-    return lines + (["- *origin*"] if origin_prefix(cls) else [])
+            rows.append((column, *said))
+    if origin_prefix(cls):
+        rows.append(("origin", "", "", False))
+    keys, others = ([row[:3] for row in rows if row[3] is key] for key in (True, False))
+    of_key, of_row = _refers_to(name, cls)
+    wide = max([len(row[0]) for row in rows if len(row[0]) <= _WIDEST] or [0])
+    lines = [*of_key, *(line for row in keys for line in _line(row, wide))]
+    below = [*of_row, *(line for row in others for line in _line(row, wide))]
+    return [*lines, "---", *below] if lines and below else lines + below
+
+
+def _line(row: tuple[str, str, str], wide: int) -> list[str]:
+    """A column with its type and meaning, broken below its name."""
+    text = f"{row[0]:<{wide}}  {row[1]:<14}  {row[2]}".rstrip()
+    below = " " * (2 + wide * (len(row[0]) <= wide))
+    return textwrap.wrap(text, 130, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
 
 def _alike(own: list[tuple[str, str, str, bool]], written: dict[str, list[tuple[str, str]]]) -> tuple[str, int]:
@@ -149,9 +157,17 @@ def _names(found: list[str]) -> str:
     return ", ".join(f"`{name}`" for name in found)
 
 
-def _refers_to(name: str, cls: Any) -> list[str]:
-    """`references`, with the column's name here where it is another: "video.Video as rig_trial"."""
-    return [f"{t} as {new}" if new else t for t, new in zip(references(name, cls), renamed(cls), strict=True)]
+def _refers_to(name: str, cls: Any) -> tuple[list[str], list[str]]:
+    """Foreign keys in the primary key and beside it: "-> video.Video as rig_trial"; not a part's own table."""
+    found, in_key, master = ([], []), True, name.rpartition(".")[0]
+    names = iter(zip(references(name, cls), renamed(cls), strict=True))
+    for line in map(str.strip, cls.definition.splitlines()):
+        in_key &= not line.startswith("---")
+        if line.startswith("->"):
+            table, new = next(names)
+            if table != master:
+                found[not in_key].append(f"-> {table} as {new}" if new else f"-> {table}")
+    return found
 
 
 def _is_origin(column: str, cls: Any) -> bool:
@@ -163,15 +179,6 @@ def origin_prefix(cls: Any) -> str | None:
     """Prefix of a table's origin columns, None where it has none."""
     found = [c[0] for c in columns(cls) if c[0].endswith("_code_version")]
     return found[0].removesuffix("code_version") if found else None
-
-
-def _code(type_: str) -> str:
-    """A type as code, without the spaces in a list of values."""
-    return "`" + type_.replace("', '", "','") + "`"
-
-
-def _cell(text: str) -> str:
-    return text.replace("<", "&lt;").replace(">", "&gt;")
 
 
 if __name__ == "__main__":
