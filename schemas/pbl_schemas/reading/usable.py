@@ -8,12 +8,13 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from pbl_pipeline.qc import FAIL, PASS
+from pbl_pipeline.records import number
 from pbl_pipeline.words import TASKS
 
 from .. import fit, gait, keypoints, video
 from ..capture import PhoneRecording
 from ..datajoint_setup import dj
-from ..rows import inside, number
+from ..rows import inside
 from .shown import shown_visit
 from .why import Why, whys
 
