@@ -162,8 +162,9 @@ def _computed(table: Any) -> tuple[int, float]:
     return int(n), float(total or 0.0)
 
 
-def copy_results(first_session: int, last_session: int) -> None:
-    """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
+def copy_results(first_session: int, last_session: int, parts: bool = False) -> None:
+    """Give sessions the rows of session 1, in the tables that the queue reads. `parts`: also in those that lists of
+    visits read, of cycles, measures and checks."""
     from pbl_schemas import fit, gait, gdi, keypoints, qc, tracking, video
 
     copied = (
@@ -183,6 +184,7 @@ def copy_results(first_session: int, last_session: int) -> None:
         gdi.GDI,
         gdi.SessionGdi,
         qc.SessionQc,
+        *((gait.GaitCycle.Cycle, gdi.SessionGdi.Measure, qc.SessionQc.Check) if parts else ()),
     )
     first = max(first_session, 1)
     template = _first_set()
@@ -215,7 +217,7 @@ def _names_of_sets(first: int, last: int) -> str:
     for start in range(first, last, 1000):
         values = []
         for i in range(start, min(start + 1000, last)):
-            rows = [{"video_sha256": r.sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
+            rows = [{"video_sha256": r.files[0].sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
             values += [i, fit_set_hash({**methods, "session_id": 1 + i}, rows)]
         query(f"INSERT INTO {name} VALUES {','.join(['(%s,%s)'] * (len(values) // 2))}", args=values)
     return name
@@ -224,7 +226,8 @@ def _names_of_sets(first: int, last: int) -> str:
 def _first_set() -> str:
     from pbl_schemas import fit
 
-    return str((fit.FitSet & {"session_id": 1}).fetch1("fit_set"))
+    (name,) = (fit.FitSet & {"session_id": 1}).to_arrays("fit_set", order_by="fit_set_created", limit=1)
+    return str(name)
 
 
 # --------------------------------------------------------------------------------------------------------------- speed

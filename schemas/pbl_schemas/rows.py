@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import pymysql
@@ -16,6 +17,10 @@ from .datajoint_setup import REPEAT, columns_read_once, dj
 
 if TYPE_CHECKING:
     from pbl_pipeline.qc import Check
+
+T = TypeVar("T")
+#: Values in one restriction: a statement stays short however many there are.
+PART = 500
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -156,8 +161,20 @@ def plain(value: Any) -> Any:
     return value
 
 
+def parts(values: Iterable[T], size: int = PART) -> Iterator[list[T]]:
+    """Yield the values, some hundred at a time."""
+    rest = iter(values)
+    while part := list(itertools.islice(rest, size)):
+        yield part
+
+
+def rows_inside(query: Any, column: str, values: Iterable[str | int]) -> list[dict[str, Any]]:
+    """Return the rows of a query with one of the values (as of `inside`), `PART` values a statement."""
+    return [row for some in parts(dict.fromkeys(values)) for row in (query & inside(column, some)).to_dicts()]
+
+
 def inside(column: str, values: Iterable[str | int]) -> Any:
-    """Return a restriction to values without quotes (codes and numbers), quick for thousands."""
+    """Return a restriction to values without quotes (codes and numbers); of more than `PART` read in `parts`."""
     listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
     return f"{column} IN ({listed})" if listed else False
 
