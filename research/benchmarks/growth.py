@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import datetime
 import time
 from collections.abc import Callable, Iterator
 from unittest import mock
@@ -54,8 +53,9 @@ class Cost:
     slowest_s: float = 0.0
     client_s: float = 0.0
     server_s: float = 0.0
-    text: str = ""  # beginning of the longest statement
-    slow: str = ""
+    texts: list[str] = dataclasses.field(default_factory=list)
+    text: str = ""  # the longest statement
+    slow: str = ""  # the slowest one
 
 
 @contextlib.contextmanager
@@ -65,9 +65,10 @@ def counted() -> Iterator[Cost]:
 
     def query(self: pymysql.connections.Connection, sql: str | bytes, unbuffered: bool = False) -> int:
         cost.statements += 1
+        cost.texts.append(str(sql))
         size = len(sql if isinstance(sql, (bytes, bytearray)) else sql.encode("utf-8", "surrogateescape"))
         if size > cost.longest:
-            cost.longest, cost.text = size, str(sql[:300])
+            cost.longest, cost.text = size, str(sql)
         begin = time.monotonic()
         try:
             return send(self, sql, unbuffered)
@@ -90,7 +91,7 @@ def measured(call: Callable[[], object], server_s: Callable[[], float] = lambda:
 
 def walk() -> dict[str, Callable[[], object]]:
     """Return the calls that are measured, by name."""
-    from pbl_schemas.reading.visit_list import Filter, visit_page
+    from pbl_schemas.reading.visit_list import visit_page
 
     calls: dict[str, Callable[[], object]] = {"pbl " + " ".join(c): lambda c=c: _pbl(*c) for c in COMMANDS}
     for name, wanted in visit_list.filters().items():
@@ -103,16 +104,18 @@ def _pbl(*command: str) -> None:
     assert done.code == 0, done.err
 
 
-def grow(visits: int, before: int = 0) -> None:
-    """Make rows of so many visits, of which there are `before` already."""
+def grow(visits: int, before: int = 0, work: Callable[[], object] = lambda: queue.work(1)) -> None:
+    """Make rows of so many visits, of which there are `before` already. work: computes the first."""
+    from pbl_schemas.operations import catalog
     from research.benchmarks.many_recordings import register_many
 
     if not before:
         register_many(visit_list.recordings(1))
-        queue.work(1)  # the visit whose rows are copied
+        work()  # the visit whose rows are copied
     register_many(one for i, one in enumerate(visit_list.recordings(visits)) if i >= before * queue.EACH)
     queue.copy_results(max(before, 1), visits, parts=True)
     visit_list.spread(visits)
+    catalog.analyse()  # as `db restore` and large imports do
     _decide()
 
 
@@ -132,7 +135,8 @@ def _decide() -> None:
     query(
         f"INSERT INTO {Decision.full_table_name} (decision_id, session_id, video_id, decision_what, decision_by,"
         " decision_at, decision_about, decision_before, decision_after, decision_reason)"
-        f" SELECT ROW_NUMBER() OVER (), q.session_id, NULL, 'check', 'A. First', UTC_TIMESTAMP(), {about}, '{{}}', '{{}}', ''"
+        " SELECT ROW_NUMBER() OVER (), q.session_id, NULL, 'check', 'A. First', UTC_TIMESTAMP(),"
+        f" {about}, '{{}}', '{{}}', ''"
         f" FROM {qc.SessionQc.full_table_name} q WHERE q.session_id %% 10 = 3"
     )
     query(
@@ -176,7 +180,7 @@ def main(videos: tuple[int, ...], only: str) -> None:
                         f" {cost.longest:9,d} bytes"
                     )
                     if cost.longest > 1e5:
-                        click.echo("    " + cost.text)
+                        click.echo(f"    longest: {cost.text[:300]}")
                     if cost.slowest_s > 2:
                         click.echo(f"    {cost.slowest_s:.1f} s: {cost.slow[:1500]}")
         for name in found[0] if len(found) > 1 else ():

@@ -196,7 +196,8 @@ def copy_results(first_session: int, last_session: int, parts: bool = False) -> 
             "`session_id`": "t.session_id + s.seq",
             "`fit_set`": "s.name",
         }
-        where = "t.fit_set = %s" if "fit_set" in table.heading.names else f"t.video_id <= {EACH} AND %s != ''"
+        of_first = f"t.video_id < {_first(video.Video, 'video_id') + EACH} AND %s != ''"
+        where = "t.fit_set = %s" if "fit_set" in table.heading.names else of_first
         table.connection.query(
             f"INSERT INTO {table.full_table_name} ({','.join(names)})"
             f" SELECT {','.join(values.get(n, f't.{n}') for n in names)} FROM {table.full_table_name} AS t"
@@ -207,10 +208,11 @@ def copy_results(first_session: int, last_session: int, parts: bool = False) -> 
 
 def _names_of_sets(first: int, last: int) -> str:
     """A temporary table of the sessions `range(first, last)` and the names that planning would give their sets."""
-    from pbl_schemas import fit
+    from pbl_schemas import fit, session
     from pbl_schemas.plan import fit_set_hash
 
     methods = (fit.FitSet.Video & {"fit_set": _first_set()}).to_dicts(limit=1)[0]
+    number = _first(session.Session, "session_id")
     name = f"`{fit.FitSet.database}`.`names_of_sets`"
     query = fit.FitSet.connection.query
     query(f"CREATE OR REPLACE TEMPORARY TABLE {name} (seq INT PRIMARY KEY, name CHAR(16))")
@@ -218,15 +220,21 @@ def _names_of_sets(first: int, last: int) -> str:
         values = []
         for i in range(start, min(start + 1000, last)):
             rows = [{"video_sha256": r.files[0].sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
-            values += [i, fit_set_hash({**methods, "session_id": 1 + i}, rows)]
+            values += [i, fit_set_hash({**methods, "session_id": number + i}, rows)]
         query(f"INSERT INTO {name} VALUES {','.join(['(%s,%s)'] * (len(values) // 2))}", args=values)
     return name
 
 
-def _first_set() -> str:
-    from pbl_schemas import fit
+def _first(table: Any, column: str) -> int:
+    """The smallest number of a table."""
+    return int(table.connection.query(f"SELECT MIN({column}) FROM {table.full_table_name}").fetchone()[0])
 
-    (name,) = (fit.FitSet & {"session_id": 1}).to_arrays("fit_set", order_by="fit_set_created", limit=1)
+
+def _first_set() -> str:
+    from pbl_schemas import fit, session
+
+    of_first = {"session_id": _first(session.Session, "session_id")}
+    (name,) = (fit.FitSet & of_first).to_arrays("fit_set", order_by="fit_set_created", limit=1)
     return str(name)
 
 

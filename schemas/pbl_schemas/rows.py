@@ -161,10 +161,10 @@ def plain(value: Any) -> Any:
     return value
 
 
-def parts(values: Iterable[T], size: int = PART) -> Iterator[list[T]]:
-    """Yield the values, some hundred at a time."""
+def parts(values: Iterable[T]) -> Iterator[list[T]]:
+    """Yield the values, `PART` at a time."""
     rest = iter(values)
-    while part := list(itertools.islice(rest, size)):
+    while part := list(itertools.islice(rest, PART)):
         yield part
 
 

@@ -22,7 +22,7 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
-from pbl_schemas.rows import PART, parts
+from pbl_schemas.rows import parts
 from pbl_schemas.transactions import repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
@@ -81,8 +81,8 @@ def fill(
     jobs, quote = jobs_of(table), table.connection.adapter.quote_identifier
     source = keys_of(table)
     if keys is not None:
-        if len(keys) > PART:
-            return sum(fill(table, some, priority, where) for some in parts(keys))
+        if len(some := list(parts(keys))) > 1:
+            return sum(fill(table, part, priority, where) for part in some)
         source = source & [dict(k) for k in keys]
     if where is not None:
         source = source & where

@@ -19,8 +19,9 @@ from ..datajoint_setup import DuplicateError, dj
 from ..jobs import forget_errors
 from ..method_rows import resolve_method
 from ..methods import insert_once
+from ..operations import catalog
 from ..plan import default_fit
-from ..rows import inside, rows_inside, utc_now
+from ..rows import PART, inside, rows_inside, utc_now
 from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of
 from .records import (
@@ -157,6 +158,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
             done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
         except PblError as error:
             done += [Registered(path, "refused", error=error) for path in recording.paths]
+    if len(done) > PART:
+        catalog.analyse()
     return done
 
 

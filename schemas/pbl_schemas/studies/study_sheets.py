@@ -367,9 +367,7 @@ class _Plan:
         self.known = {r["subject"]: r for r in lab.Subject.proj("population").to_dicts()}
         self.registered = session.by_label(rows_inside(session.Session(), "subject", people))
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
-        self.stored_visits = {
-            labels[int(r["session_id"])]: r for r in rows_inside(study.Visit(), "session_id", labels)
-        }
+        self.stored_visits = {labels[int(r["session_id"])]: r for r in rows_inside(study.Visit(), "session_id", labels)}
         scores = rows_inside(study.ClinicalScore(), "session_id", labels)
         self.stored_scores = {(*labels[int(r["session_id"])], r["instrument"]): r for r in scores}
         members = rows_inside(study.CohortMember(), "subject", people)
