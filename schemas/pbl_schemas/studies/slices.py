@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: One kind of recordings and chain of methods; the kind is `slice_kind` in StudySlice.
 CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
+#: Columns that came after the first slices were frozen, whose hash they are part of only where they have a value.
+_LATER = ("gdi_unshrunk", "gdi_unshrunk_sd")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
 _none = functools.partial(PblError, "DB_NOT_FOUND")
 _usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --help`")
@@ -126,7 +128,7 @@ def freeze(
 
 def study_data(name: str, curves: bool = True) -> StudyData:
     """Return the rows of a slice as frames: visits, their inclusion and methods as frozen, values as the tables hold
-    them now (`changes` compares them).
+    them now; the note states how many visits have others than when it was frozen (`changes` names them).
 
     Set-based except for the curves, whose files are read one by one (`curves` False leaves them out).
 
@@ -137,6 +139,9 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     about = slice_row(name)
     rows = _frozen(about)
     frames = _frames(rows, about)
+    # Without codes: the note goes with what is exported under others.
+    n = len(_changes(about, rows, frames))
+    changed = f"{n} of its {about['slice_n']} visits have other numbers than when it was frozen." if n else ""
     frames["visits"] = frames["visits"].merge(_recordings(rows, about), how="left", on=["subject", "visit"])
     if curves:
         frames |= _in_parts(_curves, rows, about)
@@ -146,7 +151,7 @@ def study_data(name: str, curves: bool = True) -> StudyData:
         methods={k: about[k] for k in CHAIN if about[k] is not None},
         code_version=about["slice_code_version"],
         event=about["slice_event"],
-        note=about["slice_note"],
+        note=" ".join(filter(None, (about["slice_note"], changed))),
     )
     return StudyData(**frames, description=description)
 
@@ -190,8 +195,12 @@ def changes(name: str) -> list[str]:
     `PblError` DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     rows = _frozen(about)
-    out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]
-    hashes = _hashes(_frames(rows, about)) if len(rows) else {}
+    return _changes(about, rows, _frames(rows, about) if len(rows) else {})
+
+
+def _changes(about: Mapping[str, Any], rows: Any, frames: Mapping[str, Any]) -> list[str]:
+    out = ["a visit was deleted"] * (about["slice_n"] - len(rows))
+    hashes = _hashes(frames) if frames else {}
     for r in rows.to_dict("records"):
         if hashes[r["subject"], r["visit"]] != r["frozen_hash"]:
             out.append(f"visit {r['visit']} of {r['subject']} has other rows")
@@ -443,9 +452,12 @@ def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
         frame = frames[name]
         columns = sorted(set(frame.columns) - {"subject", "visit"})
         # The same text for a number whatever the type of its column, which depends on other rows.
-        plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
-        for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
-            lines[key].append("\t".join((name, *row)))
+        plain = frame[columns].apply(lambda c: c.map(_text))
+        later = [c for c in columns if c in _LATER]
+        added = ["\t".join(f"{c} {v}" for c, v in r.items() if v) for r in plain[later].to_dict("records")]
+        texts = plain.drop(columns=later).to_numpy()
+        for key, row, more in zip(zip(frame["subject"], frame["visit"], strict=True), texts, added, strict=True):
+            lines[key].append("\t".join((name, *row, *([more] if more else []))))
     return {key: _digest(texts) for key, texts in lines.items()}
 
 
