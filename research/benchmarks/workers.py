@@ -2,6 +2,7 @@
 
     python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
+    python -m research.benchmarks.workers take               # a job taken against DataJoint's reserve
     python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
     python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
     python -m research.benchmarks.workers long               # 300 videos with one of two hours among them
@@ -23,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +290,40 @@ def speed(keys: int, work_ms: float) -> None:
             again = f"{repeated} steps again after a deadlock" if repeated else ""
             say(f"the same statements without the workers, {n} connections", keys / seconds, "jobs/s", again)
         say("statements of a job", sum(map(len, steps)) / keys, "")
+
+
+@main.command()
+@click.option("--keys", default=2000, show_default=True)
+@click.option("--repeats", default=5, show_default=True)
+def take(keys: int, repeats: int) -> None:
+    """Time to take a job of a table (VideoInfo) against DataJoint's `jobs.reserve` of a known key, on the same rows."""
+    from pbl_schemas import tracking, video
+    from pbl_schemas.jobs import jobs_of
+    from pbl_workers import queue
+    from research.benchmarks.many_recordings import register_many
+
+    def ms(call: Callable[[], int]) -> float:
+        """Fastest time of a job (ms)."""
+        out = []
+        for _ in range(repeats):
+            jobs.delete_quick()
+            assert queue.fill(video.VideoInfo) == keys
+            t = time.perf_counter()
+            n = call()
+            out.append(1000 * (time.perf_counter() - t) / n)
+        return min(out)
+
+    with installation():
+        register_many(recordings(0, keys))
+        jobs = jobs_of(video.VideoInfo)
+        known = [{"video_id": int(v)} for v in video.Video.to_arrays("video_id")]
+        some = known[: keys // 4]
+        alone = ms(lambda: sum(jobs.reserve(key) for key in some))
+        say("jobs.reserve of a known key", alone, "ms")
+        for n in (1, 8):
+            taken = ms(lambda n=n: sum(len(queue.claim(video.VideoInfo, n)) for _ in range(len(some) // n)))
+            say(f"a job taken, {n} at a time", taken, "ms", f"{taken / alone:.2f} times, bar 1.3")
+        assert not len(tracking.Tracking.jobs)
 
 
 def _connections(heard: list[Report], n: int) -> set[int]:

@@ -129,7 +129,7 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     study.ClinicalScore.update1({**score, "score_value": 10})
     assert slices.changes("second") == ["visit pre of P001 has other rows"]
     said: Any = slices.study_data("second", curves=False)
-    assert said.description.note == "1 of its 3 visits have other numbers than when it was frozen."
+    assert said.description.note.endswith(" 1 of its 3 visits have other numbers than when it was frozen.")
     study.ClinicalScore.update1({**score, "score_value": 11})
     assert slices.changes("second") == []
     # A later video makes another set; the slice keeps its own.

@@ -139,10 +139,10 @@ class Worker:
         idle, troubled, quiet = IDLE_S[0], 0, 0
         while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
             try:
-                if time.monotonic() - self._checked > REFRESH_EVERY_S:
-                    tables_version.refuse_newer()  # after a migration this worker ends, and its successor does not start
-                    self._checked = time.monotonic()
                 n = self.step()
+                if time.monotonic() - self._checked > REFRESH_EVERY_S:
+                    tables_version.refuse_newer()  # after a migration it ends, and its successor does not start
+                    self._checked = time.monotonic()
                 found = bool(n) or self._refresh()
             except run_job.DATABASE_ERRORS as error:
                 troubled += 1

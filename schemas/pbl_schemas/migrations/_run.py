@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
@@ -199,31 +200,24 @@ def _touched(conn: Any, due: Sequence[Migration]) -> list[str]:
     if not {(connection.schema_name(s), t) for s, t in _READ} <= set(catalog.names()):
         return []  # a server without results
     sets, visits, slices, members, decisions = (quote(connection.schema_name(s), t) for s, t in _READ)
-    out: list[str] = []
-    of_slices: dict[str, int] = {}
+    of_method = "(%s = '' OR JSON_VALUE(decision_about, '$.gait_method') = %s)"
+    queries = (
+        f"SELECT subject, session_label FROM {sets} JOIN {visits} USING (session_id) WHERE fit_set = %s LIMIT 1",  # noqa: S608
+        f"SELECT JSON_VALUE(decision_about, '$.check'), decision_by FROM {decisions} WHERE decision_what = 'check'"  # noqa: S608
+        f" AND JSON_VALUE(decision_about, '$.fit_set') = %s AND {of_method} ORDER BY decision_id",
+        f"SELECT study_slice FROM {members} JOIN {slices} USING (study_slice) WHERE slice_fit_set = %s"  # noqa: S608
+        " AND (%s = '' OR gait_method = %s)",
+    )
+    out, of_slices = [], Counter[str]()
     for fit_set, method in sorted({pair for m in due for pair in m.changed(conn)}):
-        find = functools.partial(conn.query, args=(fit_set, method, method))
-        by = f" by {method}" if method else ""
-        for subject, label in conn.query(
-            f"SELECT subject, session_label FROM {sets} JOIN {visits} USING (session_id) WHERE fit_set = %s",  # noqa: S608
-            args=(fit_set,),
-        ).fetchall():
-            visit = f"visit {label} of {subject}"
-            out.append(f"changes: the results of {visit}{by}")
-        for (name,) in find(
-            f"SELECT study_slice FROM {members} JOIN {slices} USING (study_slice)"  # noqa: S608
-            " WHERE slice_fit_set = %s AND (%s = '' OR gait_method = %s)"
-        ).fetchall():
-            of_slices[name] = of_slices.get(name, 0) + 1
-        for check, who in find(
-            f"SELECT JSON_VALUE(decision_about, '$.check'), decision_by FROM {decisions} WHERE decision_what = 'check'"  # noqa: S608
-            " AND JSON_VALUE(decision_about, '$.fit_set') = %s"
-            " AND (%s = '' OR JSON_VALUE(decision_about, '$.gait_method') = %s)"
-        ).fetchall():
-            out.append(f"changes: the check {check} of {visit}, which {who} accepted, is to be accepted again")
-    return out + [
-        f"changes: {n} visits of the slice {name}; a backup of before has its numbers" for name, n in of_slices.items()
-    ]
+        args = (fit_set, method, method)
+        visit, checks, names = (conn.query(q, args=args[: q.count("%s")]).fetchall() for q in queries)
+        said = "".join(f"visit {label} of {subject}" for subject, label in visit)
+        out.append(f"changes: the results of {said}{f' by {method}' if method else ''}")
+        out += [f"changes: the check {c} of {said}, which {who} accepted, is to be accepted again" for c, who in checks]
+        of_slices.update(name for (name,) in names)
+    slices = [f"changes: {n} visits of the slice {name}" for name, n in sorted(of_slices.items())]
+    return out + [f"{line}; a backup of before has its numbers" for line in slices]
 
 
 #: Tables that `_touched` reads.
