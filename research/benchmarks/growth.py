@@ -46,7 +46,7 @@ COMMANDS = (
 
 @dataclasses.dataclass
 class Cost:
-    """What a call cost: statements, the longest (bytes) and slowest (s), processor time of client and server (s)."""
+    """Cost of a call: statements, the longest (bytes) and slowest (s), processor time of client and server (s)."""
 
     statements: int = 0
     longest: int = 0

@@ -1,4 +1,4 @@
-"""Commands over many visits: statements do not grow with the rows, nor end up as work that nobody waits for."""
+"""Commands over many visits: statements do not grow with the rows, and end with the command that sent them."""
 
 import signal
 import subprocess
@@ -44,7 +44,7 @@ def test_statements_stay_as_short_as_they_are(
     for before, visits in ((0, FEW), (FEW, MANY)):
         growth.grow(visits, before, lambda: populate(first))
         calls = {name: call for name, call in growth.walk().items() if "page" not in name or name.endswith(PAGES)}
-        calls["pbl cron refresh --all"]()  # queues what is missing
+        calls["pbl cron refresh --all"]()  # queues the jobs of the new rows
         costs.append({name: growth.measured(call) for name, call in calls.items()})
         assert len(fit.FitSet()) >= visits
     few, many = costs

@@ -408,7 +408,7 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert (refused.code, "__session_gdi.session_corrected" in refused.err) == (1, True)
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0004 corrections_as_rows"]) > 60, dry.open) == (True, [])
-    # What will have other numbers is named before anything is done.
+    # Results that will have other numbers are named before anything is done.
     visit = "visit 2026-03-01 of P001"
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute(
