@@ -13,9 +13,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
+from pbl_pipeline.results.cycles import GaitCycle
+from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.measures import Z90
 
-from .cycle_measures import Z90, far_leg_of
-from .events import LEFT, RIGHT
+from .cycle_measures import far_leg_of
 from .measurement import (
     MeasurementModel,
     Pass,
@@ -35,15 +37,7 @@ from .normative import (
     load_norm,
     norm_names,
 )
-from .types import (
-    ANY_PACE,
-    SELF_SELECTED,
-    GaitCycle,
-    MovementProfile,
-    feature_vector,
-    movement_profile,
-    variable_scores,
-)
+from .types import ANY_PACE, SELF_SELECTED, MovementProfile, feature_vector, movement_profile, variable_scores
 
 
 @dataclasses.dataclass(frozen=True)

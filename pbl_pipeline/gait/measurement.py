@@ -25,10 +25,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaincc
 
+from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.shipped import shipped_model
 
-from .cycle_measures import CYCLE_SPREAD, Z90, sampling_sd
-from .events import LEFT, RIGHT
+from .cycle_measures import CYCLE_SPREAD, sampling_sd
 from .normative import NormativeSet
 
 #: Minimal important change of the index: half a standard deviation of healthy people, which is 10 points. A convention
@@ -95,6 +96,9 @@ N_DRAWS, N_VISITS, N_PEOPLE = 512, 64, 2048
 #: The index where the line of `unshrunk_index` bends, one standard deviation below the healthy mean, and the largest
 #: standard deviation of its error with which it is stated.
 BEND, MOST_UNSURE = 90.0, 30.0
+#: Fraction of the stated variance of least-squares scores with which the index of these scores is as far below the true
+#: one as that of tuning persons, in the mean (`research.corpus.measurement`).
+FOUND_VARIANCE = 0.7
 _FOLDER = resources.files("pbl_pipeline.gait").joinpath("measurement_models")
 
 
@@ -260,7 +264,7 @@ def unshrunk_index(
     off, gain, error, *_ = _joint(model, passes)
     weighed = np.linalg.solve(error, gain)
     covariance = np.linalg.inv(gain.T @ weighed)
-    errors = _drawn(covariance, N_PEOPLE, 3)
+    errors = math.sqrt(FOUND_VARIANCE) * _drawn(covariance, N_PEOPLE, 3)
 
     def index(scores: np.ndarray) -> np.ndarray:
         return _index(scores, norm).mean(axis=-1)

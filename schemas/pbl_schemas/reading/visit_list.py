@@ -18,13 +18,14 @@ from typing import Any
 
 from pbl_pipeline.filming import VIEW, Difference, Filming, differences
 from pbl_pipeline.qc import CADENCE
+from pbl_pipeline.records import number
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..decisions.review_decisions import accepted_sql, is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision
-from ..rows import inside, number, parts
+from ..rows import inside, parts
 from .filming import filming_of
 from .status import queue_name, queues
 
