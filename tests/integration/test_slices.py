@@ -129,6 +129,8 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     score = {"session_id": pre, "instrument": "mJOA"}
     study.ClinicalScore.update1({**score, "score_value": 10})
     assert slices.changes("second") == ["visit pre of P001 has other rows"]
+    said: Any = slices.study_data("second", curves=False)
+    assert said.description.note.endswith(" 1 of its 3 visits have other numbers than when it was frozen.")
     study.ClinicalScore.update1({**score, "score_value": 11})
     assert slices.changes("second") == []
     # A later video makes another set; the slice keeps its own.
@@ -147,7 +149,18 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     after = session.Session & {"subject": "P001", "session_label": "after"}
     number = after.fetch1("session_id")
     (study.StudySliceVisit & {"study_slice": "third", "session_id": number}).delete(prompt=False)
-    assert slices.changes("third") == ["1 visits were deleted"]
+    assert slices.changes("third") == ["a visit was deleted"]
+
+
+def test_a_column_that_came_later_changes_no_slice_until_it_has_a_value(cohort: Path):
+    about = {**slices.slice_row("first"), "cohort": "dcm"}
+    found: Any = slices._frames(slices._frozen(about), about)
+    later = ["gdi_unshrunk", "gdi_unshrunk_sd"]
+    older = {**found, "visits": found["visits"].drop(columns=later)}
+    before = slices._hashes(older)
+    assert before != slices._hashes(found)
+    upgraded = {**found, "visits": found["visits"].assign(**dict.fromkeys(later, None))}
+    assert slices._hashes(upgraded) == before
 
 
 def test_what_cannot_be_frozen(cohort: Path):

@@ -12,6 +12,7 @@ from pbl_pipeline.filming import Filming, height_word, known, picture_class, sta
 from pbl_pipeline.records import number
 
 from .. import fit, gait, gdi, keypoints, study, video
+from ..rows import inside, parts
 
 
 def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
@@ -19,12 +20,14 @@ def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
 
     results: rows with session_id, fit_set, fit_set_kind, fit_method, gait_method and gdi_method.
     """
-    if not results:
-        return []
+    return [filming for some in parts(results) for filming in _filming_of(some)]
+
+
+def _filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
     from pbl_pipeline.gait import mostly
 
-    of_visit = [{"session_id": r["session_id"]} for r in {r["session_id"]: r for r in results}.values()]
-    sets = [{"fit_set": name} for name in {r["fit_set"] for r in results}]
+    of_visit = inside("session_id", {int(r["session_id"]) for r in results})
+    sets = inside("fit_set", {str(r["fit_set"]) for r in results})
     used = gait.GaitCycle.Cycle & sets & {"cycle_used": True}
     cycles = defaultdict(list)
     for row in used.proj("cycle_far_leg").to_dicts():

@@ -34,7 +34,7 @@ from ..intake.sheets import (
     refused,
     similar_codes,
 )
-from ..rows import inside
+from ..rows import inside, parts, rows_inside
 from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
 
@@ -366,15 +366,14 @@ class _Plan:
 
     # ------------------------------------------------------------------------------------------------------- the tables
     def _load(self) -> None:
-        of_people = inside("subject", {*self.people, *(c for _, c in self.members)})
+        people = {*self.people, *(c for _, c in self.members)}
         self.known = {r["subject"]: r for r in lab.Subject.proj("population").to_dicts()}
-        sessions = session.Session & of_people
-        self.registered = session.by_label(sessions.to_dicts())
+        self.registered = session.by_label(rows_inside(session.Session(), "subject", people))
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
-        self.stored_visits = {labels[int(r["session_id"])]: r for r in (study.Visit & sessions.proj()).to_dicts()}
-        scores = (study.ClinicalScore & sessions.proj()).to_dicts()
+        self.stored_visits = {labels[int(r["session_id"])]: r for r in rows_inside(study.Visit(), "session_id", labels)}
+        scores = rows_inside(study.ClinicalScore(), "session_id", labels)
         self.stored_scores = {(*labels[int(r["session_id"])], r["instrument"]): r for r in scores}
-        members = (study.CohortMember & of_people).to_dicts()
+        members = rows_inside(study.CohortMember(), "subject", people)
         self.stored_members = {
             (r["cohort"], r["subject"]): {**r, "member_included": bool(r["member_included"])} for r in members
         }
@@ -520,7 +519,7 @@ class _Plan:
 
     def _compare_trials(self) -> None:
         numbers = [t.values["video_id"] for t in self.trials]
-        now = video.conditions(inside("video_id", numbers)) if numbers else {}
+        now = {v: c for some in parts(numbers) for v, c in video.conditions(inside("video_id", some)).items()}
         for stated in list(self.trials):
             number = stated.values["video_id"]
             with self._line(stated.row).about() as line:
