@@ -445,8 +445,8 @@ def _unrecorded() -> str:
 
 
 def _failed_visits() -> str:
-    """Visits with an error (`_failed`) but those that are computed and have an index of a current set: there a recording
-    that failed does not make the visit fail."""
+    """Visits with an error (`_failed`), without those that are computed and have an index of a current set: an error of
+    one recording does not make such a visit fail."""
     indexed = (
         f"SELECT f.session_id FROM {_name(gdi.SessionGdi)} g JOIN {_name(fit.FitSelection)} c"
         " ON c.fit_set = g.fit_set AND c.fit_method = g.fit_method AND c.fit_current = 1"
