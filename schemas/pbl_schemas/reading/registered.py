@@ -148,11 +148,13 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
 def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
     """Rows about a visit or one of its videos, with whose visit it is, and without a restriction those about none, such
     as an instrument; the columns without their prefix."""
+    import pandas as pd
+
     rows = frame_of(table.proj(..., of="session_id"))
     rows["video_id"] = rows["video_id"].astype("Int64")
     own = rows_inside(video.Video.proj("session_id"), "video_id", rows["video_id"].dropna())
-    of_video = rows["video_id"].map({int(r["video_id"]): int(r["session_id"]) for r in own})
-    rows["session_id"] = rows.pop("of").fillna(of_video).astype("Int64")
+    of_video = rows["video_id"].map({int(r["video_id"]): int(r["session_id"]) for r in own}).astype("Int64")
+    rows["session_id"] = rows.pop("of").astype("Int64").fillna(of_video)
     found = rows_inside(_visits() & restriction, "session_id", rows["session_id"].dropna())
     everything = restriction is True or restriction == {}
     named = pd.DataFrame(found, columns=["session_id", "subject", "session_label"]).astype({"session_id": "Int64"})
