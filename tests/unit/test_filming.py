@@ -6,11 +6,11 @@ import math
 import pytest
 
 from pbl_pipeline import charts
+from pbl_pipeline.change import Change, Result, change_since
 from pbl_pipeline.filming import Difference, Filming, differences, height_word, picture_class, stated, views_of
 from pbl_pipeline.gait import Z90
 from pbl_pipeline.render import SIDE_COLOUR
 from pbl_pipeline.study_report import figures
-from pbl_schemas.reading.visit_list import Change, Result, change_since
 from tests import not_none
 
 FROM_LEFT = Filming(("left",), (), (), ("self_selected",), ("stated",), ("measured",), ("1080p",), "right")

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.change import Change, change_since, judged, not_alike, usual_chain
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import MEASURES
@@ -17,7 +18,7 @@ from .. import connection, fit, gait, gdi, study, video
 from . import frames
 from .frames import current_sets, frame_of
 from .shown import ShownVisit, shown_visit
-from .visit_list import Change, change_since, judged, not_alike, results_of, usual_chain
+from .visit_list import results_of
 
 if TYPE_CHECKING:
     import pandas as pd

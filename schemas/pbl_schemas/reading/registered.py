@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.change import change_since, judged, not_alike
 from pbl_pipeline.errors import PblError
 
 from .. import fit, gait, gdi, keypoints, lab, review, session, video
@@ -15,7 +16,7 @@ from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES
 from ..rows import rows_inside
 from .frames import frame_of, newest_sets
-from .visit_list import change_since, judged, not_alike, results_of
+from .visit_list import results_of
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
+from pbl_pipeline.change import Result
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import NOT_COMPUTED
 
@@ -15,7 +16,7 @@ from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from ..decisions.review_decisions import may_be_accepted
 from . import registered
-from .visit_list import Result, VisitRow, results_of, visits_of
+from .visit_list import VisitRow, results_of, visits_of
 from .visits import load_recording, load_visit
 from .why import whys
 

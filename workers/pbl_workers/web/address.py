@@ -15,7 +15,7 @@ from pbl_pipeline.names import whole_number
 from .access import Refused, Session
 
 if TYPE_CHECKING:
-    from pbl_schemas.reading.visit_list import Result
+    from pbl_pipeline.change import Result
 
 #: Right of an address that is open without a session; the others are those of `access.RIGHTS`, and "" for any session.
 OPEN = "open"

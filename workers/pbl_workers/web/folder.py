@@ -12,12 +12,13 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from pbl_pipeline import settings
+from pbl_pipeline.change import Result
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS
 from pbl_pipeline.visit import FIT, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
 from pbl_schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
-from pbl_schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
+from pbl_schemas.reading.visit_list import INCOMPLETE, Page, VisitRow
 from pbl_schemas.subject_codes import day_of
 
 from .access import REPORT_POLICY
