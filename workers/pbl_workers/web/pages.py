@@ -21,7 +21,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
-from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, role_words, significant
 from pbl_schemas.intake.sheets import with_point
 from pbl_schemas.reading.shown import ShownVisit
 from pbl_schemas.session import UNLABELLED
@@ -125,6 +125,7 @@ class Pages:
             check_words=check_words,
             stage_words=STAGES,
             measure_words=MEASURES | TASKS,
+            moment=moment,
             angle_words=[title for title, _ in ANGLES.values()],
         )
         self._environment.filters["capital"] = capital
@@ -154,6 +155,7 @@ class Pages:
             "number": lambda *args: texts.decimals(language, number(*args)),
             "significant": lambda *args: texts.decimals(language, significant(*args)),
             "decimals": functools.partial(texts.decimals, language),
+            "role_name": lambda role: texts.library_words(language, role_words(role)),
         }
         page = self._environment.get_template(template).render({**own, **values})
         return HTMLResponse(page, status, dict(headers or {}))
@@ -190,6 +192,13 @@ class Pages:
 def visit_name(language: str, label: str) -> str:
     """Return the label of a visit; of one that got none, the words for that in a language."""
     return texts.text(language, "visits.unlabelled") if label == UNLABELLED else label
+
+
+def moment(at: datetime.datetime | str) -> str:
+    """Return a moment (UTC if it has no zone) as the clock of this machine shows it, to the minute."""
+    at = datetime.datetime.fromisoformat(at) if isinstance(at, str) else at
+    zoned = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
+    return f"{zoned.astimezone():%Y-%m-%d %H:%M}"
 
 
 def in_field(language: str, number: str) -> str:
