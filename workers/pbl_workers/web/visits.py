@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
+import numpy as np
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
@@ -98,8 +99,7 @@ def overview(visit: Visit) -> list[dict[str, Any]]:
     found = []
     for r in visit.fitted[:_OVERVIEW]:
         fit = r.fit
-        indices = report_indices(fit) if fit is not None else []
-        if fit is None or not indices:
+        if fit is None or not np.isfinite(fit.camera.matrix).all() or not (indices := report_indices(fit)):
             continue
         drawn = overlay_frames(None, fit, indices, max_side_px=_OVERVIEW_PX, crop_to_body=True)
         frames = [Picture(i, float(fit.time_s[i]), image) for i, image in zip(indices, drawn, strict=True)]

@@ -185,7 +185,10 @@ async function start() {
     canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
     stage.style.aspectRatio = `${width} / ${height}`;
     stage.style.setProperty("--wide", String(width / height));
-  } else stage.hidden = true;  // markers of a laboratory: they have no picture
+  } else {  // markers of a laboratory have no picture: the 3D view is in its place
+    stage.hidden = true;
+    stage.after(/** @type {HTMLElement} */ (look.querySelector(".space")));
+  }
   const controls = /** @type {HTMLElement} */ (look.querySelector(".controls"));
   controls.hidden = /** @type {HTMLElement} */ (look.querySelector(".about")).hidden = false;
   const position = $("position"), now = $("now"), play = $("play");
