@@ -1,4 +1,4 @@
-"""Drawn visits: synthetic markers of three persons at two visits each, to look at the pages before the first patient."""
+"""Drawn visits: synthetic markers of three persons at two visits each, to look at pages before the first patient."""
 
 from __future__ import annotations
 

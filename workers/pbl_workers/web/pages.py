@@ -170,7 +170,7 @@ class Pages:
             error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
             return self.error(request, error, _REFUSED[reason])
         if reason == "session" and self._sign_in:
-            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
+            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0, name="")
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
