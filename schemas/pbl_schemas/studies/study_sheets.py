@@ -84,7 +84,7 @@ def _add(row: Row, by: str) -> dict[str, PblError]:
 def _value(row: Row, field: str) -> Any:
     text = row.cells.get(field, "")
     if not text and field in _NEEDED:
-        raise refused("nothing", "a value", "write it", field)
+        raise refused("an empty field", "a value", "write it", field)
     if field in FLAGS:
         if text not in ("yes", "no"):
             raise refused(repr(text[:20]), "yes or no", "choose one of them", field)

@@ -97,7 +97,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
     errors: dict[str, PblError] = {}
     for name in ("subject", "visit"):
         if name not in given:
-            errors[name] = refused("nothing", "a value", "write it", name)
+            errors[name] = refused("an empty field", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": functools.partial(check_label, "visit", longest=NEW["visit"]),
