@@ -6,7 +6,6 @@ rewritten to where that page is staged; a link to any other file of the reposito
 
 from __future__ import annotations
 
-import itertools
 import os
 import posixpath
 import re
@@ -24,7 +23,6 @@ BUILT = ROOT / "build" / "docs"
 _HERE = Path(__file__).resolve().parent
 _FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^()\s]+)\)")
-_MERMAID = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 class BuildError(RuntimeError):
@@ -55,8 +53,7 @@ def stage(folder: Path) -> Path:
         texts[target] = _outside_code(text, lambda t, path=path: _LINK.sub(lambda m: _link(m, path, where), t))
     for target, text in texts.items():
         (src / target).parent.mkdir(parents=True, exist_ok=True)
-        # A browser would fetch mermaid from elsewhere: the site shows what the graph is made of.
-        (src / target).write_text(_MERMAID.sub(_graph, text), encoding="utf-8")
+        (src / target).write_text(text, encoding="utf-8")
     for file in [*(ROOT / "docs").glob("*.jpg"), *(ROOT / "docs").glob("*.svg"), *(_HERE / "assets").iterdir()]:
         shutil.copy(file, src)
     config = (_HERE / "zensical.toml").read_text(encoding="utf-8").replace("@ROOT@", ROOT.as_posix())
@@ -101,23 +98,3 @@ def _link(match: re.Match[str], page: str, where: dict[str, str]) -> str:
     else:
         return f"`{full}`" if shown.strip("`") == path else f"{shown} (`{full}`)"
     return f"{picture}[{shown}]({posixpath.relpath(to, posixpath.dirname(where[page]) or '.')}{hash_}{anchor})"
-
-
-def _graph(match: re.Match[str]) -> str:
-    """The edges of a mermaid graph as a table, by where they start."""
-    names: dict[str, str] = {}
-    edges: dict[str, set[str]] = {}
-    for line in match[1].splitlines():
-        nodes = [re.match(r"\s*(\w+)(?:\[/?\"(.*?)\"/?\])?", part) for part in re.split(r"-->|-\.->", line)]
-        found = [node for node in nodes if node is not None]
-        for node in found:
-            names[node[1]] = (
-                node[2] if node[2] and "_" not in node[1] else names.get(node[1], node[1].replace("_", ".", 1))
-            )
-        for a, b in itertools.pairwise(found):
-            edges.setdefault(a[1], set()).add(b[1])
-    rows = "".join(f"| {names[a]} | {', '.join(sorted(names[b] for b in to))} |\n" for a, to in edges.items())
-    summary = "The diagram as a list: which table is referred to by which"
-    return (
-        f"<details markdown><summary>{summary}</summary>\n\n| table | referred to by |\n|---|---|\n{rows}\n</details>"
-    )

@@ -59,7 +59,7 @@ def deidentify_how() -> str:
 
 def letter_head() -> list[str]:
     """Lines at the head of a letter: name and address of the clinic. Empty if none are set."""
-    return [line.strip() for line in os.environ.get("PBL_LETTER_HEAD", "").split("|") if line.strip()]
+    return [line.strip() for line in os.environ.get("PBL_LETTER_HEAD", "").split(";") if line.strip()]
 
 
 def audit_looks() -> bool:

@@ -13,7 +13,7 @@ from pbl_pipeline.tracking import AssociationParams, TrackingParams, WatchParams
 
 @dataclasses.dataclass(frozen=True)
 class HeadParams:
-    """Parameters of `find_heads`. Margins were tuned on the clips that docs/privacy.md names, and tested on others."""
+    """Parameters of `find_heads`. Margins were tuned on some clips and tested on others (`research/heads`)."""
 
     # Finds smaller and less certain people than measuring needs; a false one only blurs a patch of wall.
     tracking: TrackingParams = dataclasses.field(

@@ -4,6 +4,10 @@ Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keyp
 `spatiotemporal`, `score_gdi`; `gait_metrics` runs them for a session.
 """
 
+from pbl_pipeline.results.cycles import BODY_ANGLES, Exclusion, GaitCycle, Lengths
+from pbl_pipeline.results.events import GaitEvent, GaitEvents
+from pbl_pipeline.results.measures import Z90, Measure
+
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
 from ._bands import CURVE_FRAME_COLUMNS, AdultRanges, NormalBands, adult_ranges, curve_frame, leg_length_m, normal_bands
 from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles, refused_cadence, with_cadence_accepted
@@ -27,8 +31,6 @@ from ._own_norm import norm_from_cycles
 from .cycle_measures import (
     MEASURES,
     SIDED,
-    Z90,
-    Measure,
     Spatiotemporal,
     camera_side,
     cycle_measures,
@@ -37,7 +39,7 @@ from .cycle_measures import (
     spatiotemporal,
 )
 from .events import METHODS as EVENT_METHODS
-from .events import EventParams, GaitEvent, GaitEvents, apply_correction, check_correction, detect_events, load_events
+from .events import EventParams, apply_correction, check_correction, detect_events, load_events
 from .ground import cycle_lengths
 from .laboratory import PLUG_IN_GAIT_POINTS, LabTrial, read_lab_feet, read_lab_trial
 from .measurement import IMPORTANT_CHANGE, MEASURES_REMAIN, REMAINS, Chances, chances, change_sd
@@ -62,7 +64,6 @@ from .motion import (
     trial_poses,
 )
 from .normative import (
-    BODY_ANGLES,
     DEFAULT_NORM,
     NINE_ANGLES,
     PLUG_IN_GAIT,
@@ -82,9 +83,6 @@ from .types import (
     SELF_SELECTED,
     UNKNOWN,
     Condition,
-    Exclusion,
-    GaitCycle,
-    Lengths,
     MovementProfile,
     movement_profile,
     variable_scores,

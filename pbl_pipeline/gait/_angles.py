@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.cycles import BODY_ANGLES
+from pbl_pipeline.results.events import LEFT, RIGHT, SIDES
 
-from .events import LEFT, RIGHT, SIDES
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
-from .normative import BODY_ANGLES
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

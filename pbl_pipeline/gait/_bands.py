@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from pbl_pipeline.results.cycles import BODY_ANGLES, GaitCycle
+from pbl_pipeline.results.events import SIDES
 from pbl_pipeline.shipped import shipped_text
 
 from .cycle_measures import Spatiotemporal
-from .events import SIDES
-from .normative import BODY_ANGLES, GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
-from .types import GaitCycle
+from .normative import GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
 
 if TYPE_CHECKING:
     import pandas as pd

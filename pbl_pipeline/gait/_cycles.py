@@ -11,15 +11,15 @@ from scipy.interpolate import PchipInterpolator
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import CADENCE, Check, failed
+from pbl_pipeline.results.cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 
 from ._angles import AngleSeries, angle_series
 from .cycle_measures import far_leg, mostly, unusual_bound
-from .events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
 from .ground import cycle_lengths, is_metric, where_feet_stand, why_no_lengths
 from .measurement import model_of_fit
 from .motion import BodyPoses, FootTrajectories, feet_from_fit, trial_poses
-from .normative import BODY_ANGLES, THREE_ANGLES
-from .types import NO_POSITIONS, Exclusion, GaitCycle, Lengths
+from .normative import THREE_ANGLES
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

@@ -13,11 +13,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
+from pbl_pipeline.results.cycles import GaitCycle
+from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.measures import Z90
 
-from .cycle_measures import Z90, far_leg_of
-from .events import LEFT, RIGHT
+from .cycle_measures import far_leg_of
 from .measurement import (
-    MOST_LONGER,
     MeasurementModel,
     Pass,
     estimate,
@@ -36,15 +37,7 @@ from .normative import (
     load_norm,
     norm_names,
 )
-from .types import (
-    ANY_PACE,
-    SELF_SELECTED,
-    GaitCycle,
-    MovementProfile,
-    feature_vector,
-    movement_profile,
-    variable_scores,
-)
+from .types import ANY_PACE, SELF_SELECTED, MovementProfile, feature_vector, movement_profile, variable_scores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +114,11 @@ _NAMES = {
 }
 
 
+#: Errors count as at most so many times the squared distance that was found: a larger correction would be a guess.
+MOST_LONGER = 2.0
+#: A trial whose mean curve of an angle is farther than this from the others' (deg, root mean square) is named: twice
+#: the error above which gait analysis misleads (McGinley et al. 2009, Gait & Posture 29:360-369).
+APART_DEG = 10.0
 #: Numbers of an index: fields of `Gdi`, statistics of files.
 NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
 
@@ -146,8 +144,8 @@ class Gdi:
     a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
     index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
     detectable change (90 %) between two visits filmed alike. `unshrunk`: the index without people's distribution as
-    prior knowledge, for correlations and means over people; `mean` where that knows nothing of them either;
-    `unshrunk_sd`: standard deviation of its error.
+    prior knowledge of this person, for correlations and means over people; `mean` where that knows nothing of them
+    either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
     """
 
     status: str
@@ -284,7 +282,10 @@ def score_gdi(
         model=model,
         params_hash=paramset.hash,
         cycles=scored,
-        qc=(*_checks(scored, {c.angle_model for c in usable}, basis, reason, params), *_agreement(passes, basis)),
+        qc=(
+            *_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
+            *(_agreement(passes, basis) if error_model else _trials_agree(usable, basis)),
+        ),
         profile=profile,
         sd=sd,
         minimal_change=minimal_change,
@@ -387,7 +388,8 @@ def _agreement(passes: Sequence[Pass], norm: NormativeSet) -> tuple[Check, ...]:
     if len(passes) < 2:
         return ()
     doubted = [p for p in passes if p.doubt is not None]
-    which = "; ".join(_difference(p, norm) for p in doubted)
+    doubts = ((p.trial, np.reshape(np.asarray(p.doubt), (2, -1)) @ norm.components) for p in doubted)
+    which = "; ".join(_difference(trial, away, norm)[0] for trial, away in doubts)
     advice = ""
     if len(doubted) == len(passes):
         advice = (
@@ -399,12 +401,32 @@ def _agreement(passes: Sequence[Pass], norm: NormativeSet) -> tuple[Check, ...]:
     return (warn_if(advice, "passes_agree", float(len(doubted)), 0.0, advice),)
 
 
-def _difference(seen: Pass, norm: NormativeSet) -> str:
-    """Name of a doubted pass, and which angle of which leg is how far from what the others let expect."""
-    away = (np.reshape(np.asarray(seen.doubt), (2, -1)) @ norm.components).reshape(2, len(norm.variables), -1)
-    size = np.sqrt(np.mean(away**2, axis=-1))
-    side, angle = np.unravel_index(np.argmax(size), size.shape)
-    return f"{seen.trial}, {(LEFT, RIGHT)[side]} {norm.variables[angle]} by {size[side, angle]:.0f} deg"
+def _trials_agree(cycles: Sequence[GaitCycle], norm: NormativeSet) -> tuple[Check, ...]:
+    """Check `passes_agree` where no model of the error is known: the mean curves of each trial against those of all, of
+    two trials against each other (`APART_DEG`)."""
+    names = list(dict.fromkeys(c.trial for c in cycles))
+    if len(names) < 2:
+        return ()
+    curves = [
+        [[gdi_vector(c, norm) for c in cycles if (c.trial, c.side) == (trial, side)] for side in (LEFT, RIGHT)]
+        for trial in names
+    ]
+    unseen = np.full(norm.components.shape[1], np.nan)
+    means = np.array([[np.mean(own, axis=0) if own else unseen for own in sides] for sides in curves])
+    usual = means[::-1] if len(names) == 2 else np.nanmedian(means, axis=0)
+    apart = [_difference(t, away, norm) for t, away in zip(names, means - usual, strict=True)]
+    which = "; ".join(text for text, by in apart if by > APART_DEG)
+    advice = f"the curves of trials differ by more than those of one walk to the next: {which}. Look at each of them"
+    return (warn_if(which, "passes_agree", max(by for _, by in apart), APART_DEG, advice),)
+
+
+def _difference(trial: str, away: np.ndarray, norm: NormativeSet) -> tuple[str, float]:
+    """Name of a trial, and which angle of which leg is how far from what is expected (root mean square, deg); `away`:
+    of both sides' vectors (2, D), NaN for a side without cycles."""
+    size = np.sqrt(np.mean(np.square(away).reshape(2, len(norm.variables), -1), axis=-1))
+    side, angle = np.unravel_index(np.nanargmax(size), size.shape) if np.isfinite(size).any() else (0, 0)
+    by = float(np.nan_to_num(size[side, angle]))
+    return f"{trial}, {(LEFT, RIGHT)[side]} {norm.variables[angle]} by {by:.0f} deg", by
 
 
 class _Part(NamedTuple):

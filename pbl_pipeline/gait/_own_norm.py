@@ -10,10 +10,11 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check, warn_if
+from pbl_pipeline.results.cycles import GaitCycle
 
 from ._gdi import MODEL_ANGLES
 from .normative import MIN_VECTORS, NINE_ANGLES, THREE_ANGLES, NormativeSet, fit_norm
-from .types import GaitCycle, feature_vector
+from .types import feature_vector
 
 #: Fewer people, or a larger fraction of the cycles from one person, give a warning.
 ADVISED_PEOPLE, MAX_SHARE = 20, 0.2

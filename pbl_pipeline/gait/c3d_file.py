@@ -19,8 +19,7 @@ import numpy as np
 
 from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import count_rows
-
-from .events import FOOT_DOWN, FOOT_UP, GaitEvent
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, GaitEvent
 
 _BLOCK = 512
 #: Header and counts have 16 bits: a larger number is cut to this or counted from 0 again.

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pbl_pipeline import words
+from pbl_pipeline.results.cycles import GaitCycle
+from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.measures import Measure
 
-from .events import LEFT, RIGHT
 from .ground import is_metric
 from .motion import BodyPoses
-from .types import GaitCycle
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit
@@ -56,8 +57,6 @@ def mostly(names: np.ndarray) -> str:
     return str(found[np.argmax(counts)]) if len(found) and counts.max() >= SHARE * len(names) else ""
 
 
-#: A 90 % interval of a normal error, in standard deviations.
-Z90 = 1.6449
 #: Usual standard deviation between the cycles of a side, in the unit of the measure: what nine of ten recorded people
 #: do not exceed (`python -m research.corpus.spread`; single support as swing, which it is of the other foot). They are
 #: healthy: of times and percentages twice that.
@@ -110,52 +109,6 @@ def sampling_sd(usual: float, n: int, own: float | None = None, freedom: int = 0
     """
     excess = 0.0 if own is None else max(own**2 - usual**2, 0.0) * freedom / (USUAL_FREEDOM + freedom)
     return math.sqrt((usual**2 + excess) / n)
-
-
-@dataclasses.dataclass(frozen=True)
-class Measure:
-    """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side.
-
-    `variability` is the sd within a side, both sides together: the root of the mean of their variances (n - 1), which
-    does not contain an asymmetry; None with fewer than two values of a side. `cv_percent` is that in percent of the
-    mean. `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for measures that are not `SIDED` and
-    if one camera saw the same leg behind the other in most cycles (`far_leg_of`).
-    `error_sd` is the standard deviation of the error of `mean`: the measured error of camera, detector and fit, and the
-    sampling error of n values; `minimal_change` the minimal detectable change (90 %) between two visits filmed alike.
-    None if the error was not measured.
-    """
-
-    left: float | None
-    right: float | None
-    mean: float
-    sd: float | None
-    n: int
-    variability: float | None = None
-    cv_percent: float | None = None
-    asymmetry_percent: float | None = None
-    error_sd: float | None = None
-    minimal_change: float | None = None
-
-    def to_dict(self) -> dict:
-        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """90 % interval of the mean: of its whole error if that was measured (`error_sd`). Else over repetitions,
-        mean +- t sd / sqrt(n) by Student's t, from the spread of the cycles: a constant error of camera, detector and
-        fit is not contained.
-
-        The sd is `variability` if it is known (n - 2 degrees of freedom), else `sd` (n - 1); None without either.
-        """
-        if self.error_sd is not None:
-            return self.mean - Z90 * self.error_sd, self.mean + Z90 * self.error_sd
-        from scipy.stats import t  # takes longer to import than most commands run
-
-        sd, freedom = (self.variability, self.n - 2) if self.variability is not None else (self.sd, self.n - 1)
-        if sd is None or freedom < 1:
-            return None
-        half = float(t.isf(0.05, freedom)) * sd / float(np.sqrt(self.n))
-        return self.mean - half, self.mean + half
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .events import LEFT
+from pbl_pipeline.results.cycles import GaitCycle, Lengths
+from pbl_pipeline.results.events import LEFT
+
 from .motion import FootTrajectories
-from .types import GaitCycle, Lengths
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

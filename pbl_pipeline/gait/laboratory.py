@@ -15,18 +15,11 @@ from pbl_pipeline.assumptions import Origin
 from pbl_pipeline.bounded import MIB, read_bytes
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, PASS
+from pbl_pipeline.results.events import GaitEvent, GaitEvents
 
 from ._angles import AngleSeries, check_ranges
 from .c3d_file import C3dFile
-from .events import (
-    METHODS,
-    GaitEvent,
-    GaitEvents,
-    check_preconditions,
-    detect_events,
-    load_events,
-    no_events,
-)
+from .events import METHODS, check_preconditions, detect_events, load_events, no_events
 from .motion import FootTrajectories, check_feet, feet_from_markers
 from .normative import PLUG_IN_GAIT, check_degrees
 

@@ -25,10 +25,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaincc
 
+from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.measures import Z90
 from pbl_pipeline.shipped import shipped_model
 
-from .cycle_measures import CYCLE_SPREAD, Z90, sampling_sd
-from .events import LEFT, RIGHT
+from .cycle_measures import CYCLE_SPREAD, sampling_sd
 from .normative import NormativeSet
 
 #: Minimal important change of the index: half a standard deviation of healthy people, which is 10 points. A convention
@@ -90,13 +91,17 @@ def _tail(z: float) -> float:
     return 0.5 * math.erfc(z / math.sqrt(2.0))
 
 
-#: Draws of the scores for an expected index, and of two visits' errors for the index's own error.
-N_DRAWS, N_VISITS = 512, 64
+#: Draws of the scores for an expected index, of two visits' errors for the index's own error, and of people.
+N_DRAWS, N_VISITS, N_PEOPLE = 512, 64, 2048
+#: The index where the line of `unshrunk_index` bends, one standard deviation below the healthy mean, and the largest
+#: standard deviation of its error with which it is stated.
+BEND, MOST_UNSURE = 90.0, 30.0
+#: Fraction of the stated variance of least-squares scores with which the index of these scores is as far below the true
+#: one as that of tuning persons, in the mean (`research.corpus.measurement`).
+FOUND_VARIANCE = 0.7
 _FOLDER = resources.files("pbl_pipeline.gait").joinpath("measurement_models")
 
 
-#: Errors count as at most so many times the squared distance that was found: a larger correction would be a guess.
-MOST_LONGER = 2.0
 #: Passes disagree where the probability of a difference like theirs, times their number, is below this. Of visits of
 #: tuning persons 0.2 % do, of persons held out 0.2 % (`research.corpus.measurement`).
 DISAGREE = 1e-4
@@ -245,32 +250,39 @@ def estimate(model: MeasurementModel, passes: Sequence[Pass]) -> Posterior:
     return Posterior(model.mean + filtered @ off, covariance, filtered @ anew @ filtered.T)
 
 
-def unshrunk_index(model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet) -> tuple[float, float]:
-    """Return the index without people's distribution as prior knowledge, and the standard deviation of its error about
-    the true index, of people like those whom the passes suggest.
+def unshrunk_index(
+    model: MeasurementModel, passes: Sequence[Pass], norm: NormativeSet
+) -> tuple[float, float] | tuple[None, None]:
+    """Return the index without people's distribution as prior knowledge of this person, and the standard deviation of
+    its error, of people like those whom the passes suggest; None where that is above `MOST_UNSURE`. Both sides must
+    have cycles.
 
-    The scores are those of generalised least squares. An error of covariance C adds (tr C - 2 u C u) / d^2 to the
-    expected logarithm of a side's squared distance d^2 from the norm in the direction u, to the second order; that is
-    taken back. Both sides must have cycles.
+    Errors lower the index of generalised least-squares scores, high ones most. Among people of the model, filmed
+    alike, it is therefore calibrated by a line with a bend, which is as large on average as the true index whatever
+    that is (classical calibration; the line solves the moment equations of an instrumental variable, the true index).
     """
     off, gain, error, *_ = _joint(model, passes)
     weighed = np.linalg.solve(error, gain)
     covariance = np.linalg.inv(gain.T @ weighed)
-    half = len(covariance) // 2
-    of_sides = [covariance[k : k + half, k : k + half] for k in (0, half)]
+    errors = math.sqrt(FOUND_VARIANCE) * _drawn(covariance, N_PEOPLE, 3)
 
     def index(scores: np.ndarray) -> np.ndarray:
-        sides = scores.reshape(-1, 2, half)
-        square = np.sum(sides**2, axis=-1)
-        radial = np.stack([np.sum(sides[:, k] @ c * sides[:, k], axis=-1) for k, c in enumerate(of_sides)], axis=-1)
-        longer = ([np.trace(c) for c in of_sides] - 2.0 * radial / square) / square
-        return (_index(scores, norm) + 5.0 / norm.ln_sd * np.clip(longer, 0.0, MOST_LONGER)).mean(axis=-1)
+        return _index(scores, norm).mean(axis=-1)
 
+    people = model.mean + _drawn(model.spread, N_PEOPLE, 2)
+    true = index(people)
+    line = np.linalg.solve(_bent(true) @ _bent(index(people + errors)).T, _bent(true) @ true)
     likely = estimate(model, passes)
-    true = likely.mean + _drawn(likely.covariance, N_DRAWS, 2)
-    errors = index(true + _drawn(covariance, N_DRAWS, 3)) - _index(true, norm).mean(axis=-1)
-    found = index((model.mean + covariance @ (weighed.T @ off))[None])
-    return float(found[0]), model.widening * float(errors.std())
+    alike = likely.mean + _drawn(likely.covariance, N_PEOPLE, 4)
+    sd = model.widening * float(np.std(line @ _bent(index(alike + errors)) - index(alike)))
+    if not sd <= MOST_UNSURE:
+        return None, None
+    return float(line @ _bent(index(model.mean + covariance @ (weighed.T @ off)))), sd
+
+
+def _bent(index: np.ndarray) -> np.ndarray:
+    """Terms (3, ...) of a line that bends at `BEND`."""
+    return np.stack([np.ones_like(index), index, np.maximum(index - BEND, 0.0)])
 
 
 def with_doubts(model: MeasurementModel, passes: Sequence[Pass]) -> list[Pass]:

@@ -13,6 +13,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
+from pbl_pipeline.results.cycles import GaitCycle
+from pbl_pipeline.results.events import GaitEvents
+from pbl_pipeline.results.measures import Z90
 
 from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
@@ -32,19 +35,18 @@ from .cycle_measures import (
     CADENCE_PER_MIN,
     LENGTHS,
     MEASURES,
-    Z90,
     Spatiotemporal,
     far_leg_of,
     spatiotemporal,
     unusual_bound,
 )
-from .events import METHODS, GaitEvents, detect_events
+from .events import METHODS, detect_events
 from .laboratory import LabTrial
 from .measurement import load_model, measure_error
 from .motion import BodyPoses, feet_from_fit, trial_poses
 from .normative import NormativeSet
 from .tasks import TASK_MEASURES, task_measures, task_motion
-from .types import Condition, GaitCycle
+from .types import Condition
 
 if TYPE_CHECKING:
     from pbl_pipeline.fit import TrialFit

@@ -14,9 +14,9 @@ import numpy as np
 from pbl_pipeline.assumptions import SIZES, Origin, check_size, check_steps
 from pbl_pipeline.bounded import count_rows, read_text
 from pbl_pipeline.errors import PblError, unread_file
+from pbl_pipeline.results.events import SIDES
 
 from ._angles import AngleSeries, check_ranges, legs_of, series_of
-from .events import SIDES
 from .laboratory import LabTrial, trial_events
 from .motion import MIN_TRAVEL_M_PER_S, BodyPoses, FootTrajectories, check_feet, feet_from_poses, poses_of
 

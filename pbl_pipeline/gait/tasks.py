@@ -19,9 +19,10 @@ from scipy.signal import find_peaks
 
 from pbl_pipeline import words
 from pbl_pipeline.qc import Check, failed
+from pbl_pipeline.results.measures import Measure
 from pbl_pipeline.sampling import interval_of
 
-from .cycle_measures import MEASURES, Measure, measure_of
+from .cycle_measures import MEASURES, measure_of
 from .motion import BodyPoses, trial_poses
 
 if TYPE_CHECKING:

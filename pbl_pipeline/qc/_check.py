@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from typing import Annotated
+
+from pbl_pipeline.records import Column
 
 PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
@@ -16,11 +19,11 @@ CADENCE = "cadence_plausible"
 class Check:
     """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 
-    check: str
-    outcome: str
-    value: float | None
-    threshold: float | None
-    advice: str = ""
+    check: Annotated[str, Column("{}_check", "varchar(64)", "name, with its unit", key=True)]
+    outcome: Annotated[str, Column("{}_check_outcome", f"enum({', '.join(map(repr, OUTCOMES))})")]
+    value: Annotated[float | None, Column("{}_check_value", "float64", "in the unit (see {}_check)", null=True)]
+    threshold: Annotated[float | None, Column("{}_check_threshold", "float64", "in the unit (see {}_check)", null=True)]
+    advice: Annotated[str, Column("{}_check_advice", "varchar(1000)", "what to do about it")] = ""
 
     def __post_init__(self) -> None:
         if self.outcome not in OUTCOMES:

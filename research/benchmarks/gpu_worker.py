@@ -1,4 +1,4 @@
-"""Sessions a second of `pbl worker --resource gpu`, and how busy the device is: figures of docs/operations.md.
+"""Sessions a second of `pbl worker --resource gpu`, and how busy the device is.
 
     python -m research.benchmarks.gpu_worker                                  # as `pbl worker --processes auto` fits
     python -m research.benchmarks.gpu_worker --batch 32,128 --processes 1,2   # what the options bring

@@ -1,4 +1,4 @@
-"""Cost of the pages of a visit that phones film, and of `/visits` beside ten phones: for docs/capture.md.
+"""Cost of the pages of a visit that phones film, and of `/visits` beside ten phones.
 
     python -m research.benchmarks.phone_state                    # visits of 100 and 200 recordings
 

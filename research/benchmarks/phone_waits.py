@@ -1,4 +1,4 @@
-"""Waiting time for a verdict and an index after filming, while other recordings are being computed: docs/capture.md.
+"""Waiting time for a verdict and an index after filming, while other recordings are being computed.
 
     python -m research.benchmarks.phone_waits                    # 1,000 recordings wait, two processes, five by phone
     python -m research.benchmarks.phone_waits --videos 20 --phones 1

@@ -1,4 +1,4 @@
-"""Cost of the list of visits of `pbl web`: for docs/web.md.
+"""Cost of the list of visits of `pbl web`.
 
     python -m research.benchmarks.visit_list                 # 50,000 visits of 10,000 people, in a separate database
 

@@ -1,4 +1,4 @@
-"""Frame rate of the 3D view of `pbl web`: for docs/web.md.
+"""Frame rate of the 3D view of `pbl web`.
 
     python -m research.benchmarks.web_3d               # 2,000 frames at 1280 x 720 in a Chromium without windows
 

@@ -1,4 +1,4 @@
-"""Time until a recording plays in `pbl web`: for docs/web.md.
+"""Time until a recording plays in `pbl web`.
 
     python -m research.benchmarks.web_video            # 30 s of 1080p in a Chromium without windows
 

@@ -1,4 +1,4 @@
-"""Cost of the queue: figures of docs/operations.md. Failures that it survives: `research.benchmarks.chaos`.
+"""Cost of the queue. Failures that it survives: `research.benchmarks.chaos`.
 
     python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys

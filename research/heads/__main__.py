@@ -13,7 +13,7 @@ import click
     type=click.Path(path_type=Path, file_okay=False),
     required=True,
     metavar="DIR",
-    help="Folder of the recordings in which heads were located (docs/privacy.md).",
+    help="Folder of the recordings in which heads were located (`heads.json`).",
 )
 @click.option("--clip", "clips", multiple=True, metavar="NAME", help="Only this recording; repeatable.")
 def main(data: Path, clips: tuple[str, ...]) -> None:

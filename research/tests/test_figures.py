@@ -15,13 +15,10 @@ NO_FIGURES = {"docs/errors.md", "docs/export.md", "docs/files.md", "docs/licence
 #: (`python -m research.figures record NAME`), mark the table, and lower the number.
 NOT_KEPT = {
     "docs/accuracy.md": 14,
-    "docs/capture.md": 1,
     "docs/events.md": 5,
     "docs/kinetics.md": 4,
     "docs/measures.md": 1,
     "docs/models.md": 1,
-    "docs/operations.md": 2,
-    "docs/privacy.md": 1,
     "docs/statistics.md": 4,
     "docs/synth.md": 1,
     "docs/tracking.md": 1,

@@ -14,13 +14,15 @@ import numpy as np
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.records import definition, from_row, number, to_row
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, MadeOnce, check_columns, check_row, check_values, inside, number, one
+from .rows import InputChanged, MadeOnce, inside, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -233,7 +235,8 @@ class SessionFit(dj.Computed):
     class Check(dj.Part):
         definition = f"""
         # quality checks of the fit
-        {check_columns("fit")}
+        -> master
+        {definition(Quality, "fit")}
         """
 
     #: Plans the sets of all sessions; `pbl_schemas.activate` puts `plan.plan_fit_sets` here, which knows this table.
@@ -381,7 +384,7 @@ class SessionFit(dj.Computed):
                         "trial_file": path,
                     }
                 )
-        self.Check.insert({**key, **check_row("fit", check)} for check in result.qc)
+        self.Check.insert({**key, **to_row(check, "fit")} for check in result.qc)
 
 
 @MadeOnce
@@ -478,7 +481,7 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
 def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
     """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
     rows = (SessionFit.Check & {k: key[k] for k in SessionFit.primary_key}).to_dicts(order_by="fit_check")
-    return [check_values("fit", row) for row in rows]
+    return [dataclasses.astuple(from_row(Quality, row, "fit")) for row in rows]
 
 
 def median(values: np.ndarray) -> float | None:

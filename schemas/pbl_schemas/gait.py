@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.qc import in_order
+from pbl_pipeline.records import definition, from_row, number, to_row
+from pbl_pipeline.results.cycles import GaitCycle as Cycle
+from pbl_pipeline.results.events import GaitEvent
+from pbl_pipeline.results.events import GaitEvents as Events
+from pbl_pipeline.results.measures import OF_VISIT, Measure
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
@@ -13,7 +20,7 @@ from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
 from .review import Decision
-from .rows import Rows, check_columns, check_row, check_values, number, one, row_of, stored_rows
+from .rows import Rows, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -29,16 +36,9 @@ def measure_columns(prefix: str) -> str:
     -> master
     {prefix}             : varchar(32)         # name, with its unit
     ---
-    {prefix}_mean=null   : float64             # in the unit (see {prefix}): both sides
-    {prefix}_left=null   : float64             # in the unit (see {prefix})
-    {prefix}_right=null  : float64             # in the unit (see {prefix})
-    {prefix}_sd=null     : float64             # in the unit (see {prefix}): n - 1, null for one value
-    {prefix}_variability=null : float64        # in the unit (see {prefix}): sd within a side, null below two values of a side
-    {prefix}_cv=null     : float64             # (percent) variability of the mean
-    {prefix}_asymmetry=null   : float64        # (percent) right minus left, of their mean; null where it means nothing
-    {prefix}_n           : int16               # values
+    {definition(Measure, prefix, OF_VISIT)}
     {prefix}_missing     : varchar(255)        # why it is null
-    """  # noqa: E501
+    """
 
 
 @schema
@@ -143,34 +143,24 @@ class GaitEvents(dj.Computed):
     -> GaitEventMethod
     ---
     -> session.Session
-    events_status     : enum('PASS', 'EMPTY')
-    events_reason     : varchar(1000)          # why EMPTY
-    events_detector   : varchar(64)            # name of the method in the library
-    events_source     : varchar(64)            # what the feet come from
-    walking_bouts     : json                   # (s) start and end of each walking bout
-    n_events          : int16
-    n_candidates      : int16                  # possible events before their check
-    n_order_breaks    : int16                  # bouts that ended because an event was missing or out of order
+    {definition(Events)}
     {origin_columns("events")}
     index (events_status)
     """
 
     class Event(dj.Part):
-        definition = """
+        definition = f"""
         -> master
         event_no          : int16              # in order of time, from 1
         ---
-        event_time        : float64            # (s) time of the trial
-        event_side        : enum('left', 'right')
-        event_kind        : enum('foot_down', 'foot_up')
-        event_probability : float64            # (0..1) that it is real; by coordinates: how clear it is, not calibrated
-        event_bout        : int16              # walking bout, from 0
+        {definition(GaitEvent)}
         """
 
     class Check(dj.Part):
         definition = f"""
         # quality checks of the events
-        {check_columns("events")}
+        -> master
+        {definition(Quality, "events")}
         """
 
     @property
@@ -182,40 +172,22 @@ class GaitEvents(dj.Computed):
         return file_ref(one(fit.SessionFit.Trial & key, "trial_file")), method_row(GaitEventMethod, key)
 
     @computes
-    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[lib.GaitEvents, str]:
+    def make_compute(self, key: dict, ref: dict, method: Mapping[str, Any]) -> tuple[Events, str]:
         from pbl_pipeline.gait import detect_events, feet_from_fit
 
         return detect_events(feet_from_fit(fit.load_trial(ref)), methods.stored(**method)), method["sha"]
 
-    def make_insert(self, key: dict, found: lib.GaitEvents, sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, found: Events, sha: str, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
                 "session_id": fit.session_of_set(key),
-                "events_status": found.status,
-                "events_reason": found.reason[:1000],
-                "events_detector": found.method,
-                "events_source": found.source[:64],
-                "walking_bouts": [[float(a), float(b)] for a, b in found.walking_s],
-                "n_events": len(found.events),
-                "n_candidates": found.n_candidates,
-                "n_order_breaks": found.n_order_breaks,
+                **to_row(found),
                 **origin.row("events", method_hash=sha),
             }
         )
-        self.Event.insert(
-            {
-                **key,
-                "event_no": i,
-                "event_time": e.time_s,
-                "event_side": e.side,
-                "event_kind": e.event,
-                "event_probability": e.probability,
-                "event_bout": e.bout,
-            }
-            for i, e in enumerate(found.events, 1)
-        )
-        self.Check.insert({**key, **check_row("events", check)} for check in found.qc)
+        self.Event.insert({**key, "event_no": i, **to_row(e)} for i, e in enumerate(found.events, 1))
+        self.Check.insert({**key, **to_row(check, "events")} for check in found.qc)
 
 
 @schema
@@ -233,33 +205,10 @@ class GaitCycle(dj.Computed):
     """  # noqa: E501
 
     class Cycle(dj.Part):
-        definition = """
+        definition = f"""
         -> master
-        cycle_no           : int16             # in order of time, both sides together, from 0
-        ---
-        cycle_side         : enum('left', 'right')
-        cycle_bout         : int16             # walking bout, from 0
-        cycle_start        : float64           # (s) foot down
-        opposite_foot_up   : float64           # (s)
-        opposite_foot_down : float64           # (s)
-        cycle_foot_up      : float64           # (s)
-        cycle_end          : float64           # (s) next foot down of the same side
-        cycle_used         : bool              # false where one of the next six says why
-        cycle_first_step   : bool              # touches the first step of its walking bout
-        cycle_last_step    : bool              # touches the last step of its walking bout
-        cycle_length_ratio=null : float64      # (1) length over the typical stride's, null unless left out for it
-        cycle_length_unproven=null : bool      # no feet show whether a step was missed; null: not left out for its length, or not known
-        cycle_curve_distance=null : float64    # (deg) from its side's median curves, null unless left out for it
-        cycle_curves_n=null : int16            # cycles of that median, null with it
-        cycle_failed_checks : json             # names of the checks of the fit that FAIL, such as []
-        curves_missing     : varchar(100)      # why it has no curves
-        cycle_far_leg=null : enum('left', 'right')  # the leg that one camera saw behind the other, if one
-        cycle_stride_length=null : float64     # (m) over the floor
-        cycle_step_length=null   : float64     # (m) of the step that ends the cycle
-        cycle_step_width=null    : float64     # (m) null unless the metres were measured
-        cycle_lengths_metric=null : bool       # false: as large as the detector takes the person to be
-        cycle_lengths_missing='' : varchar(150)  # why there are no lengths
-        """  # noqa: E501
+        {definition(Cycle)}
+        """
 
     def make_fetch(self, key: dict) -> tuple:
         correction = correction_of(key)
@@ -271,12 +220,12 @@ class GaitCycle(dj.Computed):
     def make_compute(
         self,
         key: dict,
-        events: lib.GaitEvents,
+        events: Events,
         ref: dict,
         checks: Sequence[tuple],
         correction: Mapping[str, Any] | None,
         accepted: float | None,
-    ) -> tuple[tuple[lib.GaitCycle, ...], int | None]:
+    ) -> tuple[tuple[Cycle, ...], int | None]:
         from pbl_pipeline.gait import find_cycles, refused_cadence, with_cadence_accepted
         from pbl_pipeline.qc import Check
 
@@ -285,7 +234,7 @@ class GaitCycle(dj.Computed):
             cycles = with_cadence_accepted(cycles)
         return cycles, None if correction is None else correction["correction_no"]
 
-    def make_insert(self, key: dict, cycles: Sequence[lib.GaitCycle], correction: int | None, origin: Origin) -> None:
+    def make_insert(self, key: dict, cycles: Sequence[Cycle], correction: int | None, origin: Origin) -> None:
         from pbl_pipeline.gait.metrics_file import save_curves
 
         with new_folder() as folder:
@@ -390,81 +339,57 @@ MEASURE_COLUMNS = {
 }
 
 
-#: Column after its prefix -> attribute of the library's `Measure`.
-_MEASURE_PARTS = (
-    ("mean", "mean"),
-    ("left", "left"),
-    ("right", "right"),
-    ("sd", "sd"),
-    ("variability", "variability"),
-    ("cv", "cv_percent"),
-    ("asymmetry", "asymmetry_percent"),
-)
+def measure_of_row(row: Mapping[str, Any], prefix: str) -> Measure | None:
+    """Return the measure of a row of `measure_columns(prefix)`, None if it is not known."""
+    return None if row[f"{prefix}_mean"] is None else from_row(Measure, row, prefix)
 
 
-def measure_of_row(row: Mapping[str, Any], prefix: str) -> lib.Measure | None:
-    """The library's `Measure` of a row of `measure_columns(prefix)`, None if it is not known."""
-    from pbl_pipeline.gait import Measure
-
-    if row[f"{prefix}_mean"] is None:
-        return None
-    values: dict[str, Any] = {k: number(row[f"{prefix}_{column}"]) for column, k in _MEASURE_PARTS}
-    of_visit = {"error": "error_sd", "minimal_change": "minimal_change"}  # columns that measures of a trial lack
-    values |= {k: number(row.get(f"{prefix}_{column}")) for column, k in of_visit.items()}
-    return Measure(**values, n=int(row[f"{prefix}_n"]))
-
-
-def mean_of(measure: lib.Measure | None) -> float | None:
+def mean_of(measure: Measure | None) -> float | None:
     """The mean of a library `Measure`, None if there is none."""
     return None if measure is None else number(measure.mean)
 
 
 def measure_rows(
-    measures: Mapping[str, lib.Measure | None], reasons: Mapping[str, str], prefix: str = "measure"
+    measures: Mapping[str, Measure | None],
+    reasons: Mapping[str, str],
+    prefix: str = "measure",
+    without: Collection[str] = OF_VISIT,
 ) -> list[dict]:
-    """Rows of a part table with `measure_columns(prefix)`."""
-    rows = []
-    for name, m in measures.items():
-        row: dict[str, Any] = {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255]}
-        row |= {f"{prefix}_{column}": None if m is None else number(getattr(m, k)) for column, k in _MEASURE_PARTS}
-        rows.append({**row, f"{prefix}_n": 0 if m is None else m.n})
-    return rows
+    """Rows of a part table with `measure_columns(prefix)`; `without`: fields of `Measure` that it does not have."""
+    unknown = dict.fromkeys(to_row(Measure(None, None, 0.0, None, 0), prefix, without)) | {f"{prefix}_n": 0}
+    return [
+        {
+            prefix: name,
+            f"{prefix}_missing": reasons.get(name, "")[:255],
+            **(unknown if m is None else to_row(m, prefix, without)),
+        }
+        for name, m in measures.items()
+    ]
 
 
-def events_of(
-    row: Mapping[str, Any], correction: Mapping[str, Any] | None = None, rows: Rows = stored_rows
-) -> lib.GaitEvents:
+def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = None, rows: Rows = stored_rows) -> Events:
     """The library's `GaitEvents` of a row of GaitEvents: the detected ones, or those that a correction (key of
     EventCorrection) sets instead."""
-    from pbl_pipeline import gait as lib
-    from pbl_pipeline.qc import Check, in_order
-
     key = {k: row[k] for k in GaitEvents.primary_key}
-    detected = lib.GaitEvents(
-        status=row["events_status"],
-        events=tuple(
-            lib.GaitEvent(*(e[f"event_{k}"] for k in ("time", "side", "kind", "probability", "bout")))
-            for e in rows(GaitEvents.Event, key)
-        ),
-        reason=row["events_reason"],
-        method=row["events_detector"],
+    detected = from_row(
+        Events,
+        row,
+        events=tuple(from_row(GaitEvent, e) for e in rows(GaitEvents.Event, key)),
         params_hash=row["events_method_hash"],
-        source=row["events_source"],
-        walking_s=tuple((float(a), float(b)) for a, b in row["walking_bouts"]),
-        n_candidates=int(row["n_candidates"]),
-        n_order_breaks=int(row["n_order_breaks"]),
-        qc=in_order(Check(*check_values("events", check)) for check in rows(GaitEvents.Check, key)),
+        qc=in_order(from_row(Quality, check, "events") for check in rows(GaitEvents.Check, key)),
     )
     if correction is None:
         return detected
+    from pbl_pipeline import gait as lib
+
     changed = row_of(EventCorrection, correction, rows)["correction_changed"]
     names = ("corrected_time", "corrected_side", "corrected_kind", "corrected_probability")
     found = [[e[name] for name in names] for e in rows(EventCorrection.Event, correction)]
-    events = [lib.GaitEvent(float(t), side, kind, 1.0 if p is None else float(p)) for t, side, kind, p in found]
+    events = [GaitEvent(float(t), side, kind, 1.0 if p is None else float(p)) for t, side, kind, p in found]
     return lib.apply_correction(detected, events, int(changed))
 
 
-def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEvents:
+def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> Events:
     """The library's `GaitEvents` that the row of GaitCycle of this key was made from."""
     row = row_of(GaitEvents, {k: key[k] for k in GaitEvents.primary_key}, rows)
     cycles = row_of(GaitCycle, {k: row[k] for k in GaitEvents.primary_key}, rows)
@@ -472,79 +397,30 @@ def load_events(key: Mapping[str, Any], rows: Rows = stored_rows) -> lib.GaitEve
     return events_of(row, None if cycles["correction_no"] is None else {k: cycles[k] for k in names}, rows)
 
 
-def row_of_cycle(c: lib.GaitCycle) -> dict[str, Any]:
+def row_of_cycle(c: Cycle) -> dict[str, Any]:
     """A row of GaitCycle.Cycle, without its key above; its curves are in a file."""
-    return {
-        "cycle_no": c.number,
-        "cycle_side": c.side,
-        "cycle_bout": c.bout,
-        "cycle_start": c.start_s,
-        "opposite_foot_up": c.opposite_foot_up_s,
-        "opposite_foot_down": c.opposite_foot_down_s,
-        "cycle_foot_up": c.foot_up_s,
-        "cycle_end": c.end_s,
-        "cycle_used": c.used,
-        "cycle_first_step": c.exclusion.first_step,
-        "cycle_last_step": c.exclusion.last_step,
-        "cycle_length_ratio": number(c.exclusion.length_ratio),
-        "cycle_length_unproven": None if c.exclusion.length_ratio is None else c.exclusion.length_unproven,
-        "cycle_curve_distance": number(c.exclusion.curve_distance_deg),
-        "cycle_curves_n": c.exclusion.n_curves,
-        "cycle_failed_checks": list(c.exclusion.failed_checks),
-        "curves_missing": c.curves_missing[:100],
-        "cycle_far_leg": c.far_leg or None,
-        "cycle_stride_length": number(c.lengths.stride_length_m),
-        "cycle_step_length": number(c.lengths.step_length_m),
-        "cycle_step_width": number(c.lengths.step_width_m),
-        "cycle_lengths_metric": c.lengths.metric,
-        "cycle_lengths_missing": c.lengths.missing[:150],
-    }
+    left_out = c.exclusion.length_ratio is not None
+    return to_row(c) | ({} if left_out else {"cycle_length_unproven": None})
 
 
-def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> lib.GaitCycle:
-    from pbl_pipeline import gait as lib
-
-    return lib.GaitCycle(
-        trial=trial,
-        number=int(row["cycle_no"]),
-        bout=int(row["cycle_bout"]),
-        side=row["cycle_side"],
-        start_s=float(row["cycle_start"]),
-        opposite_foot_up_s=float(row["opposite_foot_up"]),
-        opposite_foot_down_s=float(row["opposite_foot_down"]),
-        foot_up_s=float(row["cycle_foot_up"]),
-        end_s=float(row["cycle_end"]),
-        exclusion=lib.Exclusion(
-            first_step=bool(row["cycle_first_step"]),
-            last_step=bool(row["cycle_last_step"]),
-            length_ratio=number(row["cycle_length_ratio"]),
-            # NULL for cycles older than this column: it is not known, so the spread is withheld
-            length_unproven=row["cycle_length_ratio"] is not None and row["cycle_length_unproven"] != 0,
-            curve_distance_deg=number(row["cycle_curve_distance"]),
-            n_curves=None if row["cycle_curves_n"] is None else int(row["cycle_curves_n"]),
-            failed_checks=tuple(row["cycle_failed_checks"]),
-        ),
-        curves=dict(curves.deg if curves else {}),
-        curves_missing=row["curves_missing"],
-        curves_sd=dict(curves.sd_deg if curves else {}),
-        far_leg=row["cycle_far_leg"] or "",
-        error_model=curves.error_model if curves else "",
-        lengths=lib.Lengths(
-            number(row["cycle_stride_length"]),
-            number(row["cycle_step_length"]),
-            number(row["cycle_step_width"]),
-            row["cycle_lengths_missing"],
-            bool(row["cycle_lengths_metric"]),
-        ),
+def cycle_of_row(row: Mapping[str, Any], trial: str, curves: Curves | None = None) -> Cycle:
+    """The library's cycle of a row of GaitCycle.Cycle."""
+    if row["cycle_length_ratio"] is not None and row["cycle_length_unproven"] is None:
+        row = {**row, "cycle_length_unproven": True}  # older than the column: not known, so the spread is withheld
+    of_file = (
+        {"curves": dict(curves.deg), "curves_sd": dict(curves.sd_deg), "error_model": curves.error_model}
+        if curves
+        else {}
     )
+    return from_row(Cycle, row, trial=trial, **of_file)
 
 
-def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[lib.GaitCycle]:
+def load_cycles(key: Mapping[str, Any], trial: str = "", rows: Rows = stored_rows) -> list[Cycle]:
     """Return the library's cycles of one row of GaitCycle, with their curves."""
     return cycles_of_rows(rows(GaitCycle.Cycle, key), file_ref(row_of(GaitCycle, key, rows)["curves"]), trial)
 
 
-def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[lib.GaitCycle]:
+def cycles_of_rows(rows: Sequence[Mapping[str, Any]], ref: Mapping[str, Any], trial: str) -> list[Cycle]:
     """Return the library's cycles of rows of GaitCycle.Cycle, with their curves from the file `ref`."""
     from pbl_pipeline.gait.metrics_file import load_curves
 

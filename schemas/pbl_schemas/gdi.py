@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.records import definition, number, to_row
+from pbl_pipeline.results.measures import OF_VISIT, Measure
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, Rows, check_columns, check_row, number, one, row_of, stored_rows, utc_now
+from .rows import InputChanged, Rows, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -119,7 +122,8 @@ class GDI(dj.Computed):
     class Check(dj.Part):
         definition = f"""
         # quality checks of the index
-        {check_columns("index")}
+        -> master
+        {definition(Quality, "index")}
         """
 
     @property
@@ -162,7 +166,7 @@ class GDI(dj.Computed):
             for c in result.cycles
         )
         self.Profile.insert({**key, **row} for row in profile_rows(result.profile, "gdi"))
-        self.Check.insert({**key, **check_row("index", check)} for check in result.qc)
+        self.Check.insert({**key, **to_row(check, "index")} for check in result.qc)
 
 
 @schema
@@ -214,9 +218,8 @@ class SessionGdi(dj.Computed):
         definition = f"""
         # every measure with both sides and its spread
         {gait.measure_columns("session_measure")}
-        session_measure_error=null : float64   # in the unit (see session_measure): standard deviation of the error of the mean
-        session_measure_minimal_change=null : float64  # in the unit (see session_measure): minimal detectable change (90 percent)
-        """  # noqa: E501
+        {definition(Measure, "session_measure", only=OF_VISIT)}
+        """
 
     class Profile(dj.Part):
         definition = f"""
@@ -227,7 +230,8 @@ class SessionGdi(dj.Computed):
     class Check(dj.Part):
         definition = f"""
         # quality checks of measures and index
-        {check_columns("gdi")}
+        -> master
+        {definition(Quality, "gdi")}
         """
 
     @property
@@ -313,14 +317,10 @@ class SessionGdi(dj.Computed):
             }
         )
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
-        rows = gait.measure_rows(measures.measures, measures.reasons, prefix="session_measure")
-        for row in rows:
-            own = measures.measures[row["session_measure"]]
-            row["session_measure_error"] = None if own is None else number(own.error_sd)
-            row["session_measure_minimal_change"] = None if own is None else number(own.minimal_change)
+        rows = gait.measure_rows(measures.measures, measures.reasons, "session_measure", without=())
         self.Measure.insert({**key, **row} for row in rows)
         self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
-        self.Check.insert({**key, **check_row("gdi", check)} for check in result.qc)
+        self.Check.insert({**key, **to_row(check, "gdi")} for check in result.qc)
 
 
 #: End of a column of the index -> field of the library's `Gdi`.

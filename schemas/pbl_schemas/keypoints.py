@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline import methods
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.records import definition, number, to_row
 from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import check_columns, check_row, number, one
+from .rows import one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -71,7 +73,8 @@ class Keypoints(dj.Computed):
     class Check(dj.Part):
         definition = f"""
         # quality checks of what was seen
-        {check_columns("keypoints")}
+        -> master
+        {definition(Quality, "keypoints")}
         """
 
     @property
@@ -165,7 +168,7 @@ class Keypoints(dj.Computed):
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }
             )
-        self.Check.insert({**key, **check_row("keypoints", check)} for check in checks)
+        self.Check.insert({**key, **to_row(check, "keypoints")} for check in checks)
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Camera:

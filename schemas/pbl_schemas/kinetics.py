@@ -7,13 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.records import definition, number, to_row
 from pbl_pipeline.temporary import new_folder
 
 from . import capture, fit, gait, gdi, session, study, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import InputChanged, check_columns, check_row, number
+from .rows import InputChanged
 from .stored_files import file_ref
 
 if TYPE_CHECKING:
@@ -113,7 +115,8 @@ class Kinetics(dj.Computed):
     class Check(dj.Part):
         definition = f"""
         # quality checks of the forces
-        {check_columns("forces")}
+        -> master
+        {definition(Quality, "forces")}
         """
 
     @property
@@ -203,7 +206,7 @@ class Kinetics(dj.Computed):
             for v, trial in zip(ids, found.trials, strict=True)
             for c in trial.cycles
         )
-        self.Check.insert({**key, **check_row("forces", check)} for check in found.qc)
+        self.Check.insert({**key, **to_row(check, "forces")} for check in found.qc)
 
 
 #: Column of `Kinetics.Measure` -> attribute of the library's `KineticMeasure`.

@@ -10,8 +10,9 @@ from typing import Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.records import plain
 
-from .rows import one, plain
+from .rows import one
 
 
 def method_columns(prefix: str) -> str:

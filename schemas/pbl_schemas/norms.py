@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label, normalised_label
+from pbl_pipeline.records import plain
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, gait, gdi, lab, session, video
 from .method_names import with_keys
 from .reading.frames import newest_sets
-from .rows import plain
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib

@@ -6,10 +6,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from pbl_pipeline.qc import Check as Quality
+from pbl_pipeline.records import from_row
+
 from . import fit, gait, gdi, keypoints, session  # noqa: F401  a definition refers to session
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import check_values, one
+from .rows import one
 
 schema = dj.Schema()
 
@@ -61,7 +64,10 @@ class SessionQc(dj.Computed):
                 names = keypoints.Keypoints.primary_key
                 of_set = [{k: row[k] for k in names} for row in (fit.FitSet.Video & key).to_dicts()]
             rows = (table & of_set) - (corrected if table is gait.GaitEvents.Check else [])
-            checks = [(row.get("video_id"), check_values(prefix, row)) for row in rows.to_dicts(order_by="KEY")]
+            checks = [
+                (row.get("video_id"), dataclasses.astuple(from_row(Quality, row, prefix)))
+                for row in rows.to_dicts(order_by="KEY")
+            ]
             if table is gait.GaitEvents.Check:
                 checks += [(k["video_id"], dataclasses.astuple(c)) for k in corrected for c in gait.load_events(k).qc]
             for video_id, check in checks:

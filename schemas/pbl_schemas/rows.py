@@ -1,21 +1,17 @@
-"""Values of columns, quality checks as rows, and deletion of rows with their dependent results."""
+"""Rows that agree with a key, and deletion of rows with their dependent results."""
 
 from __future__ import annotations
 
 import datetime
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import pymysql
 
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import REPEAT, columns_read_once, dj
-
-if TYPE_CHECKING:
-    from pbl_pipeline.qc import Check
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -130,30 +126,9 @@ def utc_now() -> datetime.datetime:
     return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
-def number(value: Any) -> float | None:
-    """Return a float for a nullable column: None if the value is missing or not finite."""
-    if value is None:
-        return None
-    value = float(value)
-    return value if np.isfinite(value) else None
-
-
 def or_nan(value: float | None) -> float:
     """Return the number of a nullable column; NaN for NULL."""
     return float("nan") if value is None else float(value)
-
-
-def plain(value: Any) -> Any:
-    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
 
 
 def inside(column: str, values: Iterable[str | int]) -> Any:
@@ -195,32 +170,3 @@ def delete_below(table: Any, keys: Sequence[Mapping[str, Any]]) -> dict[str, int
             if target.connection.in_transaction:  # it keeps seeing the tables as they were
                 raise pymysql.err.OperationalError(REPEAT[0], str(error)) from error
     return counts
-
-
-def check_columns(prefix: str) -> str:
-    """Definition lines of a part table of quality checks; the names carry the prefix for the same reason."""
-    return f"""
-    -> master
-    {prefix}_check           : varchar(64)       # name, with its unit
-    ---
-    {prefix}_check_outcome   : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')
-    {prefix}_check_value=null     : float64      # in the unit (see {prefix}_check)
-    {prefix}_check_threshold=null : float64      # in the unit (see {prefix}_check)
-    {prefix}_check_advice    : varchar(1000)     # what to do about it
-    """
-
-
-def check_row(prefix: str, check: Check) -> dict[str, Any]:
-    """A library `Check` as values of `check_columns(prefix)`."""
-    return {
-        f"{prefix}_check": check.check,
-        f"{prefix}_check_outcome": check.outcome,
-        f"{prefix}_check_value": number(check.value),
-        f"{prefix}_check_threshold": number(check.threshold),
-        f"{prefix}_check_advice": check.advice[:1000],
-    }
-
-
-def check_values(prefix: str, row: Mapping[str, Any]) -> tuple:
-    """The arguments of the library's `Check` from a row of `check_columns(prefix)`."""
-    return tuple(row[f"{prefix}_check{end}"] for end in ("", "_outcome", "_value", "_threshold", "_advice"))

@@ -11,13 +11,14 @@ import numpy as np
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz
+from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
 
 from . import video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .rows import delete_below, inside, number, one, utc_now
+from .rows import delete_below, inside, one, utc_now
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from pbl_pipeline.records import number
+
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import number, one, or_nan
+from .rows import one, or_nan
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:

@@ -10,12 +10,13 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
+from pbl_pipeline.records import number
 from pbl_pipeline.words import UNUSABLE
 
 from . import lab, session  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import Rows, number, one, or_nan, row_of, stored_rows
+from .rows import Rows, one, or_nan, row_of, stored_rows
 
 if TYPE_CHECKING:
     from pbl_pipeline import video as lib

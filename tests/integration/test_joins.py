@@ -92,7 +92,7 @@ def test_the_section_of_joins_names_every_computed_table(visits: None):
 
 
 def test_a_delete_behind_a_restricted_restriction_is_datajoints_own_error(visits: None):
-    """docs/datajoint_delete.md. Where this fails DataJoint has mended it: the page and the way around can go."""
+    """docs/tables.md, Joins. Where this fails DataJoint has mended it: the way around can go."""
     one = session.Session & {"subject": "P001", "session_label": "2026-06-01"}
     for chosen in (gdi.GDI & one, video.VideoInfo & (video.Video & one)):
         with pytest.raises(DataJointError, match=r"Attribute `[a-z_]+` is not found in query"):

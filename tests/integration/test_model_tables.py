@@ -15,12 +15,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import EVENT_METHODS, EventParams
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.records import plain
 from pbl_pipeline.tracking import PersonTrack, Tracking
 from pbl_pipeline.video import probe
 from pbl_schemas import fit, gait, gdi, keypoints, tracking
 from pbl_schemas.intake import Methods, VisitRecord, ingest
 from pbl_schemas.method_rows import insert_methods, resolve_method
-from pbl_schemas.rows import plain
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate

@@ -136,7 +136,7 @@ def test_twenty_workers_share_a_queue(on_mysql: Path, tmp_path: Path):
 
 
 def test_a_minute_of_faults_loses_nothing(root: Path):
-    """docs/mysql.md has ten minutes of the same."""
+    """research/reports/2026-11-29_operations.md has ten minutes of the same."""
     command = [sys.executable, "-m", "research.benchmarks.chaos", "--minutes", "1", "--database", "mysql"]
     done = subprocess.run(command, env=_environment(root), cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -20,6 +20,7 @@ from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
+from pbl_pipeline.records import to_row
 from pbl_pipeline.words import UNUSABLE
 from pbl_schemas import keypoints, session, video
 from pbl_schemas.capture import PhoneLink, PhoneRecording
@@ -29,7 +30,6 @@ from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
 from pbl_schemas.intake.protocols import add_protocol, read_protocol
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.usable import Next, Usable
-from pbl_schemas.rows import check_row
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
 from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
@@ -338,7 +338,7 @@ def test_what_cannot_be_used_is_said_with_what_to_do(visit: int, tmp_path: Path)
     key = keypoints.Keypoints().fetch1("KEY")
     (keypoints.Keypoints.Check & key).delete_quick()
     check = Check("feet_cut_share", "FAIL", 0.4, 0.3, "the feet leave the picture below: tilt the phone or step back")
-    keypoints.Keypoints.Check.insert1({**key, **check_row("keypoints", check)})
+    keypoints.Keypoints.Check.insert1({**key, **to_row(check, "keypoints")})
     said = browser.get("/phone/state.json").json()["recordings"][0]["verdict"]
     assert said.startswith("Film again: the feet leave the picture below: tilt the phone or step back (40%)")
 

@@ -153,7 +153,7 @@ def test_the_letter_is_one_visit_on_a_page(visits: None):
 def test_the_letter_has_the_clinic_the_scores_a_comment_and_the_body(
     visits: None, language: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setenv("PBL_LETTER_HEAD", "Clinic <North> | Station 1, 12345 Town")
+    monkeypatch.setenv("PBL_LETTER_HEAD", "Clinic <North>; Station 1, 12345 Town")
     form = scores_form(2)
     enter_scores(2, form.values | {"role": "6_months", "mJOA": "14"}, "A", form.seen)
     browser = web.client()

@@ -36,7 +36,7 @@ DEPLOYED = ("workers/deploy/Dockerfile", "workers/deploy/kubernetes/kustomizatio
 
 def test_errors_page_lists_exactly_the_codes():
     text = (ROOT / "docs" / "errors.md").read_text()
-    listed = re.findall(r"^\| ([A-Z_]+) \| (\w+) \|", text, re.MULTILINE)
+    listed = re.findall(r"^- \*\*([A-Z_]+)\*\* \((\w+)\)", text, re.MULTILINE)
     assert sorted(listed) == sorted((name, code.cause) for name, code in CODES.items())
 
 

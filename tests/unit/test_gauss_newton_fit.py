@@ -410,6 +410,17 @@ def test_toes_that_were_never_seen_are_told():
     assert "mtp_angle_r" not in advice
 
 
+def test_no_angle_has_a_smaller_error_with_fewer_points(walkers, one_by_one):
+    """Without a third of the points, and without those of the left foot; the points' noise is estimated anew each time,
+    to some percent."""
+    seen, whole = walkers[0].trials[0], one_by_one[0].trials[0]
+    foot = np.array([n in ("LHeel", "LBigToe", "LFoot") or n.startswith(("lf", "lank")) for n in seen.names])
+    for lost in (np.random.default_rng(1).random(len(seen.names)) < 1 / 3, foot):
+        kept = dataclasses.replace(seen, confidence=np.where(lost, 0.0, seen.confidence))
+        part = fit_session([kept], ["a"], PARAMSET).trials[0]
+        assert np.min(np.nanmedian(part.qpos_sd, axis=0) / np.nanmedian(whole.qpos_sd, axis=0)) > 0.97
+
+
 def test_a_second_without_sight_stays_unknown():
     seen = look(5, unseen_s=((1.5, 2.5),))
     trial = fit_session([seen.keypoints], ["a"], PARAMSET).trials[0]

@@ -9,9 +9,10 @@ from collections.abc import Collection, Iterable, Sequence
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS, Check
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents
 
 from .order import comes_next
-from .types import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents, no_events
+from .types import no_events
 
 #: Shortest time between two events of a side (s): a swing or a stance; the fastest walkers swing for 0.25 s.
 SHORTEST_PHASE_S = 0.1

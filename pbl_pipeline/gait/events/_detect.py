@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from pbl_pipeline.gait.motion import FootTrajectories
+from pbl_pipeline.results.events import GaitEvents
 
 from .methods import METHODS
-from .types import GaitEvents
 
 
 def detect_events(feet: FootTrajectories, params: Any = None) -> GaitEvents:

@@ -8,11 +8,12 @@ import numpy as np
 
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, SIDES, GaitEvents
 
 from ._preconditions import check_preconditions
 from .coordinates import Extremum, detect_by_extrema, forward_signals, prominence
 from .signal import Segment, refine_extremum
-from .types import FOOT_DOWN, FOOT_UP, SIDES, EventParams, GaitEvents, no_events
+from .types import EventParams, no_events
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,10 @@ from jaxtyping import Bool
 from pbl_pipeline.bounded import MAX_SECONDS, span_s
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
+from pbl_pipeline.results.events import SIDES
 from pbl_pipeline.sampling import interval_of
 
 from .network.predict import GRID_HZ, MAX_GAP_S, Grid, on_grid
-from .types import SIDES
 
 #: Minimum hip height above the feet (leg lengths); below it the person is lying. Seated people have half a leg or more.
 MIN_HIP_HEIGHT = 0.3

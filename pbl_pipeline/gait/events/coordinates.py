@@ -12,20 +12,12 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import PASS, Check, warn_if
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, SIDES, GaitEvent, GaitEvents
 
 from ._preconditions import check_preconditions
 from .order import Candidate, best_sequence
 from .signal import Segment, refine_extremum, uniform_segments
-from .types import (
-    FOOT_DOWN,
-    FOOT_UP,
-    SIDES,
-    EventParams,
-    GaitEvent,
-    GaitEvents,
-    heading_check,
-    no_events,
-)
+from .types import EventParams, heading_check, no_events
 
 _HEEL, _TOE = slice(0, 2), slice(2, 4)
 

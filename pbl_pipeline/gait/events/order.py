@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from .types import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, EventParams, GaitEvent
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent
+
+from .types import EventParams
 
 
 @dataclasses.dataclass(frozen=True)

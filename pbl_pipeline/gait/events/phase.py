@@ -13,12 +13,13 @@ from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import later
 from pbl_pipeline.qc import PASS, WARN, Check, warn_if
+from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, GaitEvent, GaitEvents
 
 from ._preconditions import check_preconditions, input_error
 from .network.predict import GRID_HZ, check_model, load, predict
 from .order import PLACE, comes_next
 from .phase_filter import FilterParams, SmoothPhases, crossings, smooth_phases
-from .types import FOOT_DOWN, FOOT_UP, GaitEvent, GaitEvents, heading_check, no_events
+from .types import heading_check, no_events
 from .walking import WalkingParams, reach_leg, swing_leg, turns, walking_stretches
 
 #: Order of the model's phases.

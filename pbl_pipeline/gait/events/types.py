@@ -1,4 +1,4 @@
-"""Gait events and the parameters of the detector."""
+"""Parameters of the detector, events of a trial without any, and files of events."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from pathlib import Path
 from pbl_pipeline.bounded import MIB, read_text
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import EMPTY, Check, warn_if
+from pbl_pipeline.results.events import COLUMNS, GaitEvent, GaitEvents
 
-LEFT, RIGHT = "left", "right"
-FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
-SIDES = (LEFT, RIGHT)
-EVENTS = (FOOT_DOWN, FOOT_UP)
-COLUMNS = ("time_s", "side", "event", "probability")
 #: Of a file of events (bytes): some ten thousand.
 _LARGEST = MIB
 
@@ -67,61 +63,6 @@ class EventParams:
     min_foot_downs: int = 2
     foot_down_offset_s: float = 0.0
     foot_up_offset_s: float = 0.0
-
-
-@dataclasses.dataclass(frozen=True)
-class GaitEvent:
-    """One event. `probability` in 0..1 that it is real: calibrated in the event model, only a measure of prominence in
-    the coordinate-based methods; `bout` counts walking bouts from 0."""
-
-    time_s: float
-    side: str
-    event: str
-    probability: float
-    bout: int = 0
-
-    def __post_init__(self) -> None:
-        if self.side not in SIDES or self.event not in EVENTS:
-            raise ValueError(f"side {self.side!r} or event {self.event!r} is not one of {SIDES}, {EVENTS}")
-
-
-@dataclasses.dataclass(frozen=True)
-class GaitEvents:
-    """The events of one trial in order of time.
-
-    `status` is "PASS" or "EMPTY" (no walking, with the `reason`). `params_hash` identifies the parameters, `source` the
-    trajectories ("fit", "keypoints blazepose_33", ...). `walking_s` lists start and end of each bout. `n_candidates`
-    counts candidates before their check, `n_order_breaks` the bouts that ended because an event was missing, or the
-    pairs that are out of order.
-    """
-
-    status: str
-    events: tuple[GaitEvent, ...]
-    reason: str
-    method: str
-    params_hash: str
-    source: str
-    walking_s: tuple[tuple[float, float], ...] = ()
-    n_candidates: int = 0
-    n_order_breaks: int = 0
-    qc: tuple[Check, ...] = ()
-
-    @property
-    def corrected(self) -> bool:
-        """True if a person corrected the detected events."""
-        return any(c.check == "events_by_hand" for c in self.qc)
-
-    def times(self, side: str, event: str) -> list[float]:
-        """Times in seconds of one kind of event."""
-        return [e.time_s for e in self.events if e.side == side and e.event == event]
-
-    def save(self, path: str | Path) -> None:
-        """Write `events.csv`: time_s, side, event, probability. Without walking only the header is written."""
-        with Path(path).open("w", encoding="utf-8", newline="") as f:
-            rows = csv.writer(f, lineterminator="\n")
-            rows.writerow(COLUMNS)
-            for e in self.events:
-                rows.writerow([f"{e.time_s:.4f}", e.side, e.event, f"{e.probability:.3f}"])
 
 
 def no_events(

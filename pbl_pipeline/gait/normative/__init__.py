@@ -1,9 +1,10 @@
 """Normative gait, with which cycles are compared."""
 
+from pbl_pipeline.results.cycles import BODY_ANGLES
+
 from ._schwartz import GRAVITY, gait_norm, harmonic_sum
 from .norm import (
     ANGLE_MODELS,
-    BODY_ANGLES,
     DEFAULT_NORM,
     MIN_VECTORS,
     NINE_ANGLES,

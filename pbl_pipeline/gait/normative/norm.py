@@ -15,6 +15,7 @@ import numpy as np
 from pbl_pipeline.bounded import parse_json, read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json, structured
+from pbl_pipeline.results.cycles import BODY_ANGLES
 
 #: The original index (Schwartz & Rozumalski 2008): nine angles x 51 points.
 NINE_ANGLES: tuple[str, ...] = (
@@ -32,9 +33,6 @@ NINE_ANGLES: tuple[str, ...] = (
 THREE_ANGLES: tuple[str, ...] = ("hip_flexion", "hip_adduction", "knee_flexion")
 
 
-#: Angles of the fitted body: the pelvis' forward axis is level in neutral standing, because Delp's frame of the pelvis
-#: (OpenSim's) has its frontal plane through the anterior spines and the pubic symphysis.
-BODY_ANGLES = "pbl_body"
 #: Angles of a laboratory marker model of Plug-in-Gait kind: the pelvis' forward axis runs from the posterior to the
 #: anterior spines and falls forward in neutral standing.
 PLUG_IN_GAIT = "plug_in_gait"

@@ -20,10 +20,11 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
+from pbl_pipeline.records import number
 
 from .. import keypoints, lab, video
 from ..jobs import forget_errors
-from ..rows import delete_below, number, utc_now
+from ..rows import delete_below, utc_now
 from ..transactions import in_transaction, next_id
 
 if TYPE_CHECKING:

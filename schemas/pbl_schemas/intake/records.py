@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_height, check_label, check_mass, is_plain, normalised_label
+from pbl_pipeline.records import number
 
 from .. import fit, gait, gdi, kinetics, lab, linking, session, video
-from ..rows import counted, delete_below, inside, number, utc_now
+from ..rows import counted, delete_below, inside, utc_now
 from ..session import UNLABELLED
 from ..subject_codes import check_subject, day_of
 from ..transactions import next_id

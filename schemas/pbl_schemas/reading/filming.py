@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.filming import Filming, height_word, known, picture_class, stated, views_of
+from pbl_pipeline.records import number
 
 from .. import fit, gait, gdi, keypoints, study, video
-from ..rows import number
 
 
 def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline.records import from_row, number
+
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
-from ..rows import Rows, check_values, number, or_nan, row_of, stored_rows
+from ..rows import Rows, or_nan, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -103,7 +105,7 @@ def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
 def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
     from pbl_pipeline.qc import Check, in_order
 
-    return list(in_order(Check(*check_values(prefix, row)) for row in rows))
+    return list(in_order(from_row(Check, row, prefix) for row in rows))
 
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:

@@ -18,6 +18,7 @@ from typing import Any
 
 from pbl_pipeline.filming import VIEW, Difference, Filming, differences
 from pbl_pipeline.qc import CADENCE
+from pbl_pipeline.records import number
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..datajoint_setup import dj
@@ -25,7 +26,7 @@ from ..decisions.review_decisions import is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision
-from ..rows import inside, number
+from ..rows import inside
 from .filming import filming_of
 from .status import queue_name, queues
 

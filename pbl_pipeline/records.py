@@ -1,0 +1,162 @@
+"""Results as rows: the fields of a frozen dataclass declare their columns, and rows follow from them.
+
+    @dataclasses.dataclass(frozen=True)
+    class GaitEvent:
+        time_s: Annotated[float, Column("event_time", "float64", "(s) time of the trial")]
+
+`definition` returns the lines of a DataJoint table, `to_row` the values of one record, `from_row` the record of a row.
+Names, types and comments are DataJoint's; "{}" in a name or a comment stands for the prefix of the table, where several
+tables hold the same class. The columns of a field that is a declared dataclass itself stand in the same row.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import re
+import types
+import typing
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Callable)
+
+
+class Column(NamedTuple):
+    """Column of a field."""
+
+    name: str
+    type: str  # of DataJoint, such as float64 or varchar(64)
+    comment: str = ""  # (unit) meaning
+    null: bool = False  # NULL for None, "" and what is not finite
+    empty: bool = False  # '' in the rows that were there when it was added
+    key: bool = False  # in the primary key of the table
+    before: str = ""  # field before whose column it stands; "": in the order of the fields
+
+
+class Declared(NamedTuple):
+    """A column with the fields that lead to its value, and the type of that; None for a property, which is not read."""
+
+    path: tuple[str, ...]
+    column: Column
+    annotation: Any
+
+
+def stored(name: str, type: str, comment: str = "", *, before: str) -> Callable[[F], F]:
+    """Decorate the function of a property that has a column too, which is written and not read."""
+
+    def mark(function: F) -> F:
+        function.__dict__["column"] = Column(name, type, comment, before=before)
+        return function
+
+    return mark
+
+
+@functools.cache
+def declared(cls: type) -> tuple[Declared, ...]:
+    """Return the columns of a class in order."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    found: list[Declared] = []
+    for field in dataclasses.fields(cls):
+        kind, *more = typing.get_args(hints[field.name]) or (hints[field.name],)
+        if own := next((m for m in more if isinstance(m, Column)), None):
+            found.append(Declared((field.name,), own, kind))
+        elif dataclasses.is_dataclass(kind):
+            found += [d._replace(path=(field.name, *d.path)) for d in declared(typing.cast("type", kind))]
+    for name, member in vars(cls).items():
+        if isinstance(member, property) and (own := getattr(member.fget, "column", None)):
+            found.append(Declared((name,), own, None))
+    for d in [d for d in found if len(d.path) == 1 and d.column.before]:
+        found.remove(d)
+        at = next((i for i, other in enumerate(found) if other.path[0] == d.column.before), len(found))
+        found.insert(at, d)
+    return tuple(found)
+
+
+def definition(cls: type, prefix: str = "", without: Collection[str] = (), only: Collection[str] = ()) -> str:
+    """Return the lines of a DataJoint definition for the columns of a class; those of the key end with "---".
+
+    `without`, `only`: names of fields that this table does not have, and that are asked for.
+    """
+    own = [d.column for d in declared(cls) if d.path[0] not in without and (not only or d.path[0] in only)]
+    keys, values = ([_line(c, prefix) for c in own if c.key == key] for key in (True, False))
+    return "\n".join([*keys, "---", *values] if keys else values)
+
+
+def _line(c: Column, prefix: str) -> str:
+    default = "=null" if c.null else "=''" if c.empty else ""
+    comment = f"  # {c.comment.format(prefix)}" if c.comment else ""
+    return f"{c.name.format(prefix)}{default} : {c.type}{comment}"
+
+
+def to_row(record: Any, prefix: str = "", without: Collection[str] = ()) -> dict[str, Any]:
+    """Return the values of a record by column: texts as long as their column, numbers as plain Python's."""
+    return {
+        c.name.format(prefix): _stored(functools.reduce(getattr, path, record), c)
+        for path, c, _ in declared(type(record))
+        if path[0] not in without
+    }
+
+
+def from_row(cls: type[T], row: Mapping[str, Any], prefix: str = "", **others: Any) -> T:
+    """Return the record of a row.
+
+    Parameters
+    ----------
+    row
+        Values by column. A field whose column is not there keeps its default: a table may hold fewer of them.
+    others
+        Values of the fields without a column.
+    """
+    own, nested = dict(others), dict[str, dict[str, Any]]()
+    for path, c, annotation in declared(cls):
+        name = c.name.format(prefix)
+        if annotation is not None and name in row:
+            group = own if len(path) == 1 else nested.setdefault(path[0], {})
+            group[path[-1]] = _read(row[name], annotation)
+    hints = typing.get_type_hints(cls)
+    return cls(**own, **{name: hints[name](**of) for name, of in nested.items()})
+
+
+def number(value: Any) -> float | None:
+    """Return a float for a nullable column: None if the value is missing or not finite."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def plain(value: Any) -> Any:
+    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _stored(value: Any, c: Column) -> Any:
+    if c.type == "json":
+        return plain(value)
+    if c.null and (value is None or value == ""):
+        return None
+    if c.type.startswith("float"):
+        return number(value) if c.null else float(value)
+    if c.type.startswith("int"):
+        return int(value)
+    if longest := re.fullmatch(r"varchar\((\d+)\)", c.type):
+        return str(value)[: int(longest[1])]
+    return bool(value) if c.type == "bool" else value
+
+
+def _read(value: Any, annotation: Any) -> Any:
+    """A stored value as the type of its field: NULL is None where the field may be, else NaN, 0 or ""."""
+    optional = isinstance(annotation, types.UnionType)
+    kind = next(a for a in typing.get_args(annotation) if a is not type(None)) if optional else annotation
+    kind = typing.get_origin(kind) or kind
+    if value is None:
+        return None if optional else math.nan if kind is float else kind()
+    return kind(value)

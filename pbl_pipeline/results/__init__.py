@@ -1,0 +1,1 @@
+"""What a computation returns: frozen records, each with the columns of its row."""
