@@ -314,7 +314,7 @@ def test_every_refusal_of_a_page_has_its_german(file: str):
 
 
 def refusals() -> Iterator[tuple[str, str, str]]:
-    """Code, found and next step of every error that library and tables can raise, with numbers for what is filled in."""
+    """Code, found and next step of every error of library and tables, with numbers for what is filled in."""
     for file in files("pbl_pipeline", "pbl_schemas"):
         for node in nodes(file):
             if not isinstance(node, ast.Call) or not any(k.arg == "next_step" for k in node.keywords):
