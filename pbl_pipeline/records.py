@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import re
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping
@@ -39,11 +38,13 @@ class Column(NamedTuple):
 
 
 class Declared(NamedTuple):
-    """A column with the fields that lead to its value, and the type of that; None for a property, which is not read."""
+    """A column with the fields that lead to its value, and how that is written to a row and read from it."""
 
     path: tuple[str, ...]
     column: Column
-    annotation: Any
+    write: Callable[[Any], Any]
+    read: Callable[[Any], Any] | None  # None: a property, which is not read
+    missing: Any = None  # value of the field for NULL
 
 
 def stored(name: str, type: str, comment: str = "", *, before: str) -> Callable[[F], F]:
@@ -62,14 +63,15 @@ def declared(cls: type) -> tuple[Declared, ...]:
     hints = typing.get_type_hints(cls, include_extras=True)
     found: list[Declared] = []
     for field in dataclasses.fields(cls):
-        kind, *more = typing.get_args(hints[field.name]) or (hints[field.name],)
+        hint = hints[field.name]
+        kind, *more = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
         if own := next((m for m in more if isinstance(m, Column)), None):
-            found.append(Declared((field.name,), own, kind))
+            found.append(Declared((field.name,), own, _writer(own), *_reader(kind)))
         elif dataclasses.is_dataclass(kind):
             found += [d._replace(path=(field.name, *d.path)) for d in declared(typing.cast("type", kind))]
     for name, member in vars(cls).items():
         if isinstance(member, property) and (own := getattr(member.fget, "column", None)):
-            found.append(Declared((name,), own, None))
+            found.append(Declared((name,), own, _writer(own), None))
     for d in [d for d in found if len(d.path) == 1 and d.column.before]:
         found.remove(d)
         at = next((i for i, other in enumerate(found) if other.path[0] == d.column.before), len(found))
@@ -95,11 +97,14 @@ def _line(c: Column, prefix: str) -> str:
 
 def to_row(record: Any, prefix: str = "", without: Collection[str] = ()) -> dict[str, Any]:
     """Return the values of a record by column: texts as long as their column, numbers as plain Python's."""
-    return {
-        c.name.format(prefix): _stored(functools.reduce(getattr, path, record), c)
-        for path, c, _ in declared(type(record))
-        if path[0] not in without
-    }
+    row = {}
+    for path, c, write, *_ in declared(type(record)):
+        if path[0] not in without:
+            value = record
+            for field in path:
+                value = getattr(value, field)
+            row[c.name.format(prefix) if prefix else c.name] = write(value)
+    return row
 
 
 def from_row(cls: type[T], row: Mapping[str, Any], prefix: str = "", **others: Any) -> T:
@@ -113,13 +118,27 @@ def from_row(cls: type[T], row: Mapping[str, Any], prefix: str = "", **others: A
         Values of the fields without a column.
     """
     own, nested = dict(others), dict[str, dict[str, Any]]()
-    for path, c, annotation in declared(cls):
-        name = c.name.format(prefix)
-        if annotation is not None and name in row:
+    for path, c, _, read, missing in declared(cls):
+        name = c.name.format(prefix) if prefix else c.name
+        if read is not None and name in row:
             group = own if len(path) == 1 else nested.setdefault(path[0], {})
-            group[path[-1]] = _read(row[name], annotation)
-    hints = typing.get_type_hints(cls)
-    return cls(**own, **{name: hints[name](**of) for name, of in nested.items()})
+            value = row[name]
+            group[path[-1]] = missing if value is None else read(value)
+    return cls(**own, **{name: _hints(cls)[name](**of) for name, of in nested.items()})
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
+
+
+def _reader(kind: Any) -> tuple[Callable[[Any], Any], Any]:
+    """Return the type of a field, and what NULL means there: None if it may be that, else NaN, 0 or ""."""
+    optional = isinstance(kind, types.UnionType)
+    if optional:
+        kind = next(a for a in typing.get_args(kind) if a is not type(None))
+    kind = typing.get_origin(kind) or kind
+    return kind, None if optional else math.nan if kind is float else kind()
 
 
 def number(value: Any) -> float | None:
@@ -138,25 +157,18 @@ def plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _stored(value: Any, c: Column) -> Any:
+def _writer(c: Column) -> Callable[[Any], Any]:
+    """Return the function that makes the value of a column."""
     if c.type == "json":
-        return plain(value)
-    if c.null and (value is None or value == ""):
-        return None
+        return plain
     if c.type.startswith("float"):
-        return number(value) if c.null else float(value)
-    if c.type.startswith("int"):
-        return int(value)
-    if longest := re.fullmatch(r"varchar\((\d+)\)", c.type):
-        return str(value)[: int(longest[1])]
-    return bool(value) if c.type == "bool" else value
+        return number if c.null else float
+    kind: Callable[[Any], Any] = {"int": int, "bool": bool}.get(c.type.rstrip("0123456789"), _same)
+    if c.type.startswith("varchar"):
+        longest = int(c.type[8:-1])
+        kind = lambda value: str(value)[:longest]  # noqa: E731
+    return (lambda value: None if value is None or value == "" else kind(value)) if c.null else kind
 
 
-def _read(value: Any, annotation: Any) -> Any:
-    """A stored value as the type of its field: NULL is None where the field may be, else NaN, 0 or ""."""
-    optional = isinstance(annotation, types.UnionType)
-    kind = next(a for a in typing.get_args(annotation) if a is not type(None)) if optional else annotation
-    kind = typing.get_origin(kind) or kind
-    if value is None:
-        return None if optional else math.nan if kind is float else kind()
-    return kind(value)
+def _same(value: T) -> T:
+    return value
