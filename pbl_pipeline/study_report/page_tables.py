@@ -194,7 +194,8 @@ def table2(results: StudyResults) -> PageTable:
     """The paper's Table 2: repeatability over cycles, correlation with the scores, effect size of change."""
     plan, marks = results.plan, _Marks()
     rows: list[dict[Any, str]] = []
-    persons_of = results.validity.groupby("score")["persons"].unique()  # all, and the changing group if not the same
+    # All, and the changing group if that is not the same.
+    persons_of = {s: list(dict.fromkeys(rows["persons"])) for s, rows in results.validity.groupby("score")}
     for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
         for i, name in enumerate(names):
             row: dict[Any, str] = {("", ""): "" if i else kind, (" ", "Measure"): short_of(name)}

@@ -208,7 +208,7 @@ def test_an_instrument_is_added_in_a_browser(own: None, chromium: Any, language:
         page.get_by_role("button", name=saved).click()
         page.get_by_role("alert").wait_for()
         assert page.locator(".problem").get_attribute("data-code") == "SHEET_FORMAT"
-        assert ("Ein leeres Feld." if language == "de" else "An empty field.") in page.locator(".problem").inner_text()
+        assert ("ein leeres Feld." if language == "de" else "an empty field.") in page.locator(".problem").inner_text()
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.locator("#instrument_unit").fill("Punkte" if language == "de" else "points")
         page.get_by_role("button", name=saved).click()
