@@ -184,6 +184,8 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
 #: Functions that return the coded error for an exception of a package that the library does not know, else None; rooms
 #: above the library add theirs.
 CODERS: list[Callable[[BaseException], PblError | None]] = []
+#: Called where a person interrupts a command.
+INTERRUPTS: list[Callable[[], None]] = []
 
 
 @contextlib.contextmanager

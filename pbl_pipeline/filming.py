@@ -7,6 +7,8 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 
+from pbl_pipeline.texts import code_of
+
 #: Least fraction of a recording's cycles that makes a side a view (a turn at the end is not one), and that makes front
 #: or back one: a pass along the camera's axis begins and ends obliquely.
 SIDE_SHARE, FRONT_SHARE = 0.25, 0.5
@@ -24,10 +26,11 @@ _VIEWS = {"right": "left", "left": "right"}  # the camera is on the other side o
 class Filming:
     """Filming conditions of the pooled walks of a visit. Each field is sorted, and empty if it is not known.
 
-    views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: as stated of
-    the visit, none where nothing is; paces: of the walks; height: whether the body height was stated ("stated" or
-    "not_stated"); cameras: kinds of sources of the intrinsics (`video.CAMERA_KINDS`); pictures: classes of the size of
-    the picture, such as "1080p"; far_leg: the leg behind the other in most cycles (`gait.far_leg_of`).
+    views: sides from which one camera saw the person, "left", "right" and `FRONT_OR_BACK`; aid, orthosis: codes or
+    words as stated of the visit, "none" where it is stated that there was none; paces: of the walks; height: whether
+    the body height was stated ("stated" or "not_stated"); cameras: kinds of sources of the intrinsics
+    (`video.CAMERA_KINDS`); pictures: classes of the size of the picture, such as "1080p"; far_leg: the leg behind the
+    other in most cycles (`gait.far_leg_of`).
     """
 
     views: tuple[str, ...] = ()
@@ -49,23 +52,25 @@ class Difference:
     before: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        values = f" ({', '.join(self.now) or 'none'}, before: {', '.join(self.before) or 'none'})"
+        values = f" ({', '.join(self.now) or 'not stated'}, before: {', '.join(self.before) or 'not stated'})"
         return self.what + (values if self.now or self.before else "")
 
 
 def differences(now: Filming, before: Filming) -> tuple[Difference, ...]:
     """Return the differences in how two visits were filmed. A property that is unknown in one of them is not compared,
-    except that an aid or orthosis stated in one visit alone is a difference."""
+    except that an aid or orthosis (not that there was none) stated in one visit alone is a difference."""
     pairs = zip(WHAT, _compared(now), _compared(before), strict=True)
     return tuple(
-        Difference(what, a, b) for what, a, b in pairs if a != b and ((a and b) or what in ("aid", "orthosis"))
+        Difference(what, a, b)
+        for what, a, b in pairs
+        if a != b and ((a and b) or (what in ("aid", "orthosis") and (a or b) != ("none",)))
     )
 
 
-def stated(text: str) -> tuple[str, ...]:
-    """Return an aid or orthosis as stated of a visit; empty for none."""
-    word = " ".join(text.split()).lower()
-    return () if word in ("", "no", "none") else (word,)
+def stated(kind: str, text: str) -> tuple[str, ...]:
+    """Return the code of an "aid" or "orthosis" as stated of a visit, or its words; empty where nothing is stated."""
+    word = " ".join(code_of(kind, text).split()).lower()
+    return (word,) if word else ()
 
 
 def height_word(height_m: float | None) -> str:

@@ -48,6 +48,43 @@ def text(language: str, name: str, /, **values: Any) -> str:
     return catalogue()[name][language].format(**values)
 
 
+@functools.cache
+def _words(kind: str) -> dict[str, str]:
+    """Every word of a kind of codes, in all languages and as the code itself -> its code."""
+    of_kind = {
+        n.removeprefix(f"coded.{kind}_"): said for n, said in catalogue().items() if n.startswith(f"coded.{kind}_")
+    }
+    spoken = {_folded(word): code for code, said in of_kind.items() for word in "|".join(said.values()).split("|")}
+    return spoken | {_folded(code): code for code in of_kind}
+
+
+def _folded(words: str) -> str:
+    return " ".join(words.casefold().replace("_", " ").replace("-", " ").split())
+
+
+def codes(kind: str) -> tuple[str, ...]:
+    """Return the codes of a kind ("aid", "orthosis", "population", "role", "pace", "activity") that have words."""
+    return tuple(dict.fromkeys(_words(kind).values()))
+
+
+def code_of(kind: str, words: str) -> str:
+    """Return the code that words of any language state, such as "walker" of "Rollator", "6_weeks" of "6 Wochen"; other
+    words as they are."""
+    folded = _folded(words)
+    number, _, unit = folded.partition(" ")
+    if kind == "role" and re.fullmatch("[0-9]{1,4}", number) and unit in _words("unit"):
+        return f"{int(number)}_{_words('unit')[unit]}{'' if int(number) == 1 else 's'}"
+    return _words(kind).get(folded, words)
+
+
+def coded(language: str, kind: str, code: str) -> str:
+    """Return the words of a code in a language; a code without words as it is."""
+    number, _, unit = code.partition("_")
+    if kind == "role" and number.isdigit() and (one := _words("unit").get(unit)) is not None:
+        return f"{number} {catalogue()[f'coded.unit_{one}'][language].split('|')[int(number) != 1]}"
+    return catalogue().get(f"coded.{kind}_{code}", {}).get(language, code).split("|")[0]
+
+
 def library_words(language: str, english: str) -> str:
     """Return an English text of the library in a language, unchanged if it is not in the catalogue."""
     found = _library_words(language, english)

@@ -44,7 +44,7 @@ N_COMPONENTS = 20
 #: `research.benchmarks.kinetics_phone` falls to 0.6 in this time.
 ERROR_MEMORY_S = 0.02
 #: Chosen by the least error of the vertical force of tuning persons, here and in `research.benchmarks.kinetics_phone`
-#: (docs/kinetics.md).
+#: (research/reports/2026-11-29_forces.md).
 CHOSEN = {
     "step_sd": 0.04,
     "step_memory_s": 0.06,

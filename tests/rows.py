@@ -131,3 +131,13 @@ def copies(video_id: int, n: int, first: int = 0) -> None:
                 f"INSERT IGNORE INTO {catalog.quote(*table)} ({', '.join(map(catalog.quote, names))}) "
                 f"{counted} SELECT {values} FROM {catalog.quote(*table)} AS t, more WHERE t.video_id = {video_id}"
             )
+
+
+def remove_copy(video_id: int) -> None:
+    """Remove a video of `copies` with its rows in every table that names it."""
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("SET foreign_key_checks = 0")
+        for table, columns in catalog.tables().items():
+            if "video_id" in [c.name for c in columns]:
+                cursor.execute(f"DELETE FROM {catalog.quote(*table)} WHERE video_id = {video_id}")
+        server.commit()

@@ -14,7 +14,7 @@ import click
 
 from pbl_pipeline import progress, temporary
 from pbl_pipeline.code_version import code_version
-from pbl_pipeline.errors import CODERS, PblError
+from pbl_pipeline.errors import CODERS, INTERRUPTS, PblError
 from pbl_pipeline.extras import absent
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
@@ -109,6 +109,8 @@ def main() -> None:
         sys.exit(error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
+        for end in INTERRUPTS:
+            end()
         sys.exit(EXIT_INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - every error gets a next step instead of a traceback
         _explain(error)

@@ -134,7 +134,14 @@ class GaitMetrics(SessionMetrics):
     @property
     def outcome(self) -> str:
         """The worst of `checks`, as report and tables judge it."""
-        return max((in_session(c.outcome, self.status == PASS) for c in self.checks), key=OUTCOMES.index, default=PASS)
+        return max(map(self.in_session, self.checks), key=OUTCOMES.index, default=PASS)
+
+    def in_session(self, check: Check) -> str:
+        """Return the outcome of one of `checks` as it counts for the session (`qc.in_session`)."""
+        counted = {t.name for t in self.trials if any(c.used for c in t.cycles)}
+        own = {t.name for t in self.trials if check in t.events.qc or check.check.endswith(f" ({t.name})")}
+        # Without a counted trial, such as in a folder without cycles, it is not known which recording counts.
+        return in_session(check.outcome, self.status == PASS, not (own and counted) or bool(own & counted))
 
     def to_dict(self) -> dict:
         """The content of metrics.json."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from pbl_pipeline.names import check_label
 from pbl_pipeline.results.events import LEFT, RIGHT, SIDES
+from pbl_pipeline.texts import code_of
 
 from .normative import NINE_ANGLES, NormativeSet
 
@@ -94,8 +95,8 @@ _WALKING = ("walk", "gait", "overground")
 class Condition:
     """Activity and pace of a trial. Unknown counts as walking, and as the pace that the person chose.
 
-    Case, spaces and hyphens make no difference: "Sit-to-stand" is "sit_to_stand". Raises `PblError` USAGE for a label
-    of more than 32 characters.
+    Case, spaces, hyphens and the language make no difference: "Sit-to-stand" is "sit_to_stand". Raises `PblError`
+    USAGE for a label of more than 32 characters.
     """
 
     activity: str = UNKNOWN
@@ -103,7 +104,8 @@ class Condition:
 
     def __post_init__(self) -> None:
         for name in ("activity", "pace"):
-            text = "_".join(str(getattr(self, name) or UNKNOWN).lower().replace("-", " ").replace("_", " ").split())
+            stated = code_of(name, str(getattr(self, name) or UNKNOWN))
+            text = "_".join(stated.lower().replace("-", " ").replace("_", " ").split())
             check_label(name, text, 32)
             object.__setattr__(self, name, text or UNKNOWN)
 

@@ -20,6 +20,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, Check, in_order, warn_if
 from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
+from pbl_pipeline.texts import code_of
 
 from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
 from .ground import GroundReaction, contact_of, ground_reaction, needed_vertical
@@ -82,7 +83,7 @@ MAX_RESIDUAL_BW = 0.15
 #: An asymmetry that is less certain than this is left out (percent).
 MAX_ASYMMETRY_SD = 30.0
 #: Words of an aid that carries no weight.
-_NO_AID = ("", "none", "no", "unknown")
+_NO_AID = ("", "none", "unknown")
 _SIDED = tuple(n for n in MEASURES if n != "centre_of_mass_excursion_m")
 
 
@@ -157,7 +158,7 @@ def trial_kinetics(fit: TrialFit, gait: Walk, params: KineticsParams, *, aid: st
 
 
 def _code_against(fit: TrialFit, gait: Walk, aid: str) -> str:
-    if aid.strip().lower() not in _NO_AID:
+    if code_of("aid", aid).strip().lower() not in _NO_AID:
         return "AID"
     if why_no_lengths(fit):
         return "MOVING_CAMERA"

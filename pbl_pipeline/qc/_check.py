@@ -43,10 +43,10 @@ def worst(checks: Iterable[Check]) -> str:
     return max((c.outcome for c in checks), key=OUTCOMES.index, default=PASS)
 
 
-def in_session(outcome: str, measured: bool) -> str:
-    """Return a recording's outcome as it counts for its session: EMPTY (no gait, no index) is only a warning if the
-    session has measures."""
-    return WARN if measured and outcome == EMPTY else outcome
+def in_session(outcome: str, measured: bool, counts: bool = True) -> str:
+    """Return a recording's outcome as it counts for its session: EMPTY (no gait, no index), and FAIL of a recording
+    without a cycle that counts (not `counts`), are only warnings if the session has measures."""
+    return WARN if measured and (outcome == EMPTY or (outcome == FAIL and not counts)) else outcome
 
 
 def failed(fit_checks: Iterable[Check]) -> tuple[str, ...]:

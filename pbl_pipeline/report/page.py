@@ -27,7 +27,7 @@ from pbl_pipeline.gait import (
     worth_of_one_more,
 )
 from pbl_pipeline.keypoints import confidence_text, visibility
-from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check, in_session
+from pbl_pipeline.qc import EMPTY, FAIL, NEEDS_CHOICE, OUTCOMES, PASS, WARN, Check
 from pbl_pipeline.report import _figures
 from pbl_pipeline.report._figures import Picture
 from pbl_pipeline.report.forces import forces_section
@@ -125,7 +125,7 @@ def _checks(visit: Visit, recordings: Sequence[Recording]) -> list[Check]:
 def _verdict(visit: Visit, recordings: Sequence[Recording], checks: list[Check]) -> dict:
     metrics = visit.measures
     measured = metrics is not None and metrics.status == PASS
-    outcomes = [in_session(c.outcome, measured) for c in checks]
+    outcomes = [c.outcome if metrics is None else metrics.in_session(c) for c in checks]
     outcome = max(outcomes, key=OUTCOMES.index, default=PASS)
     if metrics is None and outcome in (PASS, WARN, EMPTY):
         outcome = FAIL

@@ -1,1 +1,5 @@
 """What a computation returns: frozen records, each with the columns of its row."""
+
+from .cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
+from .events import EVENTS, FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
+from .measures import OF_VISIT, Z90, Measure

@@ -170,9 +170,10 @@ class Visit:
 
     @property
     def filming(self) -> Filming:
-        """Filming conditions of the pooled recordings; aid and orthosis are only stated in tables. Loads the fits and
-        raises as `Recording.fit`."""
-        pooled = [r for r in self.fitted if r.measured is not None and r.measured.pooled]
+        """Filming conditions of the pooled recordings with a cycle that counts; aid and orthosis are only stated in
+        tables. Loads the fits and raises as `Recording.fit`."""
+        measured = [r for r in self.fitted if r.measured is not None and r.measured.pooled]
+        pooled = [r for r in measured if any(c.used for c in r.cycles)]
         fits = [r.fit for r in pooled if r.fit is not None]
         one_camera = self.kind == "single"
         return Filming(

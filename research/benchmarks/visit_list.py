@@ -28,7 +28,8 @@ def recordings(n_visits: int) -> Iterator[Any]:
     for i, one in enumerate(queue.recordings(0, n_visits * queue.EACH)):
         visit = i // queue.EACH
         label = f"{datetime.date(2020, 1, 1) + datetime.timedelta(days=visit % 2000)}-{visit % VISITS_EACH}"
-        yield dataclasses.replace(one, subject=f"S{visit // VISITS_EACH:07d}", session_label=label)
+        one.visit = dataclasses.replace(one.visit, subject=f"S{visit // VISITS_EACH:07d}", session_label=label)
+        yield one
 
 
 def spread(n_visits: int) -> None:
@@ -40,11 +41,11 @@ def spread(n_visits: int) -> None:
     query(f"UPDATE {sessions} SET session_date = DATE('2020-01-01') + INTERVAL (session_id %% 2000) DAY")
     roles = "ELT(1 + session_id %% 5, 'pre', '6_weeks', '3_months', '6_months', '12_months')"
     visits = study.Visit.full_table_name
-    query(f"INSERT INTO {visits} (session_id, visit_role, intervention, assistive_device, orthosis, visit_note)"
+    query(f"INSERT IGNORE INTO {visits} (session_id, visit_role, intervention, assistive_device, orthosis, visit_note)"
           f" SELECT session_id, {roles}, '', '', '', '' FROM {sessions}")  # fmt: skip
-    study.Cohort.insert([{"cohort": "spine"}, {"cohort": "hip"}])
+    study.Cohort.insert([{"cohort": "spine"}, {"cohort": "hip"}], skip_duplicates=True)
     for cohort, of_ten in (("spine", 4), ("hip", 7)):
-        query(f"INSERT INTO {members} (cohort, subject, member_included, member_group, member_reason)"
+        query(f"INSERT IGNORE INTO {members} (cohort, subject, member_included, member_group, member_reason)"
               f" SELECT '{cohort}', subject, 1, '', '' FROM {lab.Subject.full_table_name}"
               f" WHERE MOD(CRC32(subject), 10) < {of_ten}")  # fmt: skip
     index = "session_gdi = 60 + MOD(CRC32(fit_set), 400) / 10, session_gdi_sd = 3, session_gdi_minimal_change = 7"

@@ -2,6 +2,7 @@
 
     python -m research.benchmarks.workers scale              # 300,000 videos: register, status, refresh, cost per job
     python -m research.benchmarks.workers speed              # jobs a second of 1 to 4 workers on 5,000 keys
+    python -m research.benchmarks.workers take               # a job taken against DataJoint's reserve
     python -m research.benchmarks.workers method             # a new parameter set over 10,000 fitted sessions
     python -m research.benchmarks.workers memory             # a worker's memory over 500 jobs
     python -m research.benchmarks.workers long               # 300 videos with one of two hours among them
@@ -23,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -162,8 +163,9 @@ def _computed(table: Any) -> tuple[int, float]:
     return int(n), float(total or 0.0)
 
 
-def copy_results(first_session: int, last_session: int) -> None:
-    """Give sessions the rows of session 1, in the tables that the queue reads, without the parts it does not read."""
+def copy_results(first_session: int, last_session: int, parts: bool = False) -> None:
+    """Give sessions the rows of session 1, in the tables that the queue reads. `parts`: also in those that lists of
+    visits read, of cycles, measures and checks."""
     from pbl_schemas import fit, gait, gdi, keypoints, qc, tracking, video
 
     copied = (
@@ -183,6 +185,7 @@ def copy_results(first_session: int, last_session: int) -> None:
         gdi.GDI,
         gdi.SessionGdi,
         qc.SessionQc,
+        *((gait.GaitCycle.Cycle, gdi.SessionGdi.Measure, qc.SessionQc.Check) if parts else ()),
     )
     first = max(first_session, 1)
     template = _first_set()
@@ -194,7 +197,8 @@ def copy_results(first_session: int, last_session: int) -> None:
             "`session_id`": "t.session_id + s.seq",
             "`fit_set`": "s.name",
         }
-        where = "t.fit_set = %s" if "fit_set" in table.heading.names else f"t.video_id <= {EACH} AND %s != ''"
+        of_first = f"t.video_id < {_first(video.Video, 'video_id') + EACH} AND %s != ''"
+        where = "t.fit_set = %s" if "fit_set" in table.heading.names else of_first
         table.connection.query(
             f"INSERT INTO {table.full_table_name} ({','.join(names)})"
             f" SELECT {','.join(values.get(n, f't.{n}') for n in names)} FROM {table.full_table_name} AS t"
@@ -205,26 +209,34 @@ def copy_results(first_session: int, last_session: int) -> None:
 
 def _names_of_sets(first: int, last: int) -> str:
     """A temporary table of the sessions `range(first, last)` and the names that planning would give their sets."""
-    from pbl_schemas import fit
+    from pbl_schemas import fit, session
     from pbl_schemas.plan import fit_set_hash
 
     methods = (fit.FitSet.Video & {"fit_set": _first_set()}).to_dicts(limit=1)[0]
+    number = _first(session.Session, "session_id")
     name = f"`{fit.FitSet.database}`.`names_of_sets`"
     query = fit.FitSet.connection.query
     query(f"CREATE OR REPLACE TEMPORARY TABLE {name} (seq INT PRIMARY KEY, name CHAR(16))")
     for start in range(first, last, 1000):
         values = []
         for i in range(start, min(start + 1000, last)):
-            rows = [{"video_sha256": r.sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
-            values += [i, fit_set_hash({**methods, "session_id": 1 + i}, rows)]
+            rows = [{"video_sha256": r.files[0].sha256, "keypoints_person_id": 1} for r in recordings(i * EACH, EACH)]
+            values += [i, fit_set_hash({**methods, "session_id": number + i}, rows)]
         query(f"INSERT INTO {name} VALUES {','.join(['(%s,%s)'] * (len(values) // 2))}", args=values)
     return name
 
 
-def _first_set() -> str:
-    from pbl_schemas import fit
+def _first(table: Any, column: str) -> int:
+    """The smallest number of a table."""
+    return int(table.connection.query(f"SELECT MIN({column}) FROM {table.full_table_name}").fetchone()[0])
 
-    return str((fit.FitSet & {"session_id": 1}).fetch1("fit_set"))
+
+def _first_set() -> str:
+    from pbl_schemas import fit, session
+
+    of_first = {"session_id": _first(session.Session, "session_id")}
+    (name,) = (fit.FitSet & of_first).to_arrays("fit_set", order_by="fit_set_created", limit=1)
+    return str(name)
 
 
 # --------------------------------------------------------------------------------------------------------------- speed
@@ -278,6 +290,40 @@ def speed(keys: int, work_ms: float) -> None:
             again = f"{repeated} steps again after a deadlock" if repeated else ""
             say(f"the same statements without the workers, {n} connections", keys / seconds, "jobs/s", again)
         say("statements of a job", sum(map(len, steps)) / keys, "")
+
+
+@main.command()
+@click.option("--keys", default=2000, show_default=True)
+@click.option("--repeats", default=5, show_default=True)
+def take(keys: int, repeats: int) -> None:
+    """Time to take a job of a table (VideoInfo) against DataJoint's `jobs.reserve` of a known key, on the same rows."""
+    from pbl_schemas import tracking, video
+    from pbl_schemas.jobs import jobs_of
+    from pbl_workers import queue
+    from research.benchmarks.many_recordings import register_many
+
+    def ms(call: Callable[[], int]) -> float:
+        """Fastest time of a job (ms)."""
+        out = []
+        for _ in range(repeats):
+            jobs.delete_quick()
+            assert queue.fill(video.VideoInfo) == keys
+            t = time.perf_counter()
+            n = call()
+            out.append(1000 * (time.perf_counter() - t) / n)
+        return min(out)
+
+    with installation():
+        register_many(recordings(0, keys))
+        jobs = jobs_of(video.VideoInfo)
+        known = [{"video_id": int(v)} for v in video.Video.to_arrays("video_id")]
+        some = known[: keys // 4]
+        alone = ms(lambda: sum(jobs.reserve(key) for key in some))
+        say("jobs.reserve of a known key", alone, "ms")
+        for n in (1, 8):
+            taken = ms(lambda n=n: sum(len(queue.claim(video.VideoInfo, n)) for _ in range(len(some) // n)))
+            say(f"a job taken, {n} at a time", taken, "ms", f"{taken / alone:.2f} times, bar 1.3")
+        assert not len(tracking.Tracking.jobs)
 
 
 def _connections(heard: list[Report], n: int) -> set[int]:

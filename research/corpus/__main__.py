@@ -38,7 +38,7 @@ def main(
     heights: bool,
     out: Path,
 ) -> None:
-    """Fit walks whose truth is known, and print how far index, measures and angles are off (docs/validation.md).
+    """Fit walks whose truth is known, and print how far index, measures and angles are off (research/README.md).
 
     Synthetic people, healthy and with each impairment, and recorded walks on the body, seen by the detector's error
     model from the front, the back, both sides and obliquely, by a standing and a held phone. Half of the persons are

@@ -164,7 +164,7 @@ def read_index(folder: str | Path) -> list[dict[str, str]]:
             "FILE_FORMAT",
             found=f"columns {', '.join(rows[0]) if rows else 'none'}",
             expected=f"at least {', '.join(sorted(needed))}",
-            next_step="see docs/validation.md, section Recorded motions",
+            next_step="see research/README.md, section Recorded motions",
             key=str(path),
         )
     return rows

@@ -77,7 +77,7 @@ def _same(stated: str, value: float) -> bool:
 
 
 def record(name: str) -> None:
-    """Run the command of `name` from the root of the checkout and keep what it printed.
+    """Run the command of `name` from the root of the checkout and keep what it printed; entries without a command go.
 
     Raises
     ------
@@ -92,7 +92,8 @@ def record(name: str) -> None:
     )
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     entry = {"commit": commit.stdout.strip(), "day": f"{datetime.now(UTC):%Y-%m-%d}", "machine": machine}
-    kept = {**(printed() if PRINTED.exists() else {}), name: {**entry, "text": done.stdout}}
+    found = {**(printed() if PRINTED.exists() else {}), name: {**entry, "text": done.stdout}}
+    kept = {n: e for n, e in found.items() if n in commands()}
     PRINTED.write_text(json.dumps(dict(sorted(kept.items())), indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 

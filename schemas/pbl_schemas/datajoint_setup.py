@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import os
 import warnings
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import INTERRUPTS, PblError
 
 # DataJoint reads its configuration while it is imported. Ours comes from `connection.configure` alone: a datajoint.json
 # that happens to lie in the working directory must not point the tables at another server.
@@ -32,6 +33,7 @@ with warnings.catch_warnings():
             expected="values of the DJ_ variables as DataJoint knows them (DJ_PORT: a number)",
             next_step="correct the variable, or unset it",
         ) from error
+import pymysql
 from datajoint import table as datajoint_table
 from datajoint.adapters import ADAPTERS, MySQLAdapter
 from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError, MissingTableError
@@ -71,6 +73,10 @@ REPEAT = (1020, 1205, 1213)
 #: Those that say that the server cannot be reached, and that it is full or read-only.
 AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
 FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
+#: That which says that it ended a query after `LIMIT_S`.
+TOO_LONG = (1969, 3024)
+#: Time after which the server ends a query (s), also of a process that was killed meanwhile.
+LIMIT_S = 600
 #: Rights that accounts of workers have (`pbl_schemas.operations.roles`), as the server names them when it refuses.
 _OF_WORKERS = ("SELECT", "INSERT", "UPDATE", "DELETE")
 
@@ -92,6 +98,10 @@ class RightMissing(AccessError, PblError):
         )
 
 
+#: The driver's connections of this process.
+_opened: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
 class MySQLOrMariaDB(MySQLAdapter):
     """DataJoint's adapter for MySQL, which makes each new connection (also a later one) work on MariaDB too, in UTC.
 
@@ -105,9 +115,13 @@ class MySQLOrMariaDB(MySQLAdapter):
         connection = super().connect(*args, **kwargs)
         with connection.cursor() as cursor:
             cursor.execute(UTC)
-            if "MariaDB" in connection.get_server_info():
+            mariadb = "MariaDB" in connection.get_server_info()
+            limit = f"max_statement_time = {LIMIT_S}" if mariadb else f"max_execution_time = {1000 * LIMIT_S}"
+            cursor.execute(f"SET SESSION {limit}")
+            if mariadb:
                 cursor.execute("SET SESSION sql_mode = REPLACE(@@SESSION.sql_mode, 'ONLY_FULL_GROUP_BY', '')")
                 connection.encoders = {**connection.encoders, dict: _json_literal}
+        _opened.add(connection)
         return connection
 
     def load_foreign_keys_sql(self, schemas_list: str, like_pattern: str) -> str:
@@ -120,6 +134,19 @@ class MySQLOrMariaDB(MySQLAdapter):
         """DataJoint's error; of a right that is missing one with a code."""
         translated = super().translate_error(error, query)
         return RightMissing(str(error.args[-1])) if isinstance(translated, AccessError) else translated
+
+
+def end_queries() -> None:
+    """Have the server end the queries in which this process was interrupted."""
+    for connection in list(_opened):
+        if not connection.open:  # the driver closes one whose answer it no longer waits for
+            number = connection.thread_id()
+            with suppress(pymysql.err.Error):  # it has ended, or the server cannot be reached
+                connection.connect()
+                connection.query(f"KILL {number}")
+
+
+INTERRUPTS.append(end_queries)
 
 
 def _json_literal(value: dict[str, Any], _mapping: object = None) -> str:

@@ -11,7 +11,7 @@ import pymysql
 
 from pbl_pipeline.errors import CODERS, CODES, PblError, causes
 
-from .datajoint_setup import AWAY, FULL, REPEAT, LostConnectionError
+from .datajoint_setup import AWAY, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
 
 #: Words of object stores for "full": MinIO, quotas.
 _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")
@@ -61,6 +61,7 @@ def of_server(error: Exception) -> PblError:
         )
     steps = {
         REPEAT: "try again: another one held what this needed for too long",
+        TOO_LONG: f"the server ends a query after {LIMIT_S} s: ask for less, such as one person (--subject)",
         FULL: "free space on the server's disk, or end its read-only mode; nothing was written",
     }
     return PblError(

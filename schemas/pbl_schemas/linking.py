@@ -20,7 +20,7 @@ from pbl_pipeline.names import normalised_label
 
 from . import connection, lab, session
 from .datajoint_setup import MySQLOrMariaDB, dj
-from .rows import inside
+from .rows import rows_inside
 from .transactions import in_transaction
 
 _usage = functools.partial(PblError, "USAGE", next_step='see docs/add_table.md, "Link your laboratory\'s tables"')
@@ -207,7 +207,7 @@ def _without_link(master: Any, keys: Iterable[Any]) -> Collection[Any]:
     links, (column,), keys = _links(master), master.primary_key, list(keys)
     if not links.is_declared:
         return []
-    there = set((links & inside(column, keys)).to_arrays(column))
+    there = {row[column] for row in rows_inside(links.proj(), column, keys)}
     return [key for key in keys if key not in there]
 
 

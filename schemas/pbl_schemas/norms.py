@@ -157,9 +157,9 @@ def _cycle_keys(people: Sequence[dict], restriction: Any, pace: str) -> list[dic
         * fit.FitSet.Video.proj("tracking_method", "keypoint_method")
         * gait.GaitCycle.proj()
     )
-    keys = (found & list(people) & restriction).to_dicts(order_by="KEY")
-    done = video.conditions(f"video_id IN ({','.join(str(k['video_id']) for k in keys)})") if keys else {}
-    return [k for k in keys if done[k["video_id"]].pooled(pace)]
+    query = found & list(people) & restriction
+    done = video.conditions(query.proj())
+    return [k for k in query.to_dicts(order_by="KEY") if done[k["video_id"]].pooled(pace)]
 
 
 def _cycles(keys: Sequence[dict[str, Any]]) -> tuple[list[lib.GaitCycle], list[str]]:

@@ -16,7 +16,7 @@ from .chain import before
 from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
-from .rows import utc_now
+from .rows import inside, utc_now
 from .transactions import repeated
 
 #: Columns of one fit: recordings of one kind of a session, seen through one chain of methods.
@@ -70,24 +70,36 @@ def plan_fit_sets(sessions: Iterable[int] | None = None) -> list[dict[str, Any]]
 
     `sessions`: session_id of those to look at (None: all; that reads whole tables).
     """
-    chosen = True if sessions is None else [{"session_id": int(s)} for s in sessions]
+    chosen = True if sessions is None else inside("session_id", map(int, sessions))
     current = fit.current() & (fit.FitSet & chosen)
     fitted = (fit.FitSet.Video * current).proj("tracking_method", "keypoint_method")
     in_a_set = dj.U("video_id", "tracking_method", "keypoint_method", "fit_method") & fitted
     usable = (video.Video.proj("session_id") & chosen) - video.NotUsable
-    new = fit.TrialInput.proj() * usable - in_a_set
-    recorded = fit.MarkerPlan.proj() * usable
-    new_markers = recorded - (dj.U("video_id", "fit_method") & (fit.FitSet.Video * current))
+    new = _lacking(fit.TrialInput.proj() * usable, in_a_set)
+    in_a_set = dj.U("video_id", "fit_method") & (fit.FitSet.Video * current)
+    new_markers = _lacking(fit.MarkerPlan.proj() * usable, in_a_set)
     of_kind = current * fit.FitSet.proj("session_id", "fit_set_kind")
     by_method = dj.U("session_id", "fit_method", "fit_set_kind").aggr(of_kind, n_current="count(*)")
     several = (by_method & "n_current > 1").proj()
     marked = fit.FitSet.proj("session_id") & (_with_unusable() & current)
-    to_plan = sorted({int(s) for found in (new, new_markers, several, marked) for s in found.to_arrays("session_id")})
+    others = {int(s) for found in (several, marked) for s in found.to_arrays("session_id")}
     failed = queues_before_fit()
     made = []
-    for session_id in to_plan:
+    for session_id in sorted(new | new_markers | others):
         made += _plan_locked(session_id, failed)
     return made
+
+
+def _lacking(wanted: Any, there: Any) -> set[int]:
+    """Return the sessions of rows that the other query lacks. It is joined: as NOT IN a server that knows little of the
+    tables yet reads it anew for each row."""
+    names = ", ".join(there.heading.names)
+    there = f"SELECT {names}, 1 AS is_there FROM ({there.make_sql()}) AS t"  # noqa: S608  names are DataJoint's own
+    rows = fit.FitSet.connection.query(
+        f"SELECT DISTINCT session_id FROM ({wanted.make_sql()}) AS w LEFT JOIN ({there}) AS t USING ({names})"  # noqa: S608
+        " WHERE is_there IS NULL"
+    )
+    return {int(s) for (s,) in rows.fetchall()}
 
 
 @repeated
@@ -250,10 +262,10 @@ def _measured(row: Mapping[str, Any]) -> str:
 
 def _decided(videos: Any, failed: Sequence[Any]) -> Any:
     """Return a test of a selection row: True if it will not give keypoints (failed, no one there, must be chosen)."""
-    ids = {int(v) for v in videos.to_arrays("video_id")}
+    ids = inside("video_id", map(int, videos.to_arrays("video_id")))
     stopped: list[dict] = []
     for jobs in failed:
-        stopped += list((jobs.errors & [{"video_id": i} for i in ids]).keys())
+        stopped += list((jobs.errors & ids).keys())
     unchosen = (tracking.SubjectChoice & videos) - [{"choice_status": s} for s in tracking.CHOSEN]
     stopped += list(unchosen.keys())
 

@@ -107,6 +107,11 @@ class Deidentified(dj.Computed):
         )
 
 
+def copy_of(video_id: int) -> str:
+    """Return the SHA-256 of the de-identified copy of a recording, empty without one."""
+    return "".join(str(h) for h in (Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))
+
+
 @contextlib.contextmanager
 def shown(video_id: int) -> Iterator[Path | None]:
     """The recording whose pictures overlays and reports show: the de-identified copy where PBL_DEIDENTIFY asks for it,

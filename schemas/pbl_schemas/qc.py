@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from pbl_pipeline.qc import Check as Quality
@@ -72,15 +72,18 @@ class SessionQc(dj.Computed):
                 checks += [(k["video_id"], dataclasses.astuple(c)) for k in corrected for c in gait.load_events(k).qc]
             for video_id, check in checks:
                 found.append({"qc_stage": stage, "qc_video_id": video_id, **dict(zip(COLUMNS, check, strict=True))})
-        return found, one(gdi.SessionGdi & key, "session_status")
+        used = {int(v) for v in (gait.GaitCycle & key & "n_cycles_used > 0").to_arrays("video_id")}
+        return found, one(gdi.SessionGdi & key, "session_status"), used
 
     @computes
     def make_compute(
-        self, key: dict, rows: Sequence[dict[str, Any]], session_status: str
+        self, key: dict, rows: Sequence[dict[str, Any]], session_status: str, used: Collection[int]
     ) -> tuple[str, list[str], Sequence[dict[str, Any]]]:
         from pbl_pipeline import qc
 
-        outcomes = [qc.in_session(r["qc_check_outcome"], session_status == qc.PASS) for r in rows]
+        counts = [r["qc_video_id"] is None or r["qc_video_id"] in used for r in rows]
+        measured = session_status == qc.PASS
+        outcomes = [qc.in_session(r["qc_check_outcome"], measured, c) for r, c in zip(rows, counts, strict=True)]
         outcome = max(outcomes, key=qc.OUTCOMES.index, default=qc.PASS)
         named = [r["qc_check"] for r, o in zip(rows, outcomes, strict=True) if o == outcome != qc.PASS]
         return outcome, named, rows

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import pymysql
 
 from pbl_pipeline.errors import PblError
 
 from .datajoint_setup import REPEAT, columns_read_once, dj
+
+T = TypeVar("T")
+#: Values in one restriction: a statement stays short however many there are.
+PART = 500
 
 #: Function that returns the rows of a table that agree with a key, in the order of the table's own key: `stored_rows`
 #: asks the database each time, `ReadAhead` for many keys at once.
@@ -131,8 +136,20 @@ def or_nan(value: float | None) -> float:
     return float("nan") if value is None else float(value)
 
 
+def parts(values: Iterable[T]) -> Iterator[list[T]]:
+    """Yield the values, `PART` at a time."""
+    rest = iter(values)
+    while part := list(itertools.islice(rest, PART)):
+        yield part
+
+
+def rows_inside(query: Any, column: str, values: Iterable[str | int]) -> list[dict[str, Any]]:
+    """Return the rows of a query with one of the values (as of `inside`), `PART` values a statement."""
+    return [row for some in parts(dict.fromkeys(values)) for row in (query & inside(column, some)).to_dicts()]
+
+
 def inside(column: str, values: Iterable[str | int]) -> Any:
-    """Return a restriction to values without quotes (codes and numbers), quick for thousands."""
+    """Return a restriction to values without quotes (codes and numbers); of more than `PART` read in `parts`."""
     listed = ", ".join(f"'{v}'" if isinstance(v, str) else str(v) for v in values)
     return f"{column} IN ({listed})" if listed else False
 

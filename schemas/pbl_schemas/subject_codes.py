@@ -23,10 +23,17 @@ def check_subject(code: str, next_step: str, key: object = None) -> None:
         )
 
 
+def iso_label(label: str) -> str:
+    """Return a label that is a day as D.M.YYYY in the form YYYY-MM-DD; others as they are."""
+    match = re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d{4})", label)
+    return f"{match[3]}-{int(match[2]):02}-{int(match[1]):02}" if match else label
+
+
 def day_of(label: str) -> datetime.date | None:
-    """Return the day in a session's label (ISO, such as YYYY-MM-DD, also with a time); None for any other text."""
+    """Return the day in a session's label (ISO, such as YYYY-MM-DD, also with a time, or D.M.YYYY); None for any other
+    text."""
     try:
-        return datetime.datetime.fromisoformat(label).date()
+        return datetime.datetime.fromisoformat(iso_label(label)).date()
     except ValueError:
         return None
 

@@ -111,10 +111,10 @@ def refuse_other_version() -> None:
         return
     lacking = [f"migration {title(*m)}" for m in numbered() if m not in have] + missing_columns()
     if lacking:
-        more = f" and {len(lacking) - 12} more" if len(lacking) > 12 else ""
+        more = f" and {len(lacking) - 20} more" if len(lacking) > 20 else ""
         raise PblError(
             "DB_MIGRATION",
-            found=f"tables of an older version, without {', '.join(lacking[:12])}{more}",
+            found=f"tables of an older version, without {', '.join(lacking[:20])}{more}",
             expected=f"tables as pbl-pipeline {code_version()} defines them",
             next_step="`pbl db migrate --dry-run` says what will be done, `pbl db migrate` does it; of a database of a "
             "development version it says that no migration does: set PBL_HOME to a new folder, ingest the videos again",

@@ -36,7 +36,7 @@ class Printed:
     def collect(self) -> Iterator[Any]:
         server = connection.another()
         yield from metrics.figures(server)
-        yield from metrics.disk_figures()
+        yield from metrics.machine_figures()
         server.close()
 
 

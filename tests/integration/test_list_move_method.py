@@ -8,15 +8,19 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
 from pbl_schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, video
+from pbl_schemas.decisions import review_decisions
 from pbl_schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
 from pbl_schemas.intake.move import carry_out, plan_move
 from pbl_schemas.method_names import keys_named, with_keys
+from pbl_schemas.reading import visit_list
+from pbl_schemas.studies import study_sheets, visit_forms
 from pbl_workers.populate import populate
 from tests.command import pbl
-from tests.rows import everything, outcomes, register
+from tests.rows import everything, new_visit, outcomes, register
 
 from . import chain, test_rigs
 from .drop import twice, upload
@@ -183,3 +187,50 @@ def test_a_method_from_a_file_is_registered_once_and_used_by_its_name(tables, tm
             with_keys({"norm": "nobody"})
     finally:
         (fit.FitMethod & {"fit_method_name": "slow"}).delete(prompt=False)
+
+
+def test_all_lists_and_filters_take_every_kind_of_row(tables: None, tmp_path: Path):
+    video_id, _ = register(*(chain.small_video(tmp_path, n, n=60) for n in "ab"), session_label="2026-03-01")
+    visit = new_visit("2026-04-01", "P002")  # without recordings
+    kinds = [name.partition(".")[2] for name in texts.catalogue() if name.startswith("decided.")]
+    assert len(kinds) > 10
+    about = dict.fromkeys((*gdi.SessionGdi.primary_key, "check", "computed"), "x") | {"qc_no": 1}
+    for kind in kinds:
+        for of in ({"session_id": visit}, {"video_id": video_id}, {}):
+            review_decisions.record(kind, "A", about, {}, {}, "", **of)
+    review_decisions.mark_not_usable(video_id, "helped")
+    for of, number in (("session_id", visit), ("video_id", video_id)):
+        review_decisions.record_viewing(of, number, "page", "A")
+    refused = study_sheets.add_instrument(
+        {
+            "instrument": "FAC",
+            "instrument_name": "FAC",
+            "instrument_unit": "points",
+            "higher_is_better": "yes",
+            "ordinal": "yes",
+        },
+        "A",
+    )
+    assert not refused
+    form = visit_forms.scores_form(visit)
+    assert not visit_forms.enter_scores(visit, {"role": "pre", "FAC": "3"}, "A", form.seen)[1]
+    people = {"--subject": "P002", "--population": "unknown", "--project": "default"}
+    of_visits = {**people, "--session": "2026-04-01"}
+    lists = {
+        "subjects": people,
+        "visits": of_visits,
+        "changes": people,
+        "videos": {**of_visits, "--activity": "walking"},
+    }
+    for name, filters in {**lists, "decisions": of_visits, "looks": of_visits}.items():
+        for given in ([], *([option, value] for option, value in filters.items()), ["--subject", "nobody"]):
+            done = pbl("list", name, "--json", *given)
+            assert done.code == 0, (name, given, done.err)
+            if not given and name == "decisions":
+                about = [(d["what"], d["subject"]) for d in json.loads(done.out)]
+                assert {(kind, who) for kind in kinds for who in ("P001", "P002", None)} <= set(about)
+                assert ("instrument", None) in about
+    for role in ("", "pre"):
+        for state in ("", *visit_list.STATES):
+            for quality in ("", *visit_list.OUTCOMES):
+                visit_list.visit_page(visit_list.Filter("P0", "", role, quality, state))

@@ -16,11 +16,26 @@ import pytest
 import pbl_schemas
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
-from pbl_schemas import connection, gait, gdi, jobs, lab, methods, migrations, session, stages, validation, video
+from pbl_schemas import (
+    connection,
+    gait,
+    gdi,
+    jobs,
+    lab,
+    methods,
+    migrations,
+    qc,
+    session,
+    stages,
+    study,
+    validation,
+    video,
+)
 from pbl_schemas.chain import ON_REQUEST
-from pbl_schemas.decisions import event_corrections
+from pbl_schemas.decisions import event_corrections, review_decisions
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.reading import frames
+from pbl_schemas.studies import slices
 from pbl_workers import heartbeat, loop
 from pbl_workers.populate import populate
 from tests import mysql, not_none
@@ -177,8 +192,29 @@ def corrected_by_a_method(folder: Path) -> dict[str, list[tuple]]:
     (time, side, kind, _), *others = found.events
     event_corrections.save(1, [(time + 0.02, side, kind), *(e[:3] for e in others)], "A. First", found.state)
     _compute()
+    study.Visit.insert1({"session_id": 1, "visit_role": "pre"})
+    slices.freeze("of detected events")
+    slices.freeze("of corrected events")
+    of_slice = {"study_slice": "of detected events", "session_id": 1}
+    study.StudySliceVisit.update1({**of_slice, "slice_visit_hash": "0" * 16})  # of other numbers than after the upgrade
+    key = gdi.SessionGdi.fetch1("KEY")
+    check = dict((qc.SessionQc.Check & key).to_dicts()[0])
+    qc.SessionQc.Check.update1({**{k: check[k] for k in qc.SessionQc.Check.primary_key}, "qc_check_outcome": "WARN"})
+    computed = str((qc.SessionQc & key).fetch1("qc_computed"))
+    about = {**key, "check": check["qc_check"], "qc_no": int(check["qc_no"])}
+    for then, by in (("2020-01-01 00:00:00", "B. Second"), (computed, "C. Third")):
+        review_decisions.record("check", by, {**about, "computed": then}, {}, {}, session_id=1)
     rows = everything()
-    _undo(older_tables.undo_0004)
+
+    def by_hand(cursor: Any) -> None:
+        slice_ = "WHERE study_slice = 'of corrected events'"
+        cursor.execute(f"UPDATE pbl_study.study_slice SET gait_method = 'by-hand-v1' {slice_}")
+        cursor.execute(
+            "UPDATE pbl_review.decision SET decision_about = JSON_SET(decision_about, '$.gait_method', 'by-hand-v1')"
+            " WHERE decision_by = 'C. Third'"
+        )
+
+    _undo(older_tables.undo_0004, by_hand)
     return rows
 
 
@@ -372,6 +408,22 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert (refused.code, "__session_gdi.session_corrected" in refused.err) == (1, True)
     dry = migrations.migrate(dry_run=True)
     assert (len(dict(dry.steps)["0004 corrections_as_rows"]) > 60, dry.open) == (True, [])
+    # Results that will have other numbers are named before anything is done.
+    visit = "visit 2026-03-01 of P001"
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute(
+            "SELECT JSON_VALUE(decision_about, '$.check'), JSON_VALUE(decision_about, '$.gait_method')"
+            " FROM pbl_review.decision WHERE decision_by = 'B. Second'"
+        )
+        ((check, method),) = cursor.fetchall()
+    touched = [
+        f"changes: the results of {visit} by {method}",
+        f"changes: the check {check} of {visit}, which B. Second accepted, is to be accepted again",
+        "changes: 1 visits of the slice of detected events; a backup of before has its numbers",
+    ]
+    assert dry.touched == touched
+    said = pbl("db", "migrate", "--dry-run").out.splitlines()
+    assert [line.strip() for line in said if "changes:" in line] == touched
     for killed_before in (4, 57, "DROP TABLE `pbl_gait`.`hand_events`"):  # each goes on where the last was killed
         assert killed_before in (len(said := migrate_until(killed_before)), said[-1].strip())
         assert migrations.applied()[-1].number < OWN - 1
@@ -381,6 +433,11 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert {t for t in rows if after[t] != rows[t] and not t.split(".")[1].startswith("~")} == set()
     assert not [t for t in after if "hand_events" in t]
     assert migrations.migrate().steps == []
+    # The slice of corrected events has its numbers, and what was accepted of them stays accepted.
+    assert slices.changes("of corrected events") == []
+    assert slices.changes("of detected events") == [f"{visit} has other rows"]
+    kept = review_decisions.accepted(gdi.SessionGdi.fetch1("KEY"))
+    assert [d.by for d in kept.values()] == ["C. Third"]
     # Nothing is pending; going back to the detected events computes theirs again.
     assert not populate(_chain()).did_something
     event_corrections.take_back(1, "B. Second", not_none(event_corrections.shown_events(1)).state)
@@ -393,7 +450,8 @@ def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
     statements = dict(dry.steps)["0005 tracking_of_videos_that_were_read"]
     assert (statements[0], len(statements) > 20, dry.open) == ("START TRANSACTION", True, [])
     assert len(migrate_until(5)) == 5
-    assert len(migrate_until(None)) == len(statements)  # all over again: it was one transaction
+    assert dry.touched == ["changes: the results of visit 2026-03-01 of P001"]
+    assert len(migrate_until(None)) == 1 + len(statements)  # all over again: it was one transaction
     after = everything()
     left = {t: len(found) for t, found in after.items() if t.split(".")[1].startswith("__") or "fit_set" in t}
     assert left == {t: len(rows[t]) // 2 for t in left}

@@ -13,6 +13,7 @@ from pbl_schemas import fit, gait, gdi, session, study, video
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.intake.records import set_condition
 from pbl_schemas.reading import frames
+from pbl_schemas.review import Decision
 from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
@@ -128,6 +129,8 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     score = {"session_id": pre, "instrument": "mJOA"}
     study.ClinicalScore.update1({**score, "score_value": 10})
     assert slices.changes("second") == ["visit pre of P001 has other rows"]
+    said: Any = slices.study_data("second", curves=False)
+    assert said.description.note.endswith(" 1 of its 3 visits have other numbers than when it was frozen.")
     study.ClinicalScore.update1({**score, "score_value": 11})
     assert slices.changes("second") == []
     # A later video makes another set; the slice keeps its own.
@@ -146,7 +149,18 @@ def test_the_same_frames_again_until_a_row_changes(cohort: Path):
     after = session.Session & {"subject": "P001", "session_label": "after"}
     number = after.fetch1("session_id")
     (study.StudySliceVisit & {"study_slice": "third", "session_id": number}).delete(prompt=False)
-    assert slices.changes("third") == ["1 visits were deleted"]
+    assert slices.changes("third") == ["a visit was deleted"]
+
+
+def test_a_column_that_came_later_changes_no_slice_until_it_has_a_value(cohort: Path):
+    about = {**slices.slice_row("first"), "cohort": "dcm"}
+    found: Any = slices._frames(slices._frozen(about), about)
+    later = ["gdi_unshrunk", "gdi_unshrunk_sd"]
+    older = {**found, "visits": found["visits"].drop(columns=later)}
+    before = slices._hashes(older)
+    assert before != slices._hashes(found)
+    upgraded = {**found, "visits": found["visits"].assign(**dict.fromkeys(later, None))}
+    assert slices._hashes(upgraded) == before
 
 
 def test_what_cannot_be_frozen(cohort: Path):
@@ -179,6 +193,41 @@ def test_the_views_of_a_study(cohort: Path):
     videos = (video.Video & own.proj()).proj().to_dicts()
     current = (fit.FitSelection & {"fit_current": True}).proj()
     assert len(cycles) == sum((gait.GaitCycle & current & videos).to_arrays("n_cycles_used"))
+
+
+def test_a_slice_is_looked_at_before_it_is_frozen_and_can_be_withdrawn(cohort: Path):
+    before = sorted(study.StudySlice().to_arrays("study_slice"))
+    asked = ("study", "slice", "planned")
+    assert pbl(*asked).error_code == "DB_NOT_FOUND"  # a check of a name that is not there freezes nothing
+    assert pbl(*asked, "--withdraw").error_code == "DB_NOT_FOUND"
+    assert pbl(*asked, "--all", "--role", "pre").code == 2
+    for more, n in ((("--cohort", "dcm"), 2), (("--all",), 3), ((), 3)):  # C001 is excluded from the cohort
+        planned = pbl(*asked, *more, "--dry-run")
+        assert planned.code == 0, planned.err
+        lines = planned.out.splitlines()
+        assert "P001 pre: counts" in lines
+        assert "P002 pre: does not count: no measures" in lines
+        assert f"would be frozen: 5 visits, {n} count" in lines[-1]
+    assert sorted(study.StudySlice().to_arrays("study_slice")) == before
+    made = pbl(*asked, "--all")
+    assert made.code == 0, made.err
+    digest = made.out.split()[-1]
+    assert pbl(*asked).out == "planned: as it was frozen\n"
+    server, rows = study.StudySlice.connection, study.StudySlice.full_table_name
+    schema = rows.split(".")[0]
+    refers = f"FOREIGN KEY (study_slice) REFERENCES {rows} (study_slice)"
+    server.query(f"CREATE TABLE {schema}.own (study_slice VARCHAR(32), {refers})")
+    try:
+        server.query(f"INSERT INTO {schema}.own VALUES ('planned')")
+        assert pbl(*asked, "--withdraw").error_code == "USAGE"
+        assert pbl(*asked).out == "planned: as it was frozen\n"
+    finally:
+        server.query(f"DROP TABLE {schema}.own")
+    assert pbl(*asked, "--withdraw").out == "planned: withdrawn\n"
+    assert sorted(study.StudySlice().to_arrays("study_slice")) == before
+    (kept,) = (Decision & {"decision_what": "slice"}).to_dicts()
+    assert (kept["decision_about"], kept["decision_before"]["hash"]) == ({"study_slice": "planned"}, digest)
+    assert digest in pbl("list", "decisions").out
 
 
 @pytest.mark.long

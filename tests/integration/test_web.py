@@ -48,8 +48,8 @@ def test_filters_of_the_list_and_their_order(four_visits: None):
     assert numbers(Filter(role="pre")) == [4, 1]
     assert numbers(Filter(first_day=datetime.date(2026, 2, 1))) == [2, 4]
     assert numbers(Filter(last_day=datetime.date(2026, 2, 1), cohort="spine")) == [1]
-    assert numbers(Filter(state="pending")) == [2, 4, 1, 3]
-    assert [numbers(Filter(state=s)) for s in ("computed", "waiting", "failed", "empty")] == [[], [], [], []]
+    assert numbers(Filter(state="unrecorded")) == [2, 4, 1, 3]
+    assert [numbers(Filter(state=s)) for s in visit_list.STATES if s != "unrecorded"] == [[]] * 6
     assert visit_list.choices() == {"cohort": ["spine"], "role": ["pre", "3_months"]}
 
 

@@ -263,7 +263,7 @@ def test_an_unusual_cadence_gives_no_number_until_somebody_accepts_it(
     why = "the cadence is unusual for walking, and no one has accepted it"
     assert gdi.SessionGdi.fetch1(*numbers, "session_gdi_reason") == (None, None, None, why)
     assert qc.SessionQc.fetch1("qc_outcome") == "FAIL"
-    assert usable(1) == Usable("unusable", (why, *usable(1).said[1:]), (0, 0))
+    assert usable(1) == Usable("unusable", (why, *usable(1).said[1:]), (0, 0), "walking")
     browser = web.client(name="A. First")
     assert why in browser.get("/visits/1").text
     cadence = {"qc_check": "cadence_plausible"}

@@ -8,11 +8,16 @@ from typing import Any
 import av
 import pytest
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from pbl_schemas import fit, privacy
+from pbl_schemas import computed_tables, fit, gait, privacy, session, video
+from pbl_schemas.connection import dj
 from pbl_schemas.origin import Origin
+from pbl_schemas.reading import shown
+from pbl_schemas.reading.visit_state import state_of
+from pbl_schemas.rows import delete_below
 from pbl_workers.populate import populate
-from pbl_workers.web import reports
+from pbl_workers.web import reports, source
 from tests import until
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.html_page import commands_in
@@ -132,15 +137,71 @@ def copied(path: Path) -> dict[str, Any]:
     }
 
 
-def test_what_is_computed_anew_is_drawn_anew(visit: Path):
-    key = fit.trial_key(1)
-    assert key is not None
-    before = reports.overlay_key(1)
-    assert reports.overlay_key(1) == before
-    row = (fit.SessionFit & key).proj("fit_computed").fetch1()
-    fit.SessionFit.update1({**row, "fit_computed": "2030-01-01 00:00:00"})
-    assert reports.overlay_key(1) != before
-    fit.SessionFit.update1(row)
+def test_each_input_of_what_is_kept_changes_its_key(visit: Path, monkeypatch: pytest.MonkeyPatch):
+    """The movement of a recording's page, its overlay, the report of its visit, a phone's answer."""
+    of_recording = {"movement": lambda: shown.computations(1), "overlay": lambda: reports.overlay_key(1)}
+    of_visit = {"report": lambda: reports.report_key(1, 0, "en"), "phone": lambda: state_of(1)}
+    every = {**of_recording, **of_visit}
+
+    def changed(keys: dict[str, Any], change: Any) -> set[str]:
+        """Those of the keys that a statement, or a call, changes; it is taken back."""
+        before = {name: key() for name, key in keys.items()}
+        assert before == {name: key() for name, key in keys.items()}
+        with dj.conn().transaction:
+            change() if callable(change) else dj.conn().query(change)
+            found = {name for name, key in keys.items() if key() != before[name]}
+            dj.conn().cancel_transaction()
+            dj.conn().start_transaction()
+        assert before == {name: key() for name, key in keys.items()}
+        return found
+
+    made = [t for t in computed_tables() if len(t())]
+    assert {t.__name__ for t in made} >= {"SessionFit", "GaitEvents", "GaitCycle", "SessionGdi", "Kinetics"}
+    own = {fit.SessionFit, gait.GaitEvents, gait.GaitCycle}
+    for table in made:
+        prefix = next(n.removesuffix("_computed") for n in table.heading.names if n.endswith("_computed"))
+        keys = {**(of_recording if table in own else {}), **of_visit}
+        for column, value in ((f"{prefix}_computed", "'2030-01-01'"), (f"{prefix}_seconds", "77")):
+            statement = f"UPDATE {table.full_table_name} SET {column} = {value}"
+            assert changed(keys, statement) == set(keys), (table.__name__, column)
+    for change in ("session_label = 'x'", "session_date = '2026-01-11'"):
+        statement = f"UPDATE {session.Session.full_table_name} SET {change}"
+        assert changed({"report": every["report"]}, statement) == {"report"}
+    assert changed(of_visit, f"UPDATE {video.Video.full_table_name} SET activity = 'tug'") == set(of_visit)
+    paced = lambda: video.Pace.insert1({"video_id": 1, "pace": "fast"})  # noqa: E731
+    assert changed({"report": every["report"]}, paced) == {"report"}
+    mark = {"unusable_reason": "helped", "unusable_by": "R", "unusable_created": "2026-01-01"}
+    assert changed(of_visit, lambda: video.NotUsable.insert1({"video_id": 1, **mark})) == set(of_visit)
+    assert every["report"]() != reports.report_key(1, 0, "de")
+    before = {name: every[name]() for name in ("overlay", "report")}
+    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    assert all(every[name]() != key for name, key in before.items())
+
+
+def test_a_page_opened_while_cycles_were_pending_is_made_again_with_them(visit: Path):
+    delete_below(gait.GaitCycle(), gait.GaitCycle().keys())
+    pending = shown.computations(1)
+    populate()
+    assert shown.computations(1) != pending
+
+
+def test_another_copy_with_hidden_heads_replaces_the_one_that_is_kept(
+    visit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    videos = source.Videos()
+    try:
+        for shade in (0, 1):
+            copy = tmp_path / f"copy{shade}.mp4"
+            write_video(copy, (frame * shade for frame in numbered_frames(9, 36, 64)), constant_rate(9))
+            privacy.Deidentified.insert1(copied(copy), allow_direct_insert=True)
+            assert sha256_of(videos.path(1)) == sha256_of(videos.path(1)) == sha256_of(copy)
+            (privacy.Deidentified & {"video_id": 1}).delete(prompt=False)
+        with pytest.raises(PblError, match="no de-identified copy"):  # such as of a person who was forgotten
+            videos.path(1)
+    finally:
+        videos.close()
+        (privacy.Deidentified & {"video_id": 1}).delete(prompt=False)
 
 
 def test_a_video_that_is_gone_says_so(visit: Path):

@@ -1,6 +1,7 @@
 """Filming with a phone: its link, the upload in parts, and what it may not do. Without a browser."""
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import os
@@ -12,6 +13,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,22 +24,23 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import to_row
 from pbl_pipeline.words import UNUSABLE
-from pbl_schemas import keypoints, session, video
+from pbl_schemas import gait, keypoints, session, video
 from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
 from pbl_schemas.intake import phone_recordings
-from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, phone_of
-from pbl_schemas.intake.protocols import add_protocol, read_protocol
+from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
+from pbl_schemas.intake.protocols import Step, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
-from pbl_schemas.reading.usable import Next, Usable
+from pbl_schemas.reading import usable as module_usable
+from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
 from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
-from pbl_workers.web.phone import next_words, verdict
+from pbl_workers.web.phone import next_words, usual_words, verdict
 from tests import not_none
 from tests.integration import web
-from tests.integration.chain import small_video
+from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
 from tests.rows import new_visit, register
 
@@ -49,6 +52,18 @@ def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     for module in (phone_recordings, phone_uploads):
         monkeypatch.setattr(module, "PART_BYTES", 4096)
     return new_visit("2026-01-10")
+
+
+@computed_once
+def walks(folder: Path) -> dict[str, int]:
+    """A computed walk for each activity that was stated of it, a visit each; its video_id."""
+    stated = ("walking", "tug", "sit_to_stand", "squat", "stairs", "standing", "fsst")
+    numbers = {
+        activity: register(small_video(folder, activity), session_label=activity, activity=activity)[0]
+        for activity in stated
+    }
+    populate()
+    return numbers
 
 
 def stranger() -> TestClient:
@@ -368,6 +383,11 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
     assert "complete by its protocol" not in page  # a tick means usable
     assert sorted((video.Video & {"session_id": visit}).to_arrays("activity")) == ["tug", "tug", "walking"]
     populate()
+    assert counted() == [(1, 0), (0, 0)]  # they are walks
+    assert "complete by its protocol" not in reviewer.get(f"/visits/{visit}").text
+    server, rows = gait.Spatiotemporal.Measure.connection, gait.Spatiotemporal.Measure.full_table_name
+    server.query(f"UPDATE {rows} SET measure_mean = 9 WHERE measure IN ('tug_time_s', 'turn_time_s')")
+    server.query(f"UPDATE {gait.Spatiotemporal.full_table_name} SET measures_seconds = measures_seconds + 1")
     assert counted() == [(1, 0), (2, 0)]
     assert "complete by its protocol" in reviewer.get(f"/visits/{visit}").text
     # What cannot be used does not count.
@@ -383,6 +403,125 @@ def test_a_protocol_is_ticked_off(visit: int, tmp_path: Path):
     assert "complete by its protocol" not in reviewer.get(f"/visits/{visit}").text
     answer = web.post(reviewer, f"/visits/{visit}/film", hours=2, protocol="unknown")
     assert answer.status_code == 404
+
+
+def drawn_take(rng: random.Random) -> tuple[str, Usable]:
+    """The activity that was stated of a take, and the verdict on what was filmed."""
+    activity = rng.choice(("walking", "tug", "sit_to_stand", "squat", "stairs", "standing"))
+    checks = [{"keypoints_check": "x", "keypoints_check_value": None, "keypoints_check_advice": "step back"}]
+    checks[0]["keypoints_check_outcome"] = rng.choice(("PASS", "PASS", "WARN", "FAIL"))
+    steps = rng.choice((0, 0, 3))
+    needed = {name: rng.choice((0.0, None, 5.0)) for name in ("rise_count", "tug_time_s", "turn_time_s", "squat_count")}
+    measures = {name: (value, "" if value is not None else "not found") for name, value in needed.items()}
+    found = rng.choice((None, module_usable._Found((steps, 0), "" if steps else "nobody walks", measures)))
+    state = SimpleNamespace(stops=rng.random() < 0.3, verdict="it failed")
+    judged = module_usable._verdict(activity, checks, found, state)  # pyright: ignore[reportArgumentType]
+    shows = {
+        "walking": steps > 0,
+        "stairs": steps > 0,
+        "standing": steps == 0,
+        "tug": bool(needed["tug_time_s"] and needed["turn_time_s"]),
+        "sit_to_stand": bool(needed["rise_count"]),
+        "squat": bool(needed["squat_count"]),
+    }[activity]
+    good = found is not None and shows and checks[0]["keypoints_check_outcome"] != "FAIL"
+    assert (judged.state in ("usable", "remarks")) == good, (activity, found, judged)
+    assert judged.said or judged.state in ("usable", "pending"), "what is wrong is said"
+    if judged.state == "unusable" and found is not None and not shows and activity not in ("walking", "stairs"):
+        assert any("correct its activity" in said for said in judged.said) or "step back" in judged.said
+    return activity, dataclasses.replace(judged, activity=activity)
+
+
+def test_drawn_mixes_of_takes_are_complete_by_usable_ones_alone(visit: int):
+    wanted = {"1": ("walking", 2), "2": ("tug", 1), "3": ("sit_to_stand", 1)}
+    add_protocol("drawn", [Step(int(n), activity, "", "any", k) for n, (activity, k) in wanted.items()])
+    link_of(visit, protocol="drawn")
+    rng, complete = random.Random(65), 0
+    for _ in range(200):
+        sent: list[tuple[Sent, Usable | None]] = []
+        good: dict[str, set[int]] = {n: set() for n in wanted}
+        for number in range(rng.randint(0, 40)):
+            activity, judged = drawn_take(rng)
+            if rng.random() < 0.5:  # most people follow the protocol
+                judged = dataclasses.replace(judged, state=rng.choice(("usable", "usable", "pending")))
+            fits = [n for n, (of_step, _) in wanted.items() if of_step == activity]
+            step = rng.choice(fits or list(wanted)) if rng.random() < 0.8 else rng.choice([*wanted, ""])
+            times = 2 if rng.random() < 0.2 else 1  # a walk that was sent with two logs is one video
+            about = {"step": step} if step else {}
+            for _ in range(times):
+                sent.insert(0, (Sent(number, visit, "", 1, 0, about, "received", "", number), judged))
+            if step and wanted[step][0] == activity and judged.state in ("usable", "remarks"):
+                good[step].add(number)
+            if rng.random() < 0.1:
+                sent.append((Sent(1000 + number, visit, "", 1, 0, about, "uploading", "", None), None))
+        steps = steps_of(visit, sent)
+        assert {str(s.number): s.done for s in steps} == {n: len(found) for n, found in good.items()}
+        assert all(s.complete for s in steps) == all(len(good[n]) >= k for n, (_, k) in wanted.items())
+        complete += all(s.complete for s in steps)
+    assert 5 < complete < 195  # both were drawn
+
+
+@pytest.mark.parametrize(("stated", "state"), [
+    ("sit_to_stand", "unusable"), ("tug", "unusable"), ("squat", "unusable"), ("standing", "unusable"),
+    ("walking", "usable"), ("stairs", "usable"), ("fsst", "usable"),
+])  # fmt: skip
+def test_a_walk_is_usable_as_a_walk_alone(walks: dict[str, int], stated: str, state: str):
+    browser = web.client(target=nothing)
+    number = walks[stated]
+    judged = usable(number)
+    assert (judged.state.replace("remarks", "usable"), judged.activity) == (state, stated)
+    if state == "unusable":
+        assert verdict("en", judged).startswith("Film again: ")
+        assert "if something else was filmed, correct its activity" in verdict("en", judged)
+        assert "die Aktivität auf der Seite des Termins berichtigen" in verdict("de", judged)
+    if stated == "sit_to_stand":
+        assert "five rises are needed, 0 were found" in judged.said
+        assert "fünfmal Aufstehen ist nötig, gefunden: 0" in verdict("de", judged)
+    assert browser.get(f"/recordings/{number}").status_code == 200
+
+
+def test_nothing_is_usable_before_it_is_measured(visit: int, tmp_path: Path):
+    """Neither before its cycles are known, nor while the fit waits for another recording of the visit."""
+    browser = phone(visit)
+    send(browser, small_video(tmp_path, "walk").read_bytes())
+    populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints"])
+    assert len(keypoints.Keypoints()) == 1
+    assert usable(1).state == "pending"
+    populate(["TrialInput"])
+    register(small_video(tmp_path, "later", n=60), session_label="2026-01-10")
+    populate(["SessionFit"])  # waits until the other one is decided
+    assert usable(1).state == "pending"
+    populate()
+    assert usable(1).state in ("usable", "remarks")
+    cycles = usable(1).cycles
+    register(small_video(tmp_path, "third"), session_label="2026-01-10")
+    populate()  # a second set of the visit
+    assert usable(1).cycles == cycles  # counted once
+
+
+def test_the_page_says_how_long_a_check_usually_takes(visit: int, tmp_path: Path):
+    reviewer = web.client(target=nothing)
+    assert usual_seconds() is None
+    browser = phone(visit)
+    for name in "abc":
+        send(browser, small_video(tmp_path, name).read_bytes())
+    populate()
+    server = video.Video.connection
+    for number, seconds in ((1, 12), (2, 14), (3, 300)):
+        server.query(
+            f"UPDATE {video.Video.full_table_name} SET video_created = (SELECT MIN(measures_computed) FROM"
+            f" {gait.Spatiotemporal.full_table_name} m WHERE m.video_id = {number}) - INTERVAL {seconds} SECOND"
+            f" WHERE video_id = {number}"
+        )
+    assert usual_seconds() == 14
+    send(browser, small_video(tmp_path, "waits").read_bytes())
+    assert browser.get("/phone/state.json").json()["checked"] == 1
+    for language, told in (("en", "A check usually takes 15 s."), ("de", "Eine Prüfung dauert meist 15 s.")):
+        headers = {"accept-language": language}
+        assert told in browser.get("/phone", headers=headers).text
+        assert told in reviewer.get(f"/visits/{visit}", headers=headers).text
+    assert [usual_words("en", s) for s in (None, 2.0, 91.0)] == ["", "A check usually takes 5 s.",
+                                                                "A check usually takes 2 min."]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -363,9 +363,12 @@ def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
 
 def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch: pytest.MonkeyPatch):
     add_protocol("clinic", [Step(1, "walking", "fast", "left", 1), Step(2, "tug", "", "any", 1)])
+    monkeypatch.setattr(phone, "usual_seconds", lambda: 14.0)
     with filming(camera, visit, protocol="clinic") as page:
         pressed = page.locator(".steps [aria-pressed='true']")
         assert pressed.inner_text() == "Walk, fast, from the left side: 0 of 1"
+        usual = page.locator(".usual")
+        assert usual.is_hidden()
         film(page, 1.5)
         page.locator(".keep").click()
         # It leads on while the server checks, and ticks off what is usable.
@@ -376,12 +379,19 @@ def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch:
         page.locator(".keep").click()
         page.get_by_text("TUG, from any side: 0 of 1; 1 arrived, being checked").wait_for()
         assert page.locator(".complete").inner_text() == ""
-        monkeypatch.setattr(phone_recordings, "verdicts", lambda videos: {v: Usable("usable") for v in videos})
+        assert usual.inner_text() == "A check usually takes 15 s."
+        activities = ("walking", "tug")
+
+        def judged(videos: list[int]) -> dict[int, Usable]:
+            return {v: Usable("usable", activity=a) for v, a in zip(sorted(videos), activities, strict=True)}
+
+        monkeypatch.setattr(phone_recordings, "verdicts", judged)
         with contextlib.closing(connection.plain_connection()) as server, server.cursor() as cursor:
             cursor.execute(f"UPDATE {video.Video.full_table_name} SET video_name = CONCAT(video_name, '.mp4')")
             server.commit()
         page.get_by_text("complete by its protocol").wait_for()
         assert first.inner_text().startswith("\u2713")
+        assert usual.is_hidden()
     assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
     assert list(video.Pace().to_arrays("pace")) == ["fast"]
 

@@ -12,6 +12,7 @@ from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from pbl_schemas import lab, session, study, video
 from pbl_schemas.reading.shown import shown_visit
+from pbl_schemas.reading.visit_list import STATES, Filter, visit_page
 from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
 from pbl_workers.populate import populate
@@ -168,6 +169,92 @@ def test_the_index_stays_while_that_with_an_added_recording_is_computed(tmp_path
     assert anew not in browser.get("/visits/1").text
     populate()
     assert anew not in browser.get("/visits/1").text
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_a_day_typed_as_the_label_is_the_day(language: str):
+    browser = web.client()
+    browser.headers["accept-language"] = language
+    assert new(browser, visit="28.11.2026").status_code == 303
+    visit = session.Session.fetch1()
+    assert (visit["session_label"], str(visit["session_date"])) == ("2026-11-28", "2026-11-28")
+    assert 'id="visit"' in new(browser, visit="28.11.2026").text  # the same visit again is refused
+    assert new(browser, visit="8.12.2026").headers["location"] == "/visits/2"
+    assert "2026-12-08" in browser.get("/visits").text
+
+
+def test_a_day_that_is_missing_is_stated_on_the_page():
+    browser = web.client(name="A. First")
+    new(browser, visit="before surgery", role="pre")
+    new(browser, visit="2026-04-01", role="6_weeks")
+    assert 'name="date"' not in browser.get("/visits/2/facts").text  # its label is the day
+    browser.headers["accept-language"] = "de"
+    assert "ohne Tag" in browser.get("/visits").text
+    page = browser.get("/visits/1/facts").text
+    assert 'name="date" value=""' in page
+    assert "Tag des Termins" in page
+    for wrong, code in (("03/09/2026", "SHEET_FORMAT"), ("1.5.2026", "SHEET_CONFLICT")):  # pre after 6 weeks
+        refused = correct(browser, date=wrong)
+        assert refused.status_code == 200
+        assert code in refused.text, refused.text
+    assert (session.Session & {"session_id": 1}).fetch1("session_date") is None
+    assert correct(browser, date="9.3.2026").status_code == 303
+    assert str((session.Session & {"session_id": 1}).fetch1("session_date")) == "2026-03-09"
+    assert decided()[-1] == ("date", None, "9.3.2026")
+    assert "Tag des Termins" in browser.get("/visits/1").text
+    assert 'value="2026-03-09"' in browser.get("/visits/1/facts").text
+    assert correct(browser, date="").status_code == 200  # a day is corrected, not removed
+
+
+def test_a_second_visit_of_a_role_is_taken_and_said():
+    browser = web.client()
+    new(browser, role="pre")
+    assert "same role" not in browser.get("/visits/1").text
+    assert new(browser, visit="2026-01-20", role="pre").status_code == 303
+    assert study.Visit().to_arrays("visit_role").tolist() == ["pre", "pre"]
+    assert "Another visit of this person has the same role" in browser.get("/visits/2").text
+    german = browser.get("/visits/2", headers={"accept-language": "de"}).text
+    assert "Ein anderer Termin dieser Person hat dieselbe Rolle" in german
+
+
+def test_a_visit_without_recordings_is_not_being_computed(tmp_path: Path):
+    browser = web.client()
+    new(browser)
+    register(small_video(tmp_path, "walk", n=30), session_label="2026-02-01")
+    by_state = {s: [v.session_id for v in visit_page(Filter(state=s)).visits] for s in STATES}
+    assert {s: n for s, n in by_state.items() if n} == {"pending": [2], "unrecorded": [1]}
+    for language, words, wrong in (
+        ("en", "no recordings yet", "being computed or queued"),
+        ("de", "noch keine Aufnahmen", "in Arbeit oder in der Warteschlange"),
+    ):
+        page = browser.get("/visits/1", headers={"accept-language": language}).text
+        heading = page[page.index("<h1>") : page.index("<h2>")]
+        assert words in heading
+        assert wrong not in heading
+
+
+def test_a_visit_with_an_index_is_not_headed_failed(tmp_path: Path):
+    register(small_video(tmp_path, "walk"), session_label="2026-02-01")
+    populate()
+    gone = small_video(tmp_path, "gone")
+    register(gone, session_label="2026-02-01")
+    gone.unlink()
+    populate()
+    (row,) = visit_page(Filter()).visits
+    assert row.result is not None
+    assert row.result.index is not None
+    assert (row.state, row.problem) == ("computed", "VIDEO_MISSING")
+    assert [s for s in STATES if visit_page(Filter(state=s)).visits] == ["computed", "failed"]  # it is found by both
+    browser = web.client()
+    for language, words, failed in (
+        ("en", "computed, but a part failed", ">failed"),
+        ("de", "berechnet, aber ein Teil ist fehlgeschlagen", ">fehlgeschlagen"),
+    ):
+        for address in ("/visits/1", "/visits"):
+            page = browser.get(address, headers={"accept-language": language}).text
+            assert words in page
+            heading = page[page.index("<h1>") :].partition("<h2>" if address != "/visits" else "</h1>")[0]
+            assert failed not in heading
 
 
 def test_roles_against_their_days_are_refused_as_those_of_a_sheet():

@@ -68,7 +68,7 @@ def test_each_change_is_a_row_with_what_was_before(two_visits: None):
         ({"TUG": "1,234"}, "SHEET_FORMAT", "a number with a decimal point"),
         ({"mJOA": "1_2"}, "SHEET_FORMAT", "a number"),
         ({"mJOA": "<script>"}, "SHEET_FORMAT", "&lt;script&gt;"),
-        ({"role": "6 Weeks"}, "SHEET_FORMAT", "small letters"),
+        ({"role": "Six Weeks"}, "SHEET_FORMAT", "small letters"),
         ({"role": ""}, "SHEET_FORMAT", "no role"),
         ({"role": "x" * 33}, "SHEET_FORMAT", "small letters"),
     ],

@@ -119,7 +119,7 @@ def test_a_mark_waits_for_nobody_and_nobody_for_it(tables: None, tmp_path: Path)
     gone = register(lost, session_label="2026-01-10")[0]
     lost.unlink()
     populate()
-    assert (state(), visit_page(Filter()).visits[0].problem) == ("failed", "VIDEO_MISSING")
+    assert (state(), visit_page(Filter()).visits[0].problem) == ("waiting", "VIDEO_MISSING")
     review_decisions.mark_not_usable(gone, "other", "the file is lost")
     assert state() == "waiting"
     review_decisions.mark_not_usable(waits, "other_person")

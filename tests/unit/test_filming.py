@@ -81,7 +81,13 @@ def test_views_of_a_visit():
 
 
 def test_words_of_what_is_stated():
-    assert [stated(t) for t in ("", " None ", "no", "Cane  left")] == [(), (), (), ("cane left",)]
+    words = ("", " None ", "keine", "Rollator", "My  own")
+    assert [stated("aid", t) for t in words] == [(), ("none",), ("none",), ("walker",), ("my own",)]
+    none, unknown = dataclasses.replace(FROM_LEFT, aid=("none",)), FROM_LEFT
+    assert differences(none, unknown) == differences(unknown, none) == ()
+    cane = dataclasses.replace(FROM_LEFT, aid=("cane",))
+    assert [str(d) for d in differences(cane, none)] == ["aid (cane, before: none)"]
+    assert [str(d) for d in differences(cane, unknown)] == ["aid (cane, before: not stated)"]
     assert [height_word(h) for h in (None, math.nan, 1.7)] == ["not_stated", "not_stated", "stated"]
     sizes = [(1920, 1080), (1080, 1920), (1728, 972), (960, 540), (1280, 720), (3840, 2160), (0, 0)]
     assert [picture_class(*s) for s in sizes] == ["1080p", "1080p", "1080p", "480p", "720p", "2160p", ""]

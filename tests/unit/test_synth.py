@@ -1,6 +1,6 @@
 """`synthesise`: is it a normal walk, do the feet stand, do impairments show, is the truth true of the keypoints?
 
-Bounds are about 1.5 times what was measured (docs/synth.md).
+Bounds are about 1.5 times what was measured (research/reports/2026-11-29_parts.md).
 """
 
 import dataclasses

@@ -584,3 +584,17 @@ def test_a_visit_that_was_never_fitted_is_saved_and_read(tmp_path: Path) -> None
     found = load_visit(tmp_path, measures=False)
     assert_same(as_stored(Visit((dark(),), subject="P017", methods=METHODS)), found)
     assert found.solution is None
+
+
+def test_a_check_that_fails_in_a_recording_without_a_cycle_that_counts_is_a_warning(two: Visit):
+    judged = not_none(two.judged)
+    walk, back = judged.trials
+    idle = dataclasses.replace(back, cycles=())
+    for name, trials, outcome in (
+        ("back", (walk, idle), WARN),
+        ("walk", (walk, idle), FAIL),
+        ("back", (walk, back), FAIL),
+        ("back", (dataclasses.replace(walk, cycles=()), idle), FAIL),  # not known which counts
+    ):
+        failed = Check(f"feet_cut_share ({name})", FAIL, 0.4, 0.3, "step back")
+        assert dataclasses.replace(judged, trials=trials, before=(failed,), qc=()).outcome == outcome, (name, trials)

@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import io
 import json
+import os
 import re
 import zipfile
 from pathlib import Path
@@ -194,4 +195,8 @@ def test_results_are_found_again_when_they_were_made_anew(results, tmp_path):
     before = folder.state(1)
     walking_fit(name="walk", n_frames=200).save(out / "walk.fit.npz")
     assert folder.state(1) != before
+    for file in out.iterdir():  # also its cycles
+        before = folder.state(1)
+        os.utime(file, ns=(0, 0))
+        assert folder.state(1) != before, file.name
     assert len(not_none(folder.recording(1).recording.fit).time_s) == 200

@@ -260,6 +260,23 @@ def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tm
     assert given_gpus() == expected
 
 
+def test_use_and_memory_of_gpus_are_among_the_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def found() -> dict[tuple[str, str], float]:
+        samples = [s for figure in metrics.machine_figures() for s in figure.samples if s.name.startswith("pbl_gpu")]
+        return {(s.name, s.labels["gpu"]): s.value for s in samples}
+
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert found() == {}
+    program(tmp_path, "nvidia-smi", 'echo "0, 37, 1024, 2048"\necho "1, [N/A], 0, 2048"')
+    assert found() == {
+        ("pbl_gpu_busy_ratio", "0"): 0.37,
+        ("pbl_gpu_memory_used_bytes", "0"): 2.0**30,
+        ("pbl_gpu_memory_used_bytes", "1"): 0.0,
+        ("pbl_gpu_memory_size_bytes", "0"): 2.0**31,
+        ("pbl_gpu_memory_size_bytes", "1"): 2.0**31,
+    }
+
+
 def test_processes_are_dealt_to_the_gpus_evenly():
     options = Options(processes=5, gpus=("a", "b"))
     assert [options.of_process(i).gpus for i in range(5)] == [("a",), ("b",), ("a",), ("b",), ("a",)]

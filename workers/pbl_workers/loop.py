@@ -128,6 +128,7 @@ class Worker:
     found: refresh.Refreshed = dataclasses.field(default_factory=refresh.Refreshed)
     _taken: Counter[str] = dataclasses.field(default_factory=Counter)
     _refreshed: float = -1e9
+    _checked: float = -1e9
     _everything: bool | None = None
     _in_hand: int | None = None  # video_id of the recording that was read last
     _looked_for_long: float = -1e9
@@ -139,6 +140,9 @@ class Worker:
         while not self.stop.is_set() and (max_jobs is None or self.done + self.failed < max_jobs):
             try:
                 n = self.step()
+                if time.monotonic() - self._checked > REFRESH_EVERY_S:
+                    tables_version.refuse_newer()  # after a migration it ends, and its successor does not start
+                    self._checked = time.monotonic()
                 found = bool(n) or self._refresh()
             except run_job.DATABASE_ERRORS as error:
                 troubled += 1
@@ -278,7 +282,6 @@ class Worker:
             return None if held or any(queue.most_urgent(t, where) is not None for t, where in ours.items()) else False
         if self.phone or (time.monotonic() - self._refreshed < REFRESH_EVERY_S and self._refreshed > 0):
             return False
-        tables_version.refuse_newer()  # after a migration meanwhile this worker ends, and its successor does not start
         self.heartbeat.doing("looks at all tables")
         found = refresh.refresh(self._everything)
         if found is None:

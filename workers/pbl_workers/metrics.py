@@ -17,6 +17,7 @@ from pbl_schemas import worker
 from pbl_schemas.operations.archive import disks
 from pbl_schemas.reading import status
 
+from .process import gpus
 from .queue import Claim
 from .run_job import Outcome
 
@@ -66,13 +67,13 @@ class KeptReports(Metrics):
 class _Installation(Collector):
     """Figures of the installation, as a thread last read them: a request never waits for the database or a disk.
 
-    One worker of all shows the database's, so that they sum up right; each shows the disks of its machine.
+    One worker of all shows the database's, so that they sum up right; each shows disks and GPUs of its machine.
     """
 
     def __init__(self, connect: Callable[[], Any]) -> None:
         self._connect = connect
         self._figures: list[GaugeMetricFamily] = []
-        self._disks: list[GaugeMetricFamily] = []
+        self._machine: list[GaugeMetricFamily] = []
         self._read = -math.inf  # time of the last answer
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="installation", daemon=True)
@@ -87,7 +88,7 @@ class _Installation(Collector):
         """The figures, while they are not too old, and whether they are."""
         answers = time.monotonic() - self._read < FRESH_S
         yield from (self._figures if answers else ())
-        yield from self._disks
+        yield from self._machine
         yield GaugeMetricFamily("pbl_database_up", "1 when the database answers", int(answers))
 
     def _run(self) -> None:
@@ -97,7 +98,7 @@ class _Installation(Collector):
                     self._look(server)
             except Exception:  # noqa: BLE001  away: it is asked again, until it is closed
                 self._figures, self._read = [], -math.inf
-                self._disks = disk_figures()
+                self._machine = machine_figures()
             self._closed.wait(READ_EVERY_S)
 
     def _look(self, server: Any) -> None:
@@ -109,21 +110,30 @@ class _Installation(Collector):
             # A connection that was made anew has lost the lock.
             while server.query("SELECT CONNECTION_ID()").fetchone()[0] == number:
                 self._figures = figures(server) if ours else []
-                self._disks, self._read = disk_figures(), time.monotonic()
+                self._machine, self._read = machine_figures(), time.monotonic()
                 if not ours or self._closed.wait(READ_EVERY_S):
                     return
         self._figures = []
 
 
-def disk_figures() -> list[GaugeMetricFamily]:
-    """Free and total bytes of the disks of this machine."""
+def machine_figures() -> list[GaugeMetricFamily]:
+    """Free and total bytes of the disks of this machine; use and memory of its NVIDIA GPUs."""
     free = GaugeMetricFamily("pbl_disk_free_bytes", "Free space of a disk", labels=["disk"])
     size = GaugeMetricFamily("pbl_disk_size_bytes", "Size of a disk", labels=["disk"])
     with contextlib.suppress(OSError):
         for name, free_gb, size_gb in disks():
             free.add_metric([name], 1e9 * free_gb)
             size.add_metric([name], 1e9 * size_gb)
-    return [free, size]
+    columns = {
+        "utilization.gpu": GaugeMetricFamily("pbl_gpu_busy_ratio", "Share of time that a GPU works", labels=["gpu"]),
+        "memory.used": GaugeMetricFamily("pbl_gpu_memory_used_bytes", "Memory of a GPU in use", labels=["gpu"]),
+        "memory.total": GaugeMetricFamily("pbl_gpu_memory_size_bytes", "Memory of a GPU", labels=["gpu"]),
+    }
+    for index, *values in gpus(*columns):
+        for (name, figure), value in zip(columns.items(), values, strict=True):
+            with contextlib.suppress(ValueError):  # "[N/A]": it does not measure that
+                figure.add_metric([index], float(value) * (0.01 if name == "utilization.gpu" else 2**20))
+    return [free, size, *columns.values()]
 
 
 def figures(server: Any) -> list[GaugeMetricFamily]:

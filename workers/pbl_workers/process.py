@@ -28,17 +28,22 @@ VISIBLE = "CUDA_VISIBLE_DEVICES"
 QUERY_S = 30.0
 
 
+def gpus(*columns: str) -> list[list[str]]:
+    """Index and these columns of `nvidia-smi` of each GPU of the machine, as text; none without an NVIDIA driver."""
+    query = ["nvidia-smi", f"--query-gpu={','.join(('index', *columns))}", "--format=csv,noheader,nounits"]
+    try:
+        done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [[cell.strip() for cell in line.split(",")] for line in done.stdout.splitlines()]
+
+
 def given_gpus() -> tuple[str, ...]:
     """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
     none if there is no NVIDIA driver."""
     listed = os.environ.get(VISIBLE)
     if listed is None:
-        query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
-        try:
-            done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
-            listed = ",".join(done.stdout.split())
-        except (OSError, subprocess.SubprocessError):
-            return ()
+        listed = ",".join(row[0] for row in gpus())
     return tuple(name for name in map(str.strip, listed.split(",")) if name not in ("", "-1", "NoDevFiles"))
 
 

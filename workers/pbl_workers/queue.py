@@ -22,6 +22,7 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
+from pbl_schemas.rows import parts
 from pbl_schemas.transactions import repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
@@ -80,6 +81,8 @@ def fill(
     jobs, quote = jobs_of(table), table.connection.adapter.quote_identifier
     source = keys_of(table)
     if keys is not None:
+        if len(some := list(parts(keys))) > 1:
+            return sum(fill(table, part, priority, where) for part in some)
         source = source & [dict(k) for k in keys]
     if where is not None:
         source = source & where
@@ -124,20 +127,25 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 # --------------------------------------------------------------------------------------------------- reserving, ending
 def most_urgent(table: Any, where: str | None = None) -> int | None:
     """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
-    jobs = jobs_of(table)
-    row = jobs.connection.query(
-        f"SELECT priority FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
-        " AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT 1"
-    ).fetchone()
-    return None if row is None else int(row[0])
+    rows = _ready(jobs_of(table), "priority", 1, where)
+    return int(rows[0]["priority"]) if rows else None
+
+
+def _ready(jobs: Any, columns: str, n: int, where: str | None) -> list[dict[str, Any]]:
+    """Return columns of the first n jobs that can be taken now. Plain SQL: half of DataJoint's time for a query."""
+    rows = jobs.connection.query(
+        f"SELECT {columns} FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
+        f" AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT {n}",
+        as_dict=True,
+    )
+    return list(rows.fetchall())
 
 
 def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
     """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so. `where`: as for
     `most_urgent`."""
     jobs = jobs_of(table)
-    ready = jobs.pending & "scheduled_time <= CURRENT_TIMESTAMP(3)" & (where or True)
-    rows = ready.proj("priority", "attempts").to_dicts(order_by="priority, scheduled_time", limit=_SPREAD * n)
+    rows = _ready(jobs, ", ".join((*jobs.primary_key, "priority", "attempts")), _SPREAD * n, where)
     claims: list[Claim] = []
     # All workers see the same candidates: a random order within a priority makes two hands on one job rare.
     rows.sort(key=lambda r: (r["priority"], random.random()))  # noqa: S311

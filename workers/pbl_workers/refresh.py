@@ -9,6 +9,7 @@ from typing import Any
 
 from pbl_schemas import chain, fit, review, tracking, video, worker
 from pbl_schemas.reading.visit_progress import Scope, of_visit
+from pbl_schemas.rows import inside
 from pbl_schemas.worker import installation_lock
 
 from . import queue, recover
@@ -65,7 +66,7 @@ def sessions_of(keys: Iterable[dict[str, Any]]) -> list[int]:
     ids = sorted({int(k["video_id"]) for k in keys if "video_id" in k})
     if not ids:
         return []
-    return sorted({int(s) for s in (video.Video & [{"video_id": i} for i in ids]).to_arrays("session_id")})
+    return sorted({int(s) for s in (video.Video & inside("video_id", ids)).to_arrays("session_id")})
 
 
 def plan(sessions: Sequence[int] | None = None, priority: int = NEW) -> int:
@@ -96,8 +97,6 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
             some = server.query(f"SELECT 1 FROM {video.Video.full_table_name} LIMIT {FEW}").fetchall()  # noqa: S608
             everything = len(some) < FEW or _age_of_full_look() > ALL_EVERY_S
         lately = None if everything else recent()
-        if lately is not None and len(lately.videos) > FEW:  # an archive that was just registered
-            lately = None
         out = _queue_missing(lately)
         if lately is None:
             server.query(
@@ -108,15 +107,15 @@ def refresh(everything: bool | None = None) -> Refreshed | None:
         return out
 
 
-def recent() -> Scope:
+def recent() -> Scope | None:
     """Recordings that something from outside may have happened to lately, and their sessions: registered, or decided
-    about by a person, in the last `RECENT_DAYS`."""
+    about by a person, in the last `RECENT_DAYS`; None if they are many, as of an archive that was just registered."""
     since = f">= CURRENT_TIMESTAMP - INTERVAL {RECENT_DAYS} DAY"
     ids = {int(v) for v in (video.Video & f"video_created {since}").to_arrays("video_id")}
     ids |= {int(v) for v in (tracking.SubjectOverride & f"override_created {since}").to_arrays("video_id")}
     decided = review.Decision & f"decision_at {since}" & "video_id is not null"
     ids |= {int(v) for v in decided.to_arrays("video_id")}
-    return Scope(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
+    return None if len(ids) > FEW else Scope(sorted(ids), sessions_of([{"video_id": v} for v in ids]))
 
 
 def refresh_scope(scope: Scope) -> Refreshed:

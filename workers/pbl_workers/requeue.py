@@ -9,14 +9,14 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from pbl_schemas import computed_tables, fit, gait, gdi, keypoints, kinetics, tracking, video
-from pbl_schemas.connection import dj
+from pbl_schemas.datajoint_setup import columns_read_once, dj
 from pbl_schemas.intake import Methods
 from pbl_schemas.intake.registration import resolve as resolve_ingest
 from pbl_schemas.jobs import jobs_of, keys_of
 from pbl_schemas.method_names import keys_named
 from pbl_schemas.method_rows import resolve_method
 from pbl_schemas.plan import default_fit, plan_fits, unsuited
-from pbl_schemas.rows import delete_below
+from pbl_schemas.rows import delete_below, inside, parts
 
 from . import queue
 from .registry import AGAIN, table_named
@@ -31,7 +31,7 @@ OUTSIDE = (
     "STORE_UNAVAILABLE",
     "MACHINE_SHORT",
 )
-#: Rows deleted in one transaction.
+#: Rows deleted in one transaction, and most of which the dependent ones are counted before.
 CHUNK = 200
 
 
@@ -60,9 +60,9 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
     names = jobs_of(table).primary_key
     if "video_id" in names:
         trial = fit.trial_of(video_id)
-        return (jobs_of(table).errors & [{"video_id": v} for v in {video_id, trial}]).keys()
-    sets = [{"fit_set": s} for s in (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set")]
-    return (jobs_of(table).errors & sets).keys() if sets else []
+        return (jobs_of(table).errors & inside("video_id", {video_id, trial})).keys()
+    sets = (fit.FitSet.Video & {"video_id": video_id}).to_arrays("fit_set").tolist()
+    return (jobs_of(table).errors & inside("fit_set", sets)).keys()
 
 
 # ---------------------------------------------------------------------------------------------------------- reprocess
@@ -146,10 +146,11 @@ def plan_again(
         rows = rows & f"{prefix}_computed < '{before:%Y-%m-%d %H:%M:%S}'"
     keys = rows.keys()
     below = {}
-    if keys and len(keys) <= 10 * CHUNK:
-        counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
+    if keys and len(keys) <= CHUNK:
+        with columns_read_once():
+            counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
         below = {n: c for n, c in counts.items() if c}
-    unasked = len(keys) - len(keys_of(one) & keys) if keys else 0
+    unasked = len(rows.proj().restrict(dj.Not(keys_of(one)), semantic_check=False))
     return Reprocess(one.__name__, [], keys, below, unasked=unasked)
 
 
@@ -171,12 +172,12 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
     one = table_named(plan.table)
     if plan.add:
         _, selection, _ = _SELECTIONS[plan.table]
-        for i in range(0, len(plan.add), 50 * CHUNK):
-            part = plan.add[i : i + 50 * CHUNK]
+        done = 0
+        for part in parts(plan.add):
             selection.insert(part, skip_duplicates=True)
             if plan.fit_method is not None:
                 plan_fits(part, plan.fit_method)
-            yield min(i + 50 * CHUNK, len(plan.add))
+            yield (done := done + len(part))
         # A new plan of fits makes keys computable of the table before it, which plans the sets.
         queue.fill(table_named("TrialInput") if one is fit.SessionFit else one, None, AGAIN)
     for i in range(0, len(plan.outdated), CHUNK):

@@ -124,7 +124,7 @@ def migrate(dry_run: bool, force: bool) -> None:
     for line in migrations.workers_of_other_versions():
         click.echo(f"  still running: {line}")
     outcome = migrations.migrate(dry_run, click.echo, force)
-    for line in outcome.created:
+    for line in (*outcome.created, *(outcome.touched if dry_run else ())):  # else they were said before it was done
         click.echo(f"  {line}")
     for title, statements in outcome.steps:
         click.echo(f"{title}: {len(statements)} statements")

@@ -141,9 +141,12 @@ def _write_many(
     from pbl_pipeline.export import GAIT_FORMATS, Labels, write_export
     from pbl_pipeline.files import check_no_link
     from pbl_schemas.reading import list_fitted, load_visits
+    from pbl_schemas.studies.slices import changes
 
     pbl_schemas.activate(methods=False)
     visits = list_fitted(wanted, slice_name)
+    for text in [] if slice_name is None else changes(slice_name):
+        click.echo(f"changed since it was frozen: {text}", err=True)
     gait = bool(GAIT_FORMATS & set(formats))
     refused = 0
     with progress.bar("export", len(visits), "visit") as update:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,12 +63,16 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
 
 @click.command(
     "slice",
-    epilog="\b\nExample: pbl study slice spine2026 --cohort dcm --role pre --role 6_weeks --event surgery\n"
+    epilog="\b\nExample: pbl study slice spine2026 --cohort dcm --role pre --role 6_weeks --dry-run\n"
+    "Example: pbl study slice spine2026 --cohort dcm --role pre --role 6_weeks --event surgery\n"
     "Example: pbl study slice spine2026",
 )
 @click.argument("name", required=False)
 @click.option("--cohort", metavar="NAME", help="Visits of the people of this cohort (else: of all).")
 @click.option("--role", "roles", multiple=True, help="Visits of this role; repeat for several (else: all).")
+@click.option("--all", "every", is_flag=True, help="Visits of all people and roles.")
+@click.option("--dry-run", is_flag=True, help="Freeze nothing; print the visits, and why others do not count.")
+@click.option("--withdraw", is_flag=True, help="Delete the slice, as long as nothing refers to it.")
 @click.option("--event", default="", help="What the days of the visits count from, such as surgery.")
 @click.option("--note", default="", help="Shown on the report.")
 @kind_option
@@ -76,12 +81,23 @@ def import_(sheets: tuple[Path, ...], template: Path | None, dry_run: bool, dist
 @click.option("--gait", "gait_method", help="Event method, where the tables hold several.")
 @click.option("--index", "gdi_method", help="Method of the index, where the tables hold several.")
 @click.option("--norm", help="Normative set, where the tables hold several.")
-def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: str, note: str, **methods: str) -> None:
-    """Freeze visits and methods under NAME; for an existing slice print the changes since. Without NAME list all.
+def slice_(
+    name: str | None,
+    cohort: str | None,
+    roles: tuple[str, ...],
+    every: bool,
+    dry_run: bool,
+    withdraw: bool,
+    event: str,
+    note: str,
+    **methods: str,
+) -> None:
+    """Freeze visits and methods under NAME; with NAME alone print what changed since. Without NAME list all.
 
     Methods are named by their key, such as blazepose-v5, or short, such as blazepose: the newest version with results.
     """
     import pbl_schemas
+    from pbl_pipeline.texts import code_of
     from pbl_schemas import study
     from pbl_schemas.studies import slices
 
@@ -91,7 +107,14 @@ def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: 
             cohort_name = row["cohort"] or "everybody"
             click.echo(f"{row['study_slice']:<32} {row['slice_hash']}  {row['slice_n']} visits of {cohort_name}")
         return
-    if study.StudySlice & {"study_slice": name} and not (cohort or roles or event or note):
+    if every and (cohort or roles):
+        raise click.UsageError("--all and --cohort or --role: choose one.")
+    if withdraw:
+        slices.withdraw(name, getpass.getuser())
+        click.echo(f"{name}: withdrawn")
+        return
+    wanted = {k: v for k, v in methods.items() if v}
+    if not (cohort or roles or every or dry_run or event or note or wanted):
         changed = slices.changes(name)
         for text in changed:
             click.echo(text)
@@ -99,8 +122,11 @@ def slice_(name: str | None, cohort: str | None, roles: tuple[str, ...], event: 
         if changed:
             raise click.exceptions.Exit(1)
         return
-    made = slices.freeze(name, cohort, roles, {k: v for k, v in methods.items() if v}, event, note)
-    click.echo(f"{made.name}: {made.n} visits, {made.n_included} count, hash {made.hash}")
+    made = slices.freeze(name, cohort, [code_of("role", r) for r in roles], wanted, event, note, dry_run)
+    for subject, visit, reason in made.visits if dry_run else ():
+        click.echo(f"{subject} {visit}: {f'does not count: {reason}' if reason else 'counts'}")
+    done = "would be frozen: " if dry_run else ""
+    click.echo(f"{made.name}: {done}{made.n} visits, {made.n_included} count, hash {made.hash}")
 
 
 @click.command(epilog="Example: pbl study export --slice spine2026 --out spine2026 --key spine2026_key.csv")
@@ -152,8 +178,6 @@ def instrument() -> None:
 @click.option("--change-source", default="", metavar="TEXT", help="Who found the minimal important change, in whom.")
 def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     """Add the instrument NAME, which is then a column of sheets and a field of the web page."""
-    import getpass
-
     import pbl_schemas
     from pbl_schemas.studies.study_sheets import add_instrument
 

@@ -10,6 +10,7 @@ from typing import Any
 from pbl_pipeline.words import UNUSABLE
 
 from .. import video
+from ..rows import inside, parts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +32,7 @@ class Unusable:
 
 def unusable(videos: Iterable[int]) -> dict[int, Unusable]:
     """Return the marks of these recordings by number."""
-    keys = [{"video_id": int(v)} for v in videos]
-    return {m.video_id: m for m in _marks(keys)} if keys else {}
+    return {m.video_id: m for some in parts(videos) for m in _marks(inside("video_id", map(int, some)))}
 
 
 def all_unusable(most: int = 200) -> list[Unusable]:

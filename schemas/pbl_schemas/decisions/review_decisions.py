@@ -265,6 +265,20 @@ def is_accepted(row: Mapping[str, Any], about: Mapping[str, Any]) -> bool:
     return (str(row["qc_computed"]), int(row["qc_no"])) == (about["computed"], int(about["qc_no"]))
 
 
+def accepted_sql(check: str, checks: str, of_visit: str) -> str:
+    """Condition in SQL: a check is one that `is_accepted` of any decision about its visit. The arguments are aliases of
+    SessionQc.Check, SessionQc and a table with `session_id`."""
+    about = "JSON_VALUE(d.decision_about, '$.{}')".format
+    same = " AND ".join(f"{about(k)} = {check}.{k}" for k in qc.SessionQc.primary_key)
+    cadence = f"{check}.qc_check = '{CADENCE}' AND {about('check')} = '{CADENCE}'"
+    return (
+        f"EXISTS (SELECT 1 FROM {Decision.full_table_name} d WHERE d.session_id = {of_visit}.session_id"  # noqa: S608
+        f" AND d.decision_what = 'check' AND {same} AND (({cadence}"
+        " AND JSON_CONTAINS_PATH(d.decision_about, 'one', '$.cadence'))"
+        f" OR ({about('computed')} = CAST({checks}.qc_computed AS CHAR) AND {about('qc_no')} = {check}.qc_no)))"
+    )
+
+
 def record(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:
     """Insert a row of Decision; `of`: session_id or video_id. Inside the transaction of what was decided."""
     Decision.insert1(

@@ -90,17 +90,22 @@ def protocols() -> list[str]:
 
 
 def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> list[Step]:
-    """Return the steps of the protocol of a visit's newest link, with what its `phone_recordings.recordings` have done;
-    none without a protocol."""
+    """Return the steps of the protocol of a visit's newest link, with what its `phone_recordings.recordings` have done,
+    a video once, and only where the activity of the step is registered; none without a protocol."""
+    from pbl_pipeline.gait import Condition
+
     links = (PhoneLink & {"session_id": session_id}).to_dicts(order_by="phone_link DESC")
     if not links or links[0]["protocol"] is None:
         return []
-    of = collections.Counter((one.about.get("step"), judged.state) for one, judged in sent if judged is not None)
-    return [
-        dataclasses.replace(step, done=of[number, USABLE] + of[number, REMARKS], waiting=of[number, PENDING])
-        for step in _steps(links[0]["protocol"])
-        for number in [str(step.number)]
-    ]
+    once = {one.video_id: (one.about.get("step"), judged) for one, judged in sent if judged is not None}
+    of = collections.Counter((step, judged.activity, judged.state) for step, judged in once.values())
+    out = []
+    for step in _steps(links[0]["protocol"]):
+        usable, remarks, waiting = (
+            of[str(step.number), Condition(step.activity).activity, state] for state in (USABLE, REMARKS, PENDING)
+        )
+        out.append(dataclasses.replace(step, done=usable + remarks, waiting=waiting))
+    return out
 
 
 def _steps(name: str) -> list[Step]:

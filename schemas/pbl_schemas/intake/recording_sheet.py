@@ -14,7 +14,7 @@ from pbl_pipeline.progress import track
 from pbl_pipeline.video import recorded_utc
 
 from .. import lab, session
-from ..rows import inside
+from ..rows import rows_inside
 from ..subject_codes import day_of
 from ..transactions import in_transaction
 from ..video import CAMERA_MOTIONS
@@ -169,7 +169,7 @@ def _check_day(one: OneCamera, line: Line) -> None:
 def _check_people(visits: Sequence[VisitRecord | None], lines: Sequence[Line]) -> None:
     """Refuse rows that cannot all be true: one label for two days, one person in two groups or under two codes."""
     codes = {visit.subject for visit in visits if visit is not None}
-    stored = (session.Session & inside("subject", codes)).to_dicts()
+    stored = rows_inside(session.Session(), "subject", codes)
     dates = {key: r["session_date"] for key, r in session.by_label(stored).items()}
     similar = similar_codes(codes, map(str, lab.Subject().to_arrays("subject")))
     first: dict[tuple[str, ...], object] = {}

@@ -14,9 +14,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import check_height, check_label, check_mass, is_plain, normalised_label
 from pbl_pipeline.records import number
+from pbl_pipeline.texts import code_of
 
 from .. import fit, gait, gdi, kinetics, lab, linking, session, video
-from ..rows import counted, delete_below, inside, utc_now
+from ..rows import counted, delete_below, inside, rows_inside, utc_now
 from ..session import UNLABELLED
 from ..subject_codes import check_subject, day_of
 from ..transactions import next_id
@@ -97,10 +98,10 @@ class VisitRecord:
     mass_kg: float | None = None  # of the person at the visit
 
     def __post_init__(self) -> None:
-        """Normalise the labels, so that all ways into the tables agree."""
+        """Normalise the labels and codes, so that all ways into the tables agree."""
         for name in ("subject", "session_label", "project", "activity", "pace", "population"):
             if isinstance(text := getattr(self, name), str):
-                object.__setattr__(self, name, normalised_label(text))
+                object.__setattr__(self, name, code_of(name, normalised_label(text)))
 
     def check(self, key: object = None) -> None:
         """Raise `PblError` USAGE for a code that could be a name or a label too long; FIT_INPUT for height or mass."""
@@ -248,7 +249,7 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     visits = list(dict.fromkeys(visits))
     add_people(visits)
     keys = list(dict.fromkeys((v.subject, v.session_label) for v in visits))
-    rows = (session.Session & inside("subject", {v.subject for v in visits})).to_dicts()
+    rows = rows_inside(session.Session(), "subject", (v.subject for v in visits))
     stored = session.by_label(rows)
     missing = [key for key in keys if key not in stored]
     numbers = {key: int(r["session_id"]) for key, r in stored.items()}
@@ -282,7 +283,7 @@ def add_people(visits: Iterable[VisitRecord]) -> None:
     codes = list(dict.fromkeys(v.subject for v in visits))
     projects = {v.subject: v.project for v in reversed(visits) if v.project}
     lab.Project.insert(({"project": p} for p in {*projects.values()}), skip_duplicates=True)
-    known = set((lab.Subject & inside("subject", codes)).to_arrays("subject"))
+    known = {r["subject"] for r in rows_inside(lab.Subject.proj(), "subject", codes)}
     about = {"population": "unknown", "subject_created": utc_now()}
     new = ({"subject": code, "project": projects.get(code), **about} for code in codes if code not in known)
     lab.Subject.insert(new, skip_duplicates=True)

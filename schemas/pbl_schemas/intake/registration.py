@@ -19,8 +19,9 @@ from ..datajoint_setup import DuplicateError, dj
 from ..jobs import forget_errors
 from ..method_rows import resolve_method
 from ..methods import insert_once
+from ..operations import catalog
 from ..plan import default_fit
-from ..rows import utc_now
+from ..rows import PART, inside, rows_inside, utc_now
 from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of
 from .records import (
@@ -106,7 +107,7 @@ def _of_videos(
         subject = {"subject_method": chosen["subject_method"]}
         yield tracking.TrackingSelection, [{**t, **subject} for t in trackings]
     elif "keypoint_method" in named:
-        trackings = (tracking.TrackingSelection & [{"video_id": v} for v in videos]).keys()
+        trackings = (tracking.TrackingSelection & inside("video_id", videos)).keys()
     if named & {"tracking_method", "keypoint_method"}:
         yield keypoints.KeypointSelection, [{**t, **points} for t in trackings]
     if named & {"keypoint_method", "fit_method"}:
@@ -157,6 +158,8 @@ def register(recordings: Iterable[Recording], methods: Methods | None = None) ->
             done += [Registered(path, "refused", error=wrong.error_of(path)) for path in recording.paths]
         except PblError as error:
             done += [Registered(path, "refused", error=error) for path in recording.paths]
+    if len(done) > PART:
+        catalog.analyse()
     return done
 
 
@@ -175,7 +178,7 @@ def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> lis
 def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:
     """Return the rows of Video with the bytes of these files, by SHA-256, with subject and label of the session."""
     videos = video.Video * session.Session.proj("subject", "session_label")
-    rows = (videos & [{"video_sha256": file.sha256} for file in files]).to_dicts()
+    rows = rows_inside(videos, "video_sha256", (file.sha256 for file in files))
     return {row["video_sha256"]: row for row in rows}
 
 

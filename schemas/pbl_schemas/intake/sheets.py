@@ -21,7 +21,7 @@ from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.workbook import READ_BYTES, READ_S, read_workbook
 
-from ..subject_codes import folded
+from ..subject_codes import day_of, folded, iso_label
 
 #: A `PblError` SHEET_CONFLICT about rows that cannot all be true.
 conflict = functools.partial(PblError, "SHEET_CONFLICT")
@@ -133,12 +133,9 @@ def needed(row: Row, column: str) -> str:
 
 def date_of(row: Row, column: str) -> datetime.date:
     """The day in a cell. Raises `PblError` SHEET_FORMAT for what is written neither YYYY-MM-DD nor D.M.YYYY."""
-    text = row.cells[column]
-    if match := re.fullmatch(r"(\d\d?)\.(\d\d?)\.(\d{4})", text):
-        text = f"{match[3]}-{int(match[2]):02}-{int(match[1]):02}"
-    if re.fullmatch(r"\d{4}-\d\d-\d\d", text):
-        with contextlib.suppress(ValueError):
-            return datetime.date.fromisoformat(text)
+    text = iso_label(row.cells[column])
+    if re.fullmatch(r"\d{4}-\d\d-\d\d", text) and (day := day_of(text)) is not None:
+        return day
     raise refused(
         f"{column} {row.cells[column]!r}",
         "a day as YYYY-MM-DD, such as 2026-03-09, or as 9.3.2026, or a date cell of a workbook",

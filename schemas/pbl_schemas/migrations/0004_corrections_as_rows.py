@@ -46,6 +46,25 @@ def statements(conn: Any) -> list[str]:
     return out
 
 
+def changed(conn: Any) -> list[tuple[str, str]]:
+    """Set and gait_method of the results that will be of corrected events, or are computed again."""
+    out: list[tuple[str, str]] = []
+    if _columns(conn, hand := _gait("hand_events")):
+        members = quote(connection.schema_name("fit"), "fit_set__video")
+        keypoints = quote(connection.schema_name("keypoints"), "__keypoints")
+        corrected = conn.query(
+            f"SELECT DISTINCT g.fit_set, g.gait_method FROM {hand} AS h JOIN {members} AS v USING (video_id)"
+            f" JOIN {_gdi('__session_gdi')} AS g ON g.fit_set = v.fit_set AND g.gait_method = h.hand_from"
+            f" LEFT JOIN {keypoints} AS k ON k.video_id = v.video_id AND k.tracking_method = v.tracking_method"
+            " AND k.keypoint_method = v.keypoint_method"
+            " WHERE v.tracking_method <=> h.hand_tracking AND k.keypoints_person_id <=> h.hand_person"
+        )
+        out += corrected.fetchall()
+    if _columns(conn, visits := _gdi("__session_gdi")):
+        out += conn.query(f"SELECT fit_set, gait_method FROM {visits} AS t0 WHERE {_missing()}").fetchall()
+    return out
+
+
 def _corrections(conn: Any) -> list[str]:
     """Rows of EventCorrection, the results by hand as those of the corrected method, and the end of what was before."""
     cycles, visits, corrections = _gait("__gait_cycle"), _gdi("__session_gdi"), _gait("event_correction")
@@ -90,6 +109,12 @@ def _corrections(conn: Any) -> list[str]:
         out += _copy(conn, visits, _OF_VISIT, (old, new), f"{pooled} > 0", {"session_corrected": pooled})
         slices = quote(connection.schema_name("study"), "study_slice")
         out.append(f"UPDATE {slices} SET gait_method = '{new}' WHERE gait_method = '{old}'")
+        # Its checks were accepted under the old name.
+        out.append(
+            f"UPDATE {quote(connection.schema_name('review'), 'decision')} SET decision_about ="
+            f" JSON_SET(decision_about, '$.gait_method', '{new}') WHERE decision_what = 'check'"
+            f" AND JSON_VALUE(decision_about, '$.gait_method') = '{old}'"
+        )
     out += _delete(conn, methods, "t0.gait_method_name = 'by-hand'")
     return [*out, f"DROP TABLE IF EXISTS {events}", f"DROP TABLE {hand}"]
 
@@ -105,20 +130,27 @@ def _lacks_trials(conn: Any) -> bool:
 def _trials(conn: Any) -> list[str]:
     """Rows of SessionGdi.Trial; a visit of which a trial is still to be computed is pending as well."""
     key = "fit_set, fit_method, gait_method, gdi_method, norm"
+    return [
+        *_delete(conn, _gdi("__session_gdi"), _missing()),
+        f"INSERT IGNORE INTO {_gdi('__session_gdi__trial')} ({key}, video_id)"
+        f" SELECT {key}, d.video_id FROM {_gdi('__session_gdi')} AS s JOIN {_measured()} USING ({key})",
+    ]
+
+
+def _measured() -> str:
     of_trial = "fit_set, fit_method, video_id, gait_method"
-    measured = f"{_gdi('__g_d_i')} AS d JOIN {_gait('__spatiotemporal')} USING ({of_trial})"
+    return f"{_gdi('__g_d_i')} AS d JOIN {_gait('__spatiotemporal')} USING ({of_trial})"
+
+
+def _missing() -> str:
+    """Condition: a trial of a visit (`t0`) is not computed."""
     trials = quote(connection.schema_name("fit"), "__session_fit__trial")
-    missing = (
+    return (
         f"EXISTS (SELECT 1 FROM {trials} AS f WHERE f.fit_set = t0.fit_set AND f.fit_method = t0.fit_method AND NOT"
-        f" EXISTS (SELECT 1 FROM {measured} WHERE d.fit_set = t0.fit_set AND d.fit_method = t0.fit_method"
+        f" EXISTS (SELECT 1 FROM {_measured()} WHERE d.fit_set = t0.fit_set AND d.fit_method = t0.fit_method"
         " AND d.gait_method = t0.gait_method AND d.gdi_method = t0.gdi_method AND d.norm = t0.norm"
         " AND d.video_id = f.video_id))"
     )
-    return [
-        *_delete(conn, _gdi("__session_gdi"), missing),
-        f"INSERT IGNORE INTO {_gdi('__session_gdi__trial')} ({key}, video_id)"
-        f" SELECT {key}, d.video_id FROM {_gdi('__session_gdi')} AS s JOIN {measured} USING ({key})",
-    ]
 
 
 def _delete(conn: Any, table: str, where: str) -> list[str]:

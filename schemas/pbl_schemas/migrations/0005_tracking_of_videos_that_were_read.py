@@ -23,10 +23,8 @@ def statements(conn: Any) -> list[str]:
     ).fetchone()[0]
     if there is None or there:  # no such table yet, or it has the foreign key
         return []
-    table, info = quote(*name), quote(connection.schema_name("video"), "__video_info")
-    left = conn.query(
-        f"SELECT video_id, tracking_method FROM {table} WHERE video_id NOT IN (SELECT video_id FROM {info})"  # noqa: S608
-    )
+    table, info = _tables()
+    left = conn.query(_unread("video_id, tracking_method"))
     keys = [dict(zip(("video_id", "tracking_method"), row, strict=True)) for row in left.fetchall()]
     deletes = []
     if keys:
@@ -39,3 +37,22 @@ def statements(conn: Any) -> list[str]:
         f"ALTER TABLE {table} ADD FOREIGN KEY (video_id) REFERENCES {info} (video_id)"
         " ON UPDATE CASCADE ON DELETE RESTRICT",
     ]
+
+
+def changed(conn: Any) -> list[tuple[str, str]]:
+    """Set and gait_method ("": all) of the results that are computed again."""
+    members = quote(connection.schema_name("fit"), "fit_set__video")
+    sets = conn.query(f"SELECT DISTINCT fit_set FROM {members} WHERE video_id IN ({_unread('video_id')})")  # noqa: S608
+    return [(str(name), "") for (name,) in sets.fetchall()]
+
+
+def _unread(columns: str) -> str:
+    table, info = _tables()
+    return f"SELECT {columns} FROM {table} WHERE video_id NOT IN (SELECT video_id FROM {info})"  # noqa: S608
+
+
+def _tables() -> tuple[str, str]:
+    return (
+        quote(connection.schema_name("tracking"), "__tracking"),
+        quote(connection.schema_name("video"), "__video_info"),
+    )

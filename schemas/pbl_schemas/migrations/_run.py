@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
@@ -17,6 +18,7 @@ from pbl_schemas import connection
 from pbl_schemas.chain import tables
 from pbl_schemas.datajoint_setup import dj, read_heading_again
 from pbl_schemas.operations import catalog
+from pbl_schemas.operations.catalog import quote
 from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.stages import STAGES, modules
 from pbl_schemas.tables_version import applied, numbered, record, refuse_newer, title
@@ -68,11 +70,13 @@ Say = Callable[[str], None]
 
 @dataclasses.dataclass(frozen=True)
 class Migration:
-    """A module of migrations/. `statements(conn)` returns what is still to be done."""
+    """A module of migrations/. `statements(conn)` returns what is still to be done; `changed(conn)` set and gait_method
+    ("": all) of the results that have other numbers then, or none until they are computed again."""
 
     number: int
     name: str
     statements: Callable[[Any], list[str]]
+    changed: Callable[[Any], list[tuple[str, str]]] = lambda _: []
 
     @property
     def title(self) -> str:
@@ -81,17 +85,19 @@ class Migration:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Outcome of a run, or of a dry run. open: differences that no migration removes, as text."""
+    """Outcome of a run, or of a dry run. open: differences that no migration removes, as text. touched: visits, slices
+    and accepted checks whose results change, in words."""
 
     steps: list[tuple[str, list[str]]]
     created: list[str]
     open: list[str]
+    touched: list[str] = dataclasses.field(default_factory=list)
 
 
 def available() -> list[Migration]:
     """Return all migrations, in the order of their numbers. Raises ValueError as `tables_version.numbered`."""
     loaded = ((n, name, importlib.import_module(f"pbl_schemas.migrations.{n:04d}_{name}")) for n, name in numbered())
-    return [Migration(n, name, module.statements) for n, name, module in loaded]
+    return [Migration(n, name, m.statements, getattr(m, "changed", lambda _: [])) for n, name, m in loaded]
 
 
 def workers_of_other_versions() -> list[str]:
@@ -140,13 +146,15 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None, force: bool = Fals
                 "no process that writes rows as another version does",
                 "stop them (they end after the job in hand), or repeat with --force",
             )
+        for line in plan.touched:
+            say(f"  {line}")
         created = _bind(create=True)
         steps = _apply(cursor, say)
     _reread()  # also where nothing was left to do: an earlier run may have ended before it came to this
     if left := list(map(str, differences())):
         raise _differs(left)
     declare_all()
-    return Outcome(steps, created, [])
+    return Outcome(steps, created, [], plan.touched)
 
 
 def _bind(create: bool) -> list[str]:
@@ -179,11 +187,47 @@ def _reread() -> None:
 def _plan() -> Outcome:
     conn, created = connection.connect(), _bind(create=False)
     done = {a.number for a in applied()}
-    steps = [(m.title, m.statements(conn)) for m in available() if m.number not in done]
+    due = [m for m in available() if m.number not in done]
+    steps = [(m.title, m.statements(conn)) for m in due]
     planned = " ".join(s for _, statements in steps for s in statements)
     # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
     left = [str(d) for d in differences() if d.table not in planned and (d.known or not created)]
-    return Outcome(steps, created, left)
+    return Outcome(steps, created, left, _touched(conn, [m for m, (_, s) in zip(due, steps, strict=True) if s]))
+
+
+def _touched(conn: Any, due: Sequence[Migration]) -> list[str]:
+    """Return the visits, slices and accepted checks whose results these migrations change, in words."""
+    if not {(connection.schema_name(s), t) for s, t in _READ} <= set(catalog.names()):
+        return []  # a server without results
+    sets, visits, slices, members, decisions = (quote(connection.schema_name(s), t) for s, t in _READ)
+    of_method = "(%s = '' OR JSON_VALUE(decision_about, '$.gait_method') = %s)"
+    queries = (
+        f"SELECT subject, session_label FROM {sets} JOIN {visits} USING (session_id) WHERE fit_set = %s LIMIT 1",  # noqa: S608
+        f"SELECT JSON_VALUE(decision_about, '$.check'), decision_by FROM {decisions} WHERE decision_what = 'check'"  # noqa: S608
+        f" AND JSON_VALUE(decision_about, '$.fit_set') = %s AND {of_method} ORDER BY decision_id",
+        f"SELECT study_slice FROM {members} JOIN {slices} USING (study_slice) WHERE slice_fit_set = %s"  # noqa: S608
+        " AND (%s = '' OR gait_method = %s)",
+    )
+    out, of_slices = [], Counter[str]()
+    for fit_set, method in sorted({pair for m in due for pair in m.changed(conn)}):
+        args = (fit_set, method, method)
+        visit, checks, names = (conn.query(q, args=args[: q.count("%s")]).fetchall() for q in queries)
+        said = "".join(f"visit {label} of {subject}" for subject, label in visit)
+        out.append(f"changes: the results of {said}{f' by {method}' if method else ''}")
+        out += [f"changes: the check {c} of {said}, which {who} accepted, is to be accepted again" for c, who in checks]
+        of_slices.update(name for (name,) in names)
+    slices = [f"changes: {n} visits of the slice {name}" for name, n in sorted(of_slices.items())]
+    return out + [f"{line}; a backup of before has its numbers" for line in slices]
+
+
+#: Tables that `_touched` reads.
+_READ = (
+    ("fit", "fit_set"),
+    ("session", "session"),
+    ("study", "study_slice"),
+    ("study", "study_slice_visit"),
+    ("review", "decision"),
+)
 
 
 def _apply(cursor: Any, say: Say) -> list[tuple[str, list[str]]]:

@@ -219,6 +219,7 @@ def restore(
                     said = f"{found} rows in {name} after the restore"
                     raise _refused(said, f"{expected}", "run the same with --again")
             cursor.execute(f"DROP DATABASE {quote(f'{prefix}_{_MARKER}')}")
+        catalog.analyse()
     except pymysql.err.Error as error:
         raise _refused(
             str(error.args[-1]),

@@ -12,6 +12,7 @@ from pbl_pipeline.filming import Filming, height_word, known, picture_class, sta
 from pbl_pipeline.records import number
 
 from .. import fit, gait, gdi, keypoints, study, video
+from ..rows import inside, parts
 
 
 def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
@@ -19,12 +20,14 @@ def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
 
     results: rows with session_id, fit_set, fit_set_kind, fit_method, gait_method and gdi_method.
     """
-    if not results:
-        return []
+    return [filming for some in parts(results) for filming in _filming_of(some)]
+
+
+def _filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
     from pbl_pipeline.gait import mostly
 
-    of_visit = [{"session_id": r["session_id"]} for r in {r["session_id"]: r for r in results}.values()]
-    sets = [{"fit_set": name} for name in {r["fit_set"] for r in results}]
+    of_visit = inside("session_id", {int(r["session_id"]) for r in results})
+    sets = inside("fit_set", {str(r["fit_set"]) for r in results})
     used = gait.GaitCycle.Cycle & sets & {"cycle_used": True}
     cycles = defaultdict(list)
     for row in used.proj("cycle_far_leg").to_dicts():
@@ -40,24 +43,21 @@ def filming_of(results: Sequence[Mapping[str, Any]]) -> list[Filming]:
     for row in (filmed & sets).to_dicts():
         recordings[row["fit_set"]].append(row)
     done = video.conditions((fit.FitSet.Video & sets).proj())
-    members = defaultdict(list)
-    for row in (fit.FitSet.Video & sets).proj().to_dicts():
-        members[row["fit_set"]].append(int(row["video_id"]))
     visits = {int(r["session_id"]): r for r in (study.Visit & of_visit).to_dicts()}
     paces = {name: gdi.pace_of(name) for name in {r["gdi_method"] for r in results}}
     out = []
     for r in results:
         pace, one_camera = paces[r["gdi_method"]], r["fit_set_kind"] == fit.SINGLE
-        pooled = {v for v in members[r["fit_set"]] if done[v].pooled(pace)}
-        own = [c for c in cycles[r["fit_set"], r["fit_method"], r["gait_method"]] if c[0] in pooled]
-        about = [v for v in recordings[r["fit_set"]] if int(v["video_id"]) in pooled] if one_camera else []
+        own = [c for c in cycles[r["fit_set"], r["fit_method"], r["gait_method"]] if done[c[0]].pooled(pace)]
+        counted = {v for v, _ in own}  # a recording without a cycle that counts changes nothing
+        about = [v for v in recordings[r["fit_set"]] if int(v["video_id"]) in counted] if one_camera else []
         visit = visits.get(int(r["session_id"]), {"assistive_device": "", "orthosis": ""})
         out.append(
             Filming(
                 views=views_of(own) if one_camera else (),
-                aid=stated(visit["assistive_device"]),
-                orthosis=stated(visit["orthosis"]),
-                paces=known(done[v].pool for v in pooled),
+                aid=stated("aid", visit["assistive_device"]),
+                orthosis=stated("orthosis", visit["orthosis"]),
+                paces=known(done[v].pool for v in counted),
                 height=(height_word(heights[r["fit_set"], r["fit_method"]]),),
                 cameras=known(v["camera_kind"] for v in about),
                 pictures=known(picture_class(v["width"], v["height"]) for v in about),

@@ -13,7 +13,7 @@ from .. import fit, gait, gdi, keypoints, lab, review, session, video
 from ..datajoint_setup import dj
 from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES
-from ..rows import inside
+from ..rows import rows_inside
 from .frames import frame_of, newest_sets
 from .visit_list import change_since, judged, not_alike, results_of
 
@@ -86,7 +86,7 @@ def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
     chain = ("session_id", "fit_set_kind", *gdi.SessionGdi.primary_key[1:])
     query = gdi.SessionGdi.Measure * newest_sets()
     out: dict[tuple, dict[str, Any]] = {}
-    for row in (query & inside("session_id", sessions.unique())).to_dicts():
+    for row in rows_inside(query, "session_id", map(int, sessions)):
         of_visit = out.setdefault(tuple(row[k] for k in chain), {})
         if (measure := gait.measure_of_row(row, "session_measure")) is not None:
             of_visit[row["session_measure"]] = measure
@@ -146,14 +146,17 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
 
 
 def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
-    """Rows about a visit or one of its videos, with whose visit it is; the columns without their prefix."""
+    """Rows about a visit or one of its videos, with whose visit it is, and without a restriction those about none, such
+    as an instrument; the columns without their prefix."""
     rows = frame_of(table.proj(..., of="session_id"))
-    videos = video.Video.proj("session_id") & inside("video_id", rows["video_id"].dropna().astype(int).unique())
-    own = frame_of(videos).set_index("video_id")["session_id"]
-    rows["session_id"] = rows.pop("of").fillna(rows["video_id"].map(own)).astype("Int64")
     rows["video_id"] = rows["video_id"].astype("Int64")
-    found = frame_of(_visits() & inside("session_id", rows["session_id"].unique()) & restriction)
-    rows = rows.merge(found[["session_id", "subject", "session_label"]], on="session_id")
+    own = rows_inside(video.Video.proj("session_id"), "video_id", rows["video_id"].dropna())
+    of_video = rows["video_id"].map({int(r["video_id"]): int(r["session_id"]) for r in own})
+    rows["session_id"] = rows.pop("of").fillna(of_video).astype("Int64")
+    found = rows_inside(_visits() & restriction, "session_id", rows["session_id"].dropna())
+    everything = restriction is True or restriction == {}
+    named = pd.DataFrame(found, columns=["session_id", "subject", "session_label"]).astype({"session_id": "Int64"})
+    rows = rows.merge(named, how="left" if everything else "inner", on="session_id")
     rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True)
     rows.columns = [name.removeprefix(f"{prefix}_") for name in rows.columns]
     first = ["id", "at", "by", "what", "subject", "session_label", "session_id", "video_id"]

@@ -207,17 +207,19 @@ def video_facts(recording: Recording) -> dict[str, Any]:
 
 
 def computations(video_id: int) -> tuple[Any, ...]:
-    """Return the identity of the computations of the shown fit of a recording and its events. Raises as
+    """Return the identity of the computations of the shown fit of a recording, its events and its cycles. Raises as
     `ShownRecording.fitted`."""
     key = fit.trial_key(video_id)
     if key is None:
         shown_recording(video_id).fitted()
         return ()
-    fitted = (fit.SessionFit & key).to_arrays("fit_computed")
     found = gait.newest_events(key)
-    events = () if found is None else (gait.GaitEvents & found).to_arrays("events_computed")
+    made = [("fit", fit.SessionFit & key)]
+    made += [] if found is None else [("events", gait.GaitEvents & found), ("cycles", gait.GaitCycle & found)]
+    # The seconds differ where a row was made anew within the same second of the clock.
+    when = [str(row) for name, rows in made for row in rows.proj(f"{name}_computed", f"{name}_seconds").to_dicts()]
     correction = None if found is None else gait.correction_of(found)
-    return (*key.values(), *map(str, fitted), *(found or {}).values(), *map(str, (*events, correction)))
+    return (*key.values(), *when, str(correction))
 
 
 def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]]:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+import statistics
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from pbl_pipeline.qc import FAIL, PASS
+from pbl_pipeline.records import number
+from pbl_pipeline.words import TASKS
 
 from .. import fit, gait, keypoints, video
+from ..capture import PhoneRecording
 from ..datajoint_setup import dj
 from ..rows import inside
 from .shown import shown_visit
@@ -16,6 +20,33 @@ from .why import Why, whys
 
 #: Verdicts on a recording: not known yet; usable; usable with remarks; unusable.
 PENDING, USABLE, REMARKS, UNUSABLE = "pending", "usable", "remarks", "unusable"
+#: Recordings of which `usual_seconds` is the median, and the fewest.
+_RECENT, _FEWEST = 20, 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Needs:
+    """Properties of a usable recording of an activity. cycles: True where a gait cycle has to count, False where none
+    may, None where it does not matter; measures: of the task, each known and above 0; wanted: without them there is a
+    remark."""
+
+    cycles: bool | None = None
+    measures: tuple[str, ...] = ()
+    wanted: tuple[str, ...] = ()
+
+
+#: Activity -> what a usable recording of it has. Stairs, tandem walking, running and words of a laboratory are walked:
+#: that stairs were climbed is not checked.
+NEEDS = {
+    "sit_to_stand": Needs(measures=("rise_count",), wanted=("five_rises_time_s",)),
+    "tug": Needs(measures=("tug_time_s", "turn_time_s")),
+    "squat": Needs(measures=("squat_count",)),
+    "standing": Needs(cycles=False),
+    "fsst": Needs(),  # of which nothing is measured
+}
+_WALKED = Needs(cycles=True)
+#: Next step for a recording that does not show its activity.
+OTHER_ACTIVITY = "film it again; if something else was filmed, correct its activity on the page of the visit"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +55,19 @@ class Usable:
 
     state: str  # `PENDING`, `USABLE`, `REMARKS` or `UNUSABLE`
     said: tuple[str, ...] = ()  # what is wrong and what to do, in the words of the library
-    cycles: tuple[int, int] | None = None  # used gait cycles, left and right; None before events are searched
+    #: Used gait cycles, left and right; None before events are searched, and where they do not matter.
+    cycles: tuple[int, int] | None = None
+    activity: str = ""  # as it is registered
+
+
+@dataclasses.dataclass(frozen=True)
+class _Found:
+    """What was measured of a recording. cycles: used ones, left and right; reason: why it has no measures of walking;
+    measures: those of its task, with the reason where one is not known."""
+
+    cycles: tuple[int, int]
+    reason: str
+    measures: Mapping[str, tuple[float | None, str]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +81,8 @@ class Next:
 
 
 def usable(video_id: int) -> Usable:
-    """Return the verdict on a recording by the checks of its keypoints, its gait cycles, or the error that stopped
-    it."""
+    """Return the verdict on a recording by the checks of its keypoints, what its activity needs (`NEEDS`), or the error
+    that stopped it."""
     return verdicts([video_id])[video_id]
 
 
@@ -52,34 +95,47 @@ def verdicts(videos: Collection[int]) -> dict[int, Usable]:
     checks: dict[int, list[dict[str, Any]]] = {}
     for row in (keypoints.Keypoints.Check & where).to_dicts(order_by="KEY"):
         checks.setdefault(int(row["video_id"]), []).append(row)
-    cycles, reasons = _cycles(where)
+    found, done = _found(where), video.conditions(where)
     left = [v for v in videos if v not in marks]
-    states = whys(v for v in left if v not in checks or v not in cycles)
+    states = whys(v for v in left if v not in found)
     out = {v: Usable(UNUSABLE, (mark,)) for v, mark in marks.items()}
     for v in left:
-        out[v] = _verdict(checks.get(v, []), cycles.get(v), reasons.get(v, []), states.get(v))
-    return out
+        out[v] = _verdict(done[v].activity, checks.get(v, []), found.get(v), states.get(v))
+    return {v: dataclasses.replace(judged, activity=done[v].activity) for v, judged in out.items()}
 
 
-def _verdict(
-    checks: list[dict[str, Any]], cycles: tuple[int, int] | None, reasons: Sequence[str], state: Why | None
-) -> Usable:
-    """Return the verdict by the checks of the keypoints, the used cycles and the reasons for missing measures; state:
-    of a recording without checks or cycles."""
-    if not checks:
-        assert state is not None
-        return Usable(PENDING) if state.waits else Usable(UNUSABLE, (state.verdict,))
+def _verdict(activity: str, checks: list[dict[str, Any]], found: _Found | None, state: Why | None) -> Usable:
+    """Return the verdict by the checks of the keypoints and what was measured; state: of a recording that is not
+    measured, and so not usable yet."""
     asking = [c for c in checks if c["keypoints_check_outcome"] != PASS]
     # The worst first: that is what is read.
     asking.sort(key=lambda c: c["keypoints_check_outcome"] != FAIL)
     said = tuple(dict.fromkeys(_words(c) for c in asking))
+    needs = NEEDS.get(activity, _WALKED)
+    cycles = found.cycles if found is not None and needs.cycles else None
     if any(c["keypoints_check_outcome"] not in (PASS, "WARN") for c in asking):
         return Usable(UNUSABLE, said, cycles)
-    if state is not None and not state.waits:  # it failed after its keypoints
-        return Usable(UNUSABLE, (*said, state.verdict))
-    if cycles is not None and not any(cycles):
-        return Usable(UNUSABLE, tuple(dict.fromkeys((*reasons, *said))), cycles)
+    if found is None:
+        assert state is not None
+        return Usable(UNUSABLE, (*said, state.verdict)) if state.stops else Usable(PENDING)
+    lacks = _lacks(needs, found)
+    if lacks is not None:
+        return Usable(UNUSABLE, tuple(dict.fromkeys((*lacks, *said))), cycles)
+    missing = (found.measures[name][1] for name in needs.wanted if name in found.measures)
+    said = tuple(dict.fromkeys((*filter(None, missing), *said)))
     return Usable(REMARKS if said else USABLE, said, cycles)
+
+
+def _lacks(needs: Needs, found: _Found) -> tuple[str, ...] | None:
+    """Return why a measured recording does not have what its activity needs, None if it does."""
+    if needs.cycles and not any(found.cycles):
+        return tuple(filter(None, (found.reason,)))
+    if needs.cycles is False and any(found.cycles):
+        return "the person walks", OTHER_ACTIVITY
+    if all(found.measures.get(name, (None, ""))[0] for name in needs.measures):
+        return None
+    reasons = [reason for _, reason in found.measures.values() if reason]
+    return (*reasons[:1], OTHER_ACTIVITY)
 
 
 def next_pass(session_id: int) -> Next | None:
@@ -107,15 +163,40 @@ def _words(check: dict[str, Any]) -> str:
     return advice
 
 
-def _cycles(where: Any) -> tuple[dict[int, tuple[int, int]], dict[int, list[str]]]:
-    """Return the used cycles, left and right, of the recordings whose events were searched, and why recordings have no
-    measures."""
+def _found(where: Any) -> dict[int, _Found]:
+    """Return what was measured last of recordings, first of all with the sets that count."""
     # By their sets: the tables of the gait are not indexed by the recording.
     sets = inside("fit_set", set((fit.FitSet.Video & where).to_arrays("fit_set").tolist()))
-    of_side = dj.U("video_id", "cycle_side").aggr(gait.GaitCycle.Cycle & sets & where & "cycle_used = 1", n="count(*)")
-    found = {(int(r["video_id"]), r["cycle_side"]): int(r["n"]) for r in of_side.to_dicts()}
-    searched = {int(v) for v in (gait.GaitCycle & sets & where).to_arrays("video_id")}
-    reasons: dict[int, list[str]] = {}
-    for row in (gait.Spatiotemporal & sets & where).proj("measures_reason").to_dicts(order_by="KEY"):
-        reasons.setdefault(int(row["video_id"]), []).append(str(row["measures_reason"]))
-    return {v: (found.get((v, "left"), 0), found.get((v, "right"), 0)) for v in searched}, reasons
+    counting = {(r["fit_set"], r["fit_method"]) for r in (fit.current() & sets).proj().to_dicts()}
+    rows = (gait.Spatiotemporal & sets & where).proj("measures_reason", "measures_computed").to_dicts(order_by="KEY")
+    rows.sort(key=lambda r: ((r["fit_set"], r["fit_method"]) in counting, r["measures_computed"]))
+    key = gait.Spatiotemporal.primary_key
+    last = {int(r["video_id"]): r for r in rows}
+    of_side = dj.U(*key, "cycle_side").aggr(gait.GaitCycle.Cycle & sets & where & "cycle_used = 1", n="count(*)")
+    used = {(*(r[k] for k in key), r["cycle_side"]): int(r["n"]) for r in of_side.to_dicts()}
+    measures: dict[tuple[Any, ...], dict[str, tuple[float | None, str]]] = {}
+    of_tasks = gait.Spatiotemporal.Measure & sets & where & [{"measure": name} for name in TASKS]
+    for r in of_tasks.proj("measure_mean", "measure_missing").to_dicts():
+        of = measures.setdefault(tuple(r[k] for k in key), {})
+        of[r["measure"]] = number(r["measure_mean"]), str(r["measure_missing"])
+    out = {}
+    for v, row in last.items():
+        own = tuple(row[k] for k in key)
+        left, right = (used.get((*own, side), 0) for side in ("left", "right"))
+        of_task = {name: measures[own][name] for name in TASKS if name in measures.get(own, {})}
+        out[v] = _Found((left, right), str(row["measures_reason"]), of_task)
+    return out
+
+
+def usual_seconds() -> float | None:
+    """Return how long the verdicts on the last recordings of phones took (s, median), None for fewer than three."""
+    rows = (PhoneRecording & "video_id IS NOT NULL").proj("video_id")
+    videos = [int(v) for v in rows.to_arrays("video_id", order_by="phone_recording DESC", limit=_RECENT)]
+    where = inside("video_id", videos)
+    sets = inside("fit_set", set((fit.FitSet.Video & where).to_arrays("fit_set").tolist()))
+    first = dj.U("video_id").aggr(gait.Spatiotemporal & sets & where, first="min(measures_computed)")
+    took = [
+        (r["first"] - r["video_created"]).total_seconds()
+        for r in (first * video.Video.proj("video_created")).to_dicts()
+    ]
+    return statistics.median(took) if len(took) >= _FEWEST else None

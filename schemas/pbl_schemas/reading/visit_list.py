@@ -21,19 +21,19 @@ from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.records import number
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
-from ..datajoint_setup import dj
-from ..decisions.review_decisions import is_accepted
+from ..decisions.review_decisions import accepted_sql, is_accepted
 from ..job_errors import error_code
 from ..operations.catalog import quote
 from ..review import Decision
-from ..rows import inside
+from ..rows import inside, parts
 from .filming import filming_of
 from .status import queue_name, queues
 
 #: Visits of a page.
 PAGE = 50
-#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video.
-STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable")
+#: States of a visit to filter by. empty: no one was found in its usable videos; unusable: it has no usable video;
+#: unrecorded: it has none.
+STATES = ("computed", "pending", "waiting", "failed", "empty", "unusable", "unrecorded")
 #: State of a visit in a folder without its measures.
 INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
@@ -128,8 +128,8 @@ class Trend:
 class VisitRow:
     """A visit of the list.
 
-    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it failed; more: further results of other
-    chains of methods or kinds of recordings.
+    state: one of `STATES` or `INCOMPLETE`; problem: code of the error where it, or a part of it, failed; more: further
+    results of other chains of methods or kinds of recordings.
     """
 
     session_id: int
@@ -264,17 +264,19 @@ def earlier_result(session_id: int) -> Result | None:
     for row in videos.proj().to_dicts():
         members.setdefault(row["fit_set"], set()).add(int(row["video_id"]))
     now = [members[name] for name in set((fit.current() & inside("fit_set", members)).to_arrays("fit_set"))]
-    parts = [name for name, own in members.items() if any(own < every for every in now)]
-    return next(iter(results_of([session_id], parts)[session_id]), None) if parts else None
+    older = [name for name, own in members.items() if any(own < every for every in now)]
+    return next(iter(results_of([session_id], older)[session_id]), None) if older else None
 
 
 def results_of(sessions: Iterable[int], sets: Sequence[str] = ()) -> dict[int, list[Result]]:
     """Results of the current sets of visits, or of `sets`, by session: videos of one camera first, then the newest
     methods."""
-    ids = [int(s) for s in sessions]
+    ids = dict.fromkeys(int(s) for s in sessions)
+    return {i: of for some in parts(ids) for i, of in _results_of(some, sets).items()}
+
+
+def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
     found: dict[int, list[Result]] = {i: [] for i in ids}
-    if not ids:
-        return found
     open_checks = _open_checks(ids)
     rows = _ask(
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
@@ -322,10 +324,13 @@ def _open_checks(sessions: Iterable[int]) -> dict[tuple[str, ...], set[str]]:
     for row in (Decision & inside("session_id", sessions) & {"decision_what": "check"}).to_dicts():
         about = row["decision_about"]
         accepted.setdefault(tuple(str(about[k]) for k in _RESULT), []).append(about)
+    checks: dict[tuple[str, ...], list[dict[str, Any]]] = {of: [] for of in accepted}
+    asking = qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & {"qc_check_outcome": "WARN"}
+    for row in (asking & inside("fit_set", {of[0] for of in accepted})).to_dicts():
+        checks.get(tuple(str(row[k]) for k in _RESULT), []).append(row)
     found: dict[tuple[str, ...], set[str]] = {}
     for of, decided in accepted.items():
-        key = {**dict(zip(_RESULT, of, strict=True)), "qc_check_outcome": "WARN"}
-        rows = (qc.SessionQc.Check * qc.SessionQc.proj("qc_computed") & key).to_dicts()
+        rows = checks[of]
         if any(is_accepted(r, about) for r in rows for about in decided):
             found[of] = {r["qc_check"] for r in rows if not any(is_accepted(r, about) for about in decided)}
     return found
@@ -350,9 +355,9 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
         where.append(condition)
         of_where.extend(values)
 
-    def outside(visits: set[int]) -> None:
-        if visits:
-            add(f"s.session_id NOT IN ({_places(list(visits))})", *visits)
+    def beside(name: str, *visits: str) -> str:
+        joins.append(f"LEFT JOIN ({' UNION '.join(visits)}) {name} ON {name}.session_id = s.session_id")
+        return f"{name}.session_id IS NULL"
 
     if wanted.search:
         like = "%" + wanted.search.replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_") + "%"
@@ -369,29 +374,20 @@ def _asked(wanted: Filter) -> tuple[list[str], list[str], list[Any]]:
         add("s.session_date <= %s", wanted.last_day)
     if wanted.quality:
         only("j", f"{_judged()} WHERE q.qc_outcome = %s", "WARN" if wanted.quality == "ACCEPTED" else wanted.quality)
-        if wanted.quality in ("WARN", "ACCEPTED"):
-            asked = dj.U("session_id") & (Decision & {"decision_what": "check"} & "session_id IS NOT NULL")
-            of_visits = results_of(int(i) for i in asked.to_arrays("session_id"))
-            outcomes = {i: {r.outcome for r in results} for i, results in of_visits.items()}
-            # Visits in which a person accepted every check that asked for attention.
-            settled = {i for i, of in outcomes.items() if "ACCEPTED" in of and "WARN" not in of}
-            if wanted.quality == "WARN":
-                outside(settled)
-            else:
-                add(f"s.session_id IN ({_places(list(settled))})" if settled else "FALSE", *settled)
+        if wanted.quality == "WARN":
+            add(beside("a", _settled()))
+        elif wanted.quality == "ACCEPTED":
+            only("a", _settled())
     if wanted.state in ("computed", "pending"):
-        # Queried first: as subqueries the server would evaluate them for each visit.
-        questions = (_waiting(), _failed(), _empty(), _unusable())
-        apart = {int(i) for question in questions for (i,) in _ask(question, [])}
-        unfinished = {int(i) for question in (_unfinished(), _none_current()) for (i,) in _ask(question, [])}
+        apart, unfinished = (_waiting(), _empty(), _unusable()), (_unfinished(), _none_current())
         with_set = f"EXISTS (SELECT 1 FROM {_name(fit.FitSet)} p WHERE p.session_id = s.session_id)"
         if wanted.state == "computed":
             add(with_set)
-            outside(apart | unfinished)
+            add(beside("o", *apart, *unfinished, _failed_visits()))
         else:
-            listed = f" OR s.session_id IN ({_places(list(unfinished))})" if unfinished else ""
-            add(f"(NOT {with_set}{listed})", *unfinished)
-            outside(apart)
+            add(f"NOT ({with_set} AND {beside('u', *unfinished)})")
+            add(f"EXISTS (SELECT 1 FROM {_name(video.Video)} o WHERE o.session_id = s.session_id)")
+            add(beside("o", *apart, _failed()))
     elif wanted.state:
         only("x", _STATES[wanted.state]())
     return joins, where, [*of_joins, *of_where]
@@ -403,6 +399,18 @@ def _judged() -> str:
         f"SELECT DISTINCT f.session_id FROM {_name(qc.SessionQc)} q STRAIGHT_JOIN {_name(fit.FitSelection)} c"
         " ON c.fit_set = q.fit_set AND c.fit_method = q.fit_method AND c.fit_current = 1"
         f" STRAIGHT_JOIN {_name(fit.FitSet)} f ON f.fit_set = c.fit_set"
+    )
+
+
+def _settled() -> str:
+    """Visits in which a person accepted every check that asked for attention, of all current results."""
+    return (
+        f"SELECT f.session_id FROM {_name(Decision)} e JOIN {_name(fit.FitSet)} f ON f.session_id = e.session_id"
+        f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set AND c.fit_current = 1"
+        f" JOIN {_name(qc.SessionQc)} q ON q.fit_set = c.fit_set AND q.fit_method = c.fit_method"
+        f" LEFT JOIN {_name(qc.SessionQc.Check)} k ON {' AND '.join(f'k.{n} = q.{n}' for n in _RESULT)}"
+        " AND k.qc_check_outcome = 'WARN' WHERE e.decision_what = 'check' AND q.qc_outcome = 'WARN'"
+        f" GROUP BY f.session_id HAVING MIN({accepted_sql('k', 'q', 'f')}) = 1"
     )
 
 
@@ -444,6 +452,27 @@ def _empty() -> str:
     )
 
 
+def _unrecorded() -> str:
+    """Visits without a video."""
+    recorded = f"SELECT 1 FROM {_name(video.Video)} o WHERE o.session_id = n.session_id"
+    return f"SELECT n.session_id FROM {_name(session.Session)} n WHERE NOT EXISTS ({recorded})"
+
+
+def _failed_visits() -> str:
+    """Visits with an error (`_failed`), without those that are computed and have an index of a current set: an error of
+    one recording does not make such a visit fail."""
+    indexed = (
+        f"SELECT f.session_id FROM {_name(gdi.SessionGdi)} g JOIN {_name(fit.FitSelection)} c"
+        " ON c.fit_set = g.fit_set AND c.fit_method = g.fit_method AND c.fit_current = 1"
+        f" JOIN {_name(fit.FitSet)} f ON f.fit_set = c.fit_set WHERE g.session_gdi IS NOT NULL"
+    )
+    return (
+        f"SELECT e.session_id FROM ({_failed()}) e LEFT JOIN ({indexed}) i ON i.session_id = e.session_id"
+        f" LEFT JOIN ({_unfinished()}) u ON u.session_id = e.session_id"
+        " WHERE i.session_id IS NULL OR u.session_id IS NOT NULL"
+    )
+
+
 def _unusable() -> str:
     """Visits whose videos are all marked as not usable."""
     videos, marked = _name(video.Video), _name(video.NotUsable)
@@ -480,7 +509,13 @@ def _failed(column: str = "") -> str:
     return f" {'UNION ALL' if column else 'UNION'} ".join(parts)
 
 
-_STATES = {"waiting": _waiting, "failed": _failed, "empty": _empty, "unusable": _unusable}
+_STATES = {
+    "waiting": _waiting,
+    "failed": _failed_visits,
+    "empty": _empty,
+    "unusable": _unusable,
+    "unrecorded": _unrecorded,
+}
 
 
 # ----------------------------------------------------------------------------------------------------- rows of a page
@@ -517,7 +552,10 @@ def _visit_rows(rows: Sequence[Sequence[Any]]) -> tuple[VisitRow, ...]:
         i = int(session_id)
         found = results[i]
         computed = bool(found) and i not in open_sets
-        state = next((name for name, visits in sets.items() if i in visits), "computed" if computed else "pending")
+        of_visit = [name for name, visits in sets.items() if i in visits]
+        if computed and any(r.index is not None for r in found):  # as `_failed_visits`
+            of_visit = [name for name in of_visit if name != "failed"]
+        state = next(iter(of_visit), "computed" if computed else "pending" if videos.get(i) else "unrecorded")
         first = found[0] if found else None
         out.append(
             VisitRow(

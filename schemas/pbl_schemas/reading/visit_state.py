@@ -35,6 +35,12 @@ def state_of(session_id: int) -> dict[str, str]:
     return {str(name): f"{count} {found}" for name, count, found in rows}
 
 
+def results_state(session_id: int) -> tuple[str, ...]:
+    """Return texts which change with the results of a visit, not with its queues."""
+    tables = {table.__name__ for table in computed_tables()}
+    return tuple(text for name, text in state_of(session_id).items() if name in tables)
+
+
 def _part(name: str, table: Any, columns: list[str], session_id: int) -> str:
     """Return the query of the number of rows of a visit and of their hashes, XOR."""
     key, where = table.heading.primary_key, f"session_id = {int(session_id)}"

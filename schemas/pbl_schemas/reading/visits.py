@@ -133,7 +133,7 @@ def list_fitted(restriction: Mapping[str, Any], slice_name: str | None = None) -
     restriction = session.as_registered(with_keys(restriction))
     if slice_name is not None:
         chain, counted = chain_of(slice_name)
-        restriction, sets = {**restriction, **chain}, fit.FitSelection & inside("fit_set", counted)
+        restriction, sets = {**restriction, **chain}, fit.FitSelection().restrict(counted, semantic_check=False)
     fits = fit.SessionFit.proj("session_id") * fit.FitSet.proj("fit_set_kind") * sets.proj()
     fits = fits * session.Session.proj("subject", "session_label", "session_date") & restriction
     found = {

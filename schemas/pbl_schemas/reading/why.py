@@ -46,11 +46,18 @@ class Why:
     marked: bool  # as not usable
 
     @property
+    def stops(self) -> bool:
+        """True if it does not go on by itself: it failed, has no person, waits for a choice, or is marked."""
+        ends = {t.__name__ for t in before(fit.SessionFit)}  # events that are empty are measured all the same
+        left = [s for s in self.steps if s.what != DONE]
+        empty = any(s.what == EMPTY and s.table in ends for s in left)
+        return self.marked or empty or any(s.next_step or s.what == ERROR for s in left)
+
+    @property
     def waits(self) -> bool:
         """True if it waits for a worker alone, not for another video, a choice, a retry or a withdrawn mark."""
         left = [s for s in self.steps if s.what != DONE]
-        stops = any(s.next_step or s.what in (ERROR, EMPTY) for s in left) or self.marked
-        return bool(left) and not stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
+        return bool(left) and not self.stops and (left[0].table, left[0].what) != ("SessionFit", NOT_YET)
 
 
 def why(video_id: int) -> Why:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,13 +18,14 @@ from pbl_pipeline.names import check_label, is_plain
 from pbl_pipeline.words import UNUSABLE, unit_of
 
 from .. import fit, gait, gdi, lab, session, study, video
-from ..datajoint_setup import dj
+from ..datajoint_setup import IntegrityError, dj
 from ..decisions.not_usable import unusable
+from ..decisions.review_decisions import record
 from ..method_names import with_keys
 from ..reading.filming import filming_of
 from ..reading.frames import cycle_rows, frame_of, newest_sets
 from ..reading.slice_rows import slice_row
-from ..rows import inside, utc_now
+from ..rows import PART, inside, rows_inside, utc_now
 from ..stored_files import file_ref, stored_file
 from ..transactions import in_transaction
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 #: One kind of recordings and chain of methods; the kind is `slice_kind` in StudySlice.
 CHAIN = ("fit_set_kind", "tracking_method", "keypoint_method", "fit_method", "gait_method", "gdi_method", "norm")
+#: Columns that came after the first slices were frozen, whose hash they are part of only where they have a value.
+_LATER = ("gdi_unshrunk", "gdi_unshrunk_sd")
 _SIDES = {"mean": "both", "left": "left", "right": "right"}
 _none = functools.partial(PblError, "DB_NOT_FOUND")
 _usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --help`")
@@ -40,12 +43,14 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """A frozen slice: name, hash, how many visits it has and how many of them count."""
+    """A frozen slice: name, hash, how many visits it has and how many of them count; `visits`: person, visit, and why
+    it does not count, empty where it does."""
 
     name: str
     hash: str
     n: int
     n_included: int
+    visits: tuple[tuple[str, str, str], ...] = ()
 
 
 def freeze(
@@ -55,8 +60,10 @@ def freeze(
     methods: Mapping[str, str] | None = None,
     event: str = "",
     note: str = "",
+    dry_run: bool = False,
 ) -> Slice:
-    """Freeze the visits of a cohort (None: of all people) with the measures that they have now.
+    """Freeze the visits of a cohort (None: of all people) with the measures that they have now; `dry_run`: only return
+    what would be frozen.
 
     Raises `PblError` USAGE for a name that is taken, labels too long, several chains of methods; DB_NOT_FOUND for an
     unknown cohort, no visits, no measures.
@@ -81,7 +88,7 @@ def freeze(
             "USAGE",
             found=f"slice {name!r} is there already",
             expected="a new name: a slice never changes",
-            next_step=f"name it {name}-2, or delete the old one from study.StudySlice",
+            next_step=f"name it {name}-2, or withdraw the old one: pbl study slice {name} --withdraw",
         )
     if cohort is not None and not study.Cohort & {"cohort": cohort}:
         raise _none(
@@ -97,6 +104,10 @@ def freeze(
         about = {**chain, "study_slice": name, "slice_event": event, "slice_note": said, "cohort": cohort}
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
+        listed = zip(rows["subject"], rows["visit"], rows["reason"], strict=True)
+        made = Slice(name, digest, len(rows), int(rows["included"].sum()), tuple(listed))
+        if dry_run:
+            return made
         study.StudySlice.insert1(
             {
                 **{k: v for k, v in about.items() if k != "fit_set_kind"},
@@ -119,14 +130,36 @@ def freeze(
             }
             for r in rows.to_dict("records")
         )
-        return Slice(name, digest, len(rows), int(rows["included"].sum()))
+        return made
 
     return in_transaction(work)
 
 
+def withdraw(name: str, by: str) -> None:
+    """Delete a slice, with a row of Decision that keeps its hash. Raises `PblError` DB_NOT_FOUND for an unknown slice,
+    USAGE if rows of another table refer to it."""
+    about = slice_row(name)
+    key = {"study_slice": name}
+
+    def work() -> None:
+        (study.StudySliceVisit & key).delete_quick()
+        (study.StudySlice & key).delete_quick()
+        record("slice", by, key, {"hash": about["slice_hash"], "visits": int(about["slice_n"])}, {})
+
+    try:
+        in_transaction(work)
+    except IntegrityError as error:
+        raise PblError(
+            "USAGE",
+            found=f"rows of another table refer to the slice {name!r}: {error}",
+            expected="a slice to which nothing refers",
+            next_step="keep it, and freeze another one under a new name",
+        ) from None
+
+
 def study_data(name: str, curves: bool = True) -> StudyData:
     """Return the rows of a slice as frames: visits, their inclusion and methods as frozen, values as the tables hold
-    them now (`changes` compares them).
+    them now; the note states how many visits have others than when it was frozen (`changes` names them).
 
     Set-based except for the curves, whose files are read one by one (`curves` False leaves them out).
 
@@ -137,16 +170,19 @@ def study_data(name: str, curves: bool = True) -> StudyData:
     about = slice_row(name)
     rows = _frozen(about)
     frames = _frames(rows, about)
+    # Without codes: the note goes with what is exported under others.
+    n = len(_changes(about, rows, frames))
+    changed = f"{n} of its {about['slice_n']} visits have other numbers than when it was frozen." if n else ""
     frames["visits"] = frames["visits"].merge(_recordings(rows, about), how="left", on=["subject", "visit"])
     if curves:
-        frames["curves"] = _curves(rows, about)
+        frames |= _in_parts(_curves, rows, about)
     description = StudyDescription(
         name=name,
         hash=about["slice_hash"],
         methods={k: about[k] for k in CHAIN if about[k] is not None},
         code_version=about["slice_code_version"],
         event=about["slice_event"],
-        note=about["slice_note"],
+        note=" ".join(filter(None, (about["slice_note"], changed))),
     )
     return StudyData(**frames, description=description)
 
@@ -162,11 +198,13 @@ def _recordings(rows: Any, about: Mapping[str, Any]) -> Any:
         {**chain, "session_id": int(r["session_id"]), "fit_set": r["fit_set"]} for r in with_set.to_dict("records")
     ]
     filmed = dict(zip(with_set["session_id"], filming_of(results), strict=True))
-    own = frame_of(video.Video.proj("session_id") & inside("session_id", map(int, rows["session_id"])))
-    marked = {n: UNUSABLE[mark.reason] for n, mark in unusable(own["video_id"]).items()}
+    own: dict[int, list[int]] = defaultdict(list)
+    for row in rows_inside(video.Video.proj("session_id"), "session_id", map(int, rows["session_id"])):
+        own[int(row["session_id"])].append(int(row["video_id"]))
+    marked = {n: UNUSABLE[mark.reason] for n, mark in unusable(v for of in own.values() for v in of).items()}
     out = []
     for row in rows.to_dict("records"):
-        videos = own.loc[own["session_id"] == row["session_id"], "video_id"]
+        videos = own[int(row["session_id"])]
         reasons = Counter(marked[v] for v in videos if v in marked)
         how = filmed.get(row["session_id"], Filming())
         parts = {"views": how.views, "cameras": how.cameras, "pictures": how.pictures, "height": how.height}
@@ -188,8 +226,12 @@ def changes(name: str) -> list[str]:
     `PblError` DB_NOT_FOUND for an unknown slice."""
     about = slice_row(name)
     rows = _frozen(about)
-    out = [] if len(rows) == about["slice_n"] else [f"{about['slice_n'] - len(rows)} visits were deleted"]
-    hashes = _hashes(_frames(rows, about)) if len(rows) else {}
+    return _changes(about, rows, _frames(rows, about) if len(rows) else {})
+
+
+def _changes(about: Mapping[str, Any], rows: Any, frames: Mapping[str, Any]) -> list[str]:
+    out = ["a visit was deleted"] * (about["slice_n"] - len(rows))
+    hashes = _hashes(frames) if frames else {}
     for r in rows.to_dict("records"):
         if hashes[r["subject"], r["visit"]] != r["frozen_hash"]:
             out.append(f"visit {r['visit']} of {r['subject']} has other rows")
@@ -216,7 +258,7 @@ def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
     of markers."""
     if unknown := sorted(set(methods) - set(CHAIN)):
         raise _usage(f"methods of {', '.join(unknown)}", f"of {', '.join(CHAIN)}")
-    found = [tuple(r[c] for c in CHAIN) for r in (dj.U(*CHAIN) & (_measured(visits) & dict(methods))).to_dicts()]
+    found = {tuple(row[c] for c in CHAIN): row for row in _measured(visits, methods)}
     if not found:
         raise _none("no measures of these visits", "visits with measures", "`pbl populate`, `pbl status`")
     if len(found) > 1:
@@ -225,21 +267,22 @@ def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:
             f"measures of {len(found)} chains of methods: " + "; ".join(named[:4]),
             f"one: name the method of one or more of {', '.join(CHAIN)}",
         )
-    return dict(zip(CHAIN, found[0], strict=True))
+    return dict(zip(CHAIN, *found, strict=True))
 
 
-def _measured(visits: Any) -> Any:
-    """SessionGdi of the current sets of the visits, with session and chain."""
+def _measured(visits: Any, methods: Mapping[str, str | None]) -> list[dict[str, Any]]:
+    """SessionGdi of the current sets of the visits by these methods, with session and chain."""
     sets = newest_sets()
     of_set = dj.U("fit_set", "tracking_method", "keypoint_method") & fit.FitSet.Video
     columns = ("session_status", "session_reason", "session_gdi_reason")
-    return sets * of_set * gdi.SessionGdi.proj(*columns) & inside("session_id", map(int, visits["session_id"]))
+    measured = sets * of_set * gdi.SessionGdi.proj(*columns) & dict(methods)
+    return rows_inside(measured, "session_id", map(int, visits["session_id"]))
 
 
 def _decided(visits: Any, chain: Mapping[str, str | None], members: Sequence[Mapping[str, Any]]) -> Any:
     """The visits with their set of videos, and whether each counts."""
     left_out = {m["subject"]: m["member_reason"] for m in members if not m["member_included"]}
-    measured = {int(r["session_id"]): r for r in (_measured(visits) & dict(chain)).to_dicts()}
+    measured = {int(r["session_id"]): r for r in _measured(visits, chain)}
     taken: set[tuple[str, str]] = set()
     rows = []
     for v in visits.to_dict("records"):
@@ -281,15 +324,28 @@ def _line(text: str) -> str:
 # ------------------------------------------------------------------------------------------------------------- reading
 def _frozen(about: Mapping[str, Any]) -> Any:
     own = study.StudySliceVisit & {"study_slice": about["study_slice"]}
-    named = session.Session.proj("subject", visit="session_label")
+    named = session.Session.proj("subject", visit="session_label", date="session_date")
     rows = frame_of(own * named * study.Visit.proj(role="visit_role", days="visit_days"))
+    rows = rows.sort_values(["subject", "date", "session_id"], ignore_index=True)
     names = {"slice_included": "included", "slice_reason": "reason", "slice_fit_set": "fit_set"}
     return rows.rename(columns={**names, "slice_visit_hash": "frozen_hash"})
 
 
 def _frames(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     """visits, measures, scores, instruments and cycles of the visits `rows` by the chain of `about`."""
+    frames = _in_parts(_frames_of, rows, about)
+    return {**frames, "instruments": frames["instruments"].drop_duplicates("instrument", ignore_index=True)}
 
+
+def _in_parts(read: Callable[[Any, Mapping[str, Any]], dict[str, Any]], rows: Any, about: Mapping[str, Any]) -> Any:
+    """The frames that `read` returns of the visits `rows`, `PART` visits at a time."""
+    import pandas as pd
+
+    found = [read(rows.iloc[i : i + PART], about) for i in range(0, max(len(rows), 1), PART)]
+    return {name: pd.concat([frames[name] for frames in found], ignore_index=True) for name in found[0]}
+
+
+def _frames_of(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     ids = inside("session_id", map(int, rows["session_id"]))
     chain = {k: about[k] for k in gdi.SessionGdi.primary_key if k in CHAIN}
     key = rows[["session_id", "subject", "visit"]]
@@ -383,7 +439,7 @@ def _cycles(cycles: Any, sets: Any, gdi_method: str) -> Any:
     return long.dropna(subset=["value"])
 
 
-def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
+def _curves(rows: Any, about: Mapping[str, Any]) -> dict[str, Any]:
     """Mean curve of the used cycles that each visit pools, per side and angle, at 0, 1, ..., 100 %."""
     import pandas as pd
 
@@ -415,7 +471,8 @@ def _curves(rows: Any, about: Mapping[str, Any]) -> Any:
         points.append(np.interp(CURVE_PERCENT, np.linspace(0.0, 100.0, len(mean)), mean))
         out.append((of.at[fit_set, "subject"], of.at[fit_set, "visit"], side, angle, "deg", len(curves)))
     frame = pd.DataFrame(out, columns=["subject", "visit", "side", "variable", "unit", "n_cycles"])
-    return frame.join(pd.DataFrame(np.array(points).reshape(len(out), len(CURVE_POINTS)), columns=list(CURVE_POINTS)))
+    values = pd.DataFrame(np.array(points).reshape(len(out), len(CURVE_POINTS)), columns=list(CURVE_POINTS))
+    return {"curves": frame.join(values)}
 
 
 # --------------------------------------------------------------------------------------------------------------- hashes
@@ -426,9 +483,12 @@ def _hashes(frames: Mapping[str, Any]) -> dict[tuple[str, str], str]:
         frame = frames[name]
         columns = sorted(set(frame.columns) - {"subject", "visit"})
         # The same text for a number whatever the type of its column, which depends on other rows.
-        plain = frame[columns].apply(lambda c: c.map(_text)).to_numpy()
-        for key, row in zip(zip(frame["subject"], frame["visit"], strict=True), plain, strict=True):
-            lines[key].append("\t".join((name, *row)))
+        plain = frame[columns].apply(lambda c: c.map(_text))
+        later = [c for c in columns if c in _LATER]
+        added = ["\t".join(f"{c} {v}" for c, v in r.items() if v) for r in plain[later].to_dict("records")]
+        texts = plain.drop(columns=later).to_numpy()
+        for key, row, more in zip(zip(frame["subject"], frame["visit"], strict=True), texts, added, strict=True):
+            lines[key].append("\t".join((name, *row, *([more] if more else []))))
     return {key: _digest(texts) for key, texts in lines.items()}
 
 

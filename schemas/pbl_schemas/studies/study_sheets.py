@@ -14,6 +14,7 @@ from typing import Any
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label, check_mass, normalised_label
+from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
@@ -33,7 +34,7 @@ from ..intake.sheets import (
     refused,
     similar_codes,
 )
-from ..rows import inside
+from ..rows import inside, parts, rows_inside
 from ..subject_codes import check_subject, day_of
 from ..transactions import in_transaction
 
@@ -125,6 +126,8 @@ _SIZES = {"height_m": check_height, "mass_kg": check_mass}
 COLUMNS = ("subject", "visit", *_DATED, *VISIT_COLUMNS, *_SIZES, "population", "record", "cohort", *MEMBER_COLUMNS)
 SCORE_COLUMNS = ("subject", "visit", "instrument", "value")
 TRIAL_COLUMNS = ("video", "subject", "visit", "activity", "pace")
+#: Columns whose words are codes (`texts.code_of`) -> kind of the codes.
+CODED = {"role": "role", "population": "population", "assistive_device": "aid", "orthosis": "orthosis"}
 #: A cell that removes what is stored; an empty one leaves it.
 CLEAR = "-"
 _LONGEST = {
@@ -263,7 +266,7 @@ class _Plan:
         code = needed(row, "subject")
         stated = self.people.setdefault(code, _Stated(row, {}))
         if population := row.cells.get("population"):
-            self._same(row, stated, "population", population, "population", code)
+            self._same(row, stated, "population", code_of("population", population), "population", code)
         return code
 
     def _same(self, row: Row, stated: _Stated, name: str, value: Any, what: str, whose: str) -> None:
@@ -373,16 +376,16 @@ class _Plan:
 
     # ------------------------------------------------------------------------------------------------------- the tables
     def _load(self) -> None:
-        of_people = inside("subject", {*self.people, *(c for _, c in self.members)})
+        people = {*self.people, *(c for _, c in self.members)}
         self.known = {r["subject"]: r for r in lab.Subject.proj("population", "subject_height").to_dicts()}
-        sessions = session.Session & of_people
-        self.registered = session.by_label(sessions.to_dicts())
+        self.registered = session.by_label(rows_inside(session.Session(), "subject", people))
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
-        self.stored_visits = {labels[int(r["session_id"])]: r for r in (study.Visit & sessions.proj()).to_dicts()}
-        self.stored_masses = {labels[int(r["session_id"])]: r for r in (session.BodyMass & sessions.proj()).to_dicts()}
-        scores = (study.ClinicalScore & sessions.proj()).to_dicts()
+        self.stored_visits = {labels[int(r["session_id"])]: r for r in rows_inside(study.Visit(), "session_id", labels)}
+        masses = rows_inside(session.BodyMass(), "session_id", labels)
+        self.stored_masses = {labels[int(r["session_id"])]: r for r in masses}
+        scores = rows_inside(study.ClinicalScore(), "session_id", labels)
         self.stored_scores = {(*labels[int(r["session_id"])], r["instrument"]): r for r in scores}
-        members = (study.CohortMember & of_people).to_dicts()
+        members = rows_inside(study.CohortMember(), "subject", people)
         self.stored_members = {
             (r["cohort"], r["subject"]): {**r, "member_included": bool(r["member_included"])} for r in members
         }
@@ -398,7 +401,10 @@ class _Plan:
 
     def _day(self, key: tuple[str, str]) -> datetime.date | None:
         stated = self.sessions[key].values.get("session_date") if key in self.sessions else None
-        return stated or day_of(key[1]) or self.registered.get(key, {}).get("session_date")
+        return stated or day_of(key[1]) or self._stored_day(key)
+
+    def _stored_day(self, key: tuple[str, str]) -> datetime.date | None:
+        return self.registered.get(key, {}).get("session_date")
 
     def _check_times(self) -> None:
         """Ages and days that follow from dates; refuse what cannot be in time."""
@@ -411,6 +417,11 @@ class _Plan:
         for key, stated in self.sessions.items():
             with self._line(stated.row).about():
                 self._age(key)
+            day, stored = stated.values.get("session_date"), self.stored_visits.get(key)
+            if stored is not None and key not in self.visits and day not in (None, self._stored_day(key)):
+                # Its role has to fit the new day, and days from an event follow from it.
+                values = {"visit_days": None} if stored["intervention_date"] is not None else {}
+                self.visits[key] = _Stated(stated.row, values)
         for key, stated in self.visits.items():
             with self._line(stated.row).about() as line:
                 if line.errors:  # the role may be what is wrong
@@ -521,7 +532,7 @@ class _Plan:
 
     def _compare_trials(self) -> None:
         numbers = [t.values["video_id"] for t in self.trials]
-        now = video.conditions(inside("video_id", numbers)) if numbers else {}
+        now = {v: c for some in parts(numbers) for v, c in video.conditions(inside("video_id", some)).items()}
         for stated in list(self.trials):
             number = stated.values["video_id"]
             with self._line(stated.row).about() as line:
@@ -612,7 +623,8 @@ def _flag(row: Row, column: str) -> bool:
 
 
 def check_role(text: str, where: str) -> str:
-    """Return a text that can be a role of a visit. Raises `PblError` SHEET_FORMAT."""
+    """Return the role of a visit that a text states. Raises `PblError` SHEET_FORMAT for one that cannot be a role."""
+    text = code_of("role", text)
     if not study.is_role(text):
         expected = "baseline, pre, 6_weeks, 3_months, 6_months, or a word of small letters, digits and _"
         raise refused(f"role {text[:40]!r}", expected, "write it so", where)
@@ -636,7 +648,7 @@ def _visit_value(row: Row, column: str) -> Any:
             raise refused(f"{column} {text}", expected, "correct it", row.where)
         return int(number) if column == "days" else number
     check_label(column, text, _LONGEST[column])
-    return text
+    return code_of(CODED[column], text) if column in CODED else text
 
 
 def _video(row: Row) -> int:

@@ -14,27 +14,30 @@ from typing import Any
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_height, check_label, check_mass, normalised_label
+from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import decisions, record
 from ..intake.records import set_condition, set_height, set_mass, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
-from ..subject_codes import check_subject
+from ..subject_codes import check_subject, day_of, iso_label
 from ..transactions import in_transaction
-from .study_sheets import CLEAR, COLUMNS, SCORE_COLUMNS, check_role, import_rows
+from .study_sheets import CLEAR, CODED, COLUMNS, SCORE_COLUMNS, check_role, import_rows
 
 #: Fields of a new visit: column of a sheet of `pbl study import`, and the most characters.
 NEW = {"subject": 32, "visit": 64, "date": 10, "role": 32, "population": 32}
 #: Field by which a person confirms that a code that is like another one is of another person.
 DISTINCT = "distinct"
-#: Fields of a registered visit and the most characters; height (m) and population are of the person.
-FACTS = {"height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
+#: Fields of a registered visit and the most characters; height (m) and population are of the person, the day is asked
+#: for where the label names none.
+FACTS = {"date": 10, "height_m": 10, "mass_kg": 10, "population": 32, "assistive_device": 64, "orthosis": 64}
 #: Prefixes of the names of the fields of a recording, followed by its video_id.
 ACTIVITY, PACE = "activity:", "pace:"
 #: Fields that are numbers, and their checks.
 _NUMBERS = {"height_m": check_height, "mass_kg": check_mass}
 #: Kind of decision by the first part of a field's name.
 _KINDS = {
+    "date": "date",
     "height_m": "height",
     "mass_kg": "mass",
     "population": "population",
@@ -68,6 +71,11 @@ class Form:
         text = json.dumps([self.session_id, self.values], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    @property
+    def no_day_in_label(self) -> bool:
+        """True if the label of the visit names no day, which can then be stated."""
+        return day_of(self.label) is None or not self.values.get("date")
+
     def stored(self, name: str, text: str) -> Any:
         """Return what is stored of a field with this text, None if there is nothing."""
         numeric = name in _NUMBERS or name in self.instruments
@@ -76,7 +84,9 @@ class Form:
     def same(self, name: str, text: str) -> bool:
         """Return whether a text is the stored value, also in another notation: 1,80 for 1.8."""
         try:
-            return text == self.values[name] or self.stored(name, text) == self.stored(name, self.values[name])
+            return iso_label(text) == self.values[name] or self.stored(name, text) == self.stored(
+                name, self.values[name]
+            )
         except PblError:
             return False
 
@@ -90,6 +100,7 @@ def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict
     `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
     given = {name: normalised_label(text) for name, text in _stripped(values).items() if text}
+    given |= {"visit": iso_label(given["visit"])} if "visit" in given else {}
     return in_transaction(lambda: _register(given, by))
 
 
@@ -136,6 +147,7 @@ def facts_form(session_id: int) -> Form:
     of_visit = (study.Visit & {"session_id": session_id}).to_dicts()
     masses = (session.BodyMass & {"session_id": session_id}).to_arrays("body_mass")
     values = {
+        "date": str(visit["session_date"] or ""),
         "height_m": _text(person["subject_height"]),
         "mass_kg": _text(masses[0] if len(masses) else None),
         "population": "" if person["population"] == "unknown" else person["population"],
@@ -237,16 +249,19 @@ def _correct(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tu
     checks: dict[str, Callable[[str], Any]] = {
         **{n: functools.partial(_number, n) for n in _NUMBERS},
         **{n: functools.partial(check_label, n, longest=m) for n, m in FACTS.items() if n not in _NUMBERS},
+        "date": lambda text: date_of(Row("date", {"date": text}), "date"),
         **{n: functools.partial(check_label, n.partition(":")[0], longest=32) for n in changed if ":" in n},
     }
     errors: dict[str, PblError] = {}
     _check({name: text for name, text in changed.items() if text}, checks, errors)
-    worn = {name: changed[name] or CLEAR for name in ("assistive_device", "orthosis") if name in changed}
-    if worn and not errors:
-        row = Row("form", {"subject": now.subject, "visit": now.label, **worn})
+    if changed.get("date") == "":
+        errors["date"] = refused("no day", "the day of the visit", "write it", "date")
+    cells = {n: changed[n] or CLEAR for n in ("date", "assistive_device", "orthosis") if n in changed}
+    if cells and not errors:
+        row = Row("form", {"subject": now.subject, "visit": now.label, **cells})
         found = import_rows([Sheet("form", tuple(row.cells), (row,))], distinct_codes=True)
         if found.errors:
-            return (), {next(iter(worn)): found.errors[0].with_key(None)}
+            return (), {next(iter(cells)): found.errors[0].with_key(None)}
     if errors:
         return (), errors
     _write(now, changed, by, reason)
@@ -276,7 +291,7 @@ def _enter(now: Form, given: dict[str, str], by: str, reason: str) -> tuple[tupl
 
 
 def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
-    """Write values that were checked, each with its row of Decision; aid and orthosis are written by their caller."""
+    """Write values that were checked, each with its row of Decision; day, aid and orthosis are written before."""
     for name, text in changed.items():
         kind, _, number = name.partition(":")
         if name == "height_m":
@@ -293,7 +308,7 @@ def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
 
 
 def _stripped(values: Mapping[str, str]) -> dict[str, str]:
-    return {name: text.strip()[:1000] for name, text in values.items()}
+    return {name: code_of(CODED.get(name, ""), text.strip()[:1000]) for name, text in values.items()}
 
 
 def _check(given: Mapping[str, str], checks: Mapping[str, Callable[[str], Any]], errors: dict[str, PblError]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_schemas.studies import study_sheets, visit_forms
 
@@ -25,11 +26,12 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
     ) -> Response:
         entry, language = await tables.ask(visit_forms.scores_form, number_of(request)), reader_language(request)
         scores = {name: in_field(language, entry.values[name]) for name in entry.instruments}
+        role = {visit_forms.ROLE: texts.coded(language, visit_forms.ROLE, entry.values[visit_forms.ROLE])}
         return pages.show(
             request,
             "scores.html",
             entry=entry,
-            values={**entry.values, **scores, **values},
+            values={**entry.values, **scores, **role, **values},
             errors=errors,
             field=_FIELD,
             role=visit_forms.ROLE,

@@ -14,7 +14,7 @@ from starlette.responses import FileResponse, Response
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import PASS
-from pbl_pipeline.visit import FIT, METRICS, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
+from pbl_pipeline.visit import FIT, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
 from pbl_schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
 from pbl_schemas.reading.visit_list import INCOMPLETE, Page, Result, VisitRow
@@ -112,10 +112,9 @@ class ResultsFolder(Source):
         )
 
     def state(self, number: int) -> Hashable:
-        """Return a value that changes with the fit of a recording."""
+        """Return a value that changes with the fit of a recording and with its measures."""
         of, name = self._of_recording(number)
-        path = self._places[of].path / f"{name}.{FIT}"
-        return str(path), path.stat().st_mtime_ns
+        return name, str(self._places[of].path), self._changed(of)
 
     def video(self, number: int) -> Path:
         """Return the video. Raises `PblError` DB_NOT_FOUND; VIDEO_MISSING if it is not found.
@@ -174,8 +173,11 @@ class ResultsFolder(Source):
         raise _unknown("recording", number)
 
     def _visit(self, number: int) -> Visit:
-        files = [p for p in sorted(self._place(number).path.iterdir()) if p.name in (SESSION, METRICS) or FIT in p.name]
-        return self._load(number, tuple((p.name, p.stat().st_mtime_ns) for p in files))
+        return self._load(number, self._changed(number))
+
+    def _changed(self, number: int) -> tuple[tuple[str, int], ...]:
+        """Return the files of a visit, any of which may be read, and when they were written."""
+        return tuple((p.name, p.stat().st_mtime_ns) for p in sorted(self._place(number).path.iterdir()))
 
     def _read(self, number: int, changed: tuple[tuple[str, int], ...]) -> Visit:
         place = self._places[number]

@@ -21,7 +21,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
-from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, role_words, significant
+from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
 from pbl_schemas.intake.sheets import with_point
 from pbl_schemas.reading.shown import ShownVisit
 from pbl_schemas.session import UNLABELLED
@@ -124,6 +124,7 @@ class Pages:
             significant=significant,
             check_words=check_words,
             stage_words=STAGES,
+            codes=texts.codes,
             measure_words=MEASURES | TASKS,
             moment=moment,
             angle_words=[title for title, _ in ANGLES.values()],
@@ -147,6 +148,7 @@ class Pages:
         own: dict[str, Any] = {
             "t": functools.partial(texts.text, language),
             "said": functools.partial(texts.on_page, language),
+            "coded": functools.partial(texts.coded, language),
             "named": functools.partial(visit_name, language),
             "language": language,
             "other_language": next(name for name in texts.LANGUAGES if name != language),
@@ -155,7 +157,6 @@ class Pages:
             "number": lambda *args: texts.decimals(language, number(*args)),
             "significant": lambda *args: texts.decimals(language, significant(*args)),
             "decimals": functools.partial(texts.decimals, language),
-            "role_name": lambda role: texts.library_words(language, role_words(role)),
         }
         page = self._environment.get_template(template).render({**own, **values})
         return HTMLResponse(page, status, dict(headers or {}))

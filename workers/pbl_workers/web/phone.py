@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import logging
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import steps_of
 from pbl_schemas.operations.archive import UNFINISHED_DAYS
-from pbl_schemas.reading.usable import Next, Usable, next_pass
+from pbl_schemas.reading.usable import PENDING, Next, Usable, next_pass, usual_seconds
 from pbl_schemas.reading.visit_state import RESULTS, state_of
 
 from .. import phone_uploads
@@ -51,6 +52,8 @@ _MAY = {
 }
 #: Hours for which a link can be made on the page.
 HOURS = ("2", "8")
+#: Longer checks are told in minutes (s).
+_SECONDS = 90.0
 #: Answers that are kept, by visit and language.
 _KEPT = 200
 _RANGE = re.compile(r"bytes (0|[1-9][0-9]{0,11})-(0|[1-9][0-9]{0,11})/([1-9][0-9]{0,11})")
@@ -133,9 +136,9 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
             **{f"is_{name}": every[f"library.{name}"] for name in PACES},
             **{name.removeprefix(_SAID): own for name, own in every.items() if name.startswith(_SAID)},
         }
-        return pages.show(
-            request, "capture.html", 200, _MAY, phone=request.state.phone, words=json.dumps(said), part_bytes=PART_BYTES
-        )
+        usual = usual_words(reader_language(request), await tables.ask(usual_seconds))
+        values = {"phone": request.state.phone, "words": json.dumps(said), "usual": usual, "part_bytes": PART_BYTES}
+        return pages.show(request, "capture.html", 200, _MAY, **values)
 
     async def state(request: Request) -> Response:
         phone: Phone = request.state.phone
@@ -164,6 +167,7 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         told = {
             "visit": session_id,
             "recordings": [_shown(language, one, judged) for one, judged in sent],
+            "checked": sum(judged is not None and judged.state == PENDING for _, judged in sent),
             "next": next_words(language, worth[session_id][1]),
             "protocol": [dataclasses.asdict(step) for step in steps_of(session_id, sent)],
         }
@@ -284,6 +288,15 @@ def verdict(language: str, judged: Usable | None) -> str:
         left, right = judged.cycles
         said = f"{said}. {texts.text(language, 'capture.cycles', left=left, right=right)}"
     return said.removesuffix(".") + "."
+
+
+def usual_words(language: str, seconds: float | None) -> str:
+    """Return how long a check usually takes, in a sentence; empty if that is not known."""
+    if seconds is None:
+        return ""
+    minutes = seconds > _SECONDS
+    n = math.ceil(seconds / 60.0) if minutes else max(5, 5 * round(seconds / 5.0))
+    return texts.text(language, "capture.usual_min" if minutes else "capture.usual_s", n=n)
 
 
 def next_words(language: str, more: Next | None) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
+from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_schemas import lab
 from pbl_schemas import session as sessions
@@ -78,11 +79,12 @@ def routes(pages: Pages, tables: Tables) -> list[Address]:
 
         stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
         numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
+        words = {n: texts.coded(language, n, stored.values[n]) for n in ("population", "orthosis")}
         return pages.show(
             request,
             "facts.html",
             facts=stored,
-            values={**stored.values, **numbers, **values},
+            values={**stored.values, **numbers, **words, **values},
             errors=errors,
             longest=visit_forms.FACTS,
             choices={"activity": ACTIVITIES, "pace": PACES},

@@ -14,6 +14,7 @@ from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_schemas import privacy, video
 from pbl_schemas.reading import shown as reading
+from pbl_schemas.reading.visit_state import results_state
 
 from .. import on_request
 from ..process_queue import ProcessQueue, Task, Work
@@ -93,7 +94,7 @@ def overlay_key(video_id: int) -> tuple[Any, ...]:
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
-    return ("overlay", video_id, *reading.computations(video_id), about.hidden_heads, _copy_of(video_id))
+    return ("overlay", video_id, *reading.computations(video_id), about.hidden_heads, privacy.copy_of(video_id))
 
 
 def load_overlay(video_id: int) -> Task:
@@ -107,8 +108,10 @@ def load_overlay(video_id: int) -> Task:
 def report_key(session_id: int, shown: int, language: str) -> tuple[Any, ...]:
     """Return the dependencies of the report of a result of a visit in a language."""
     about = reading.computed_visit(session_id, shown)
-    copies = [_copy_of(r.number) for r in about.recordings if r.number is not None]
-    return ("report", session_id, language, *about.key.values(), about.computed, settings.deidentify_how(), *copies)
+    named = (about.row.subject, about.row.label, about.row.day)
+    listed = [(r.name, r.condition, r.problem, about.marks.get(r.number or 0)) for r in about.recordings]
+    results = (*about.key.values(), *results_state(session_id))
+    return ("report", session_id, language, *named, *listed, *results, settings.deidentify_how())
 
 
 def load_report(session_id: int, shown: int, language: str) -> Task:
@@ -134,7 +137,3 @@ def _not_made(found: str) -> PblError:
         expected="a file that is written to its end",
         next_step="load the page again to have it made again; `pbl report` writes it without limits",
     )
-
-
-def _copy_of(video_id: int) -> str:
-    return "".join(str(h) for h in (privacy.Deidentified & {"video_id": video_id}).to_arrays("deidentified_sha256"))

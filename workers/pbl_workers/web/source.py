@@ -15,6 +15,7 @@ from pbl_schemas import privacy, video
 from pbl_schemas.decisions import candidates, review_decisions
 from pbl_schemas.intake import phone_recordings, protocols
 from pbl_schemas.reading import shown
+from pbl_schemas.reading.usable import usual_seconds
 from pbl_schemas.reading.visit_progress import Progress, visit_progress
 
 from .corrections import Judged, judged
@@ -26,25 +27,29 @@ _KEPT = 8
 class Videos:
     """Files that are shown of recordings: the original, or the copy with hidden heads if PBL_DEIDENTIFY asks for it.
 
-    A copy in a remote store is fetched once and kept until others replace it or the page ends.
+    A copy in a remote store is fetched once and kept until others, or another copy, replace it or the page ends.
     """
 
     def __init__(self) -> None:
-        self._open: collections.OrderedDict[int, tuple[Path, contextlib.ExitStack]] = collections.OrderedDict()
+        self._open: collections.OrderedDict[tuple[int, str], tuple[Path, contextlib.ExitStack]] = (
+            collections.OrderedDict()
+        )
         self._lock = threading.Lock()
 
     def path(self, video_id: int) -> Path:
         """Return the file to show. Reads tables. Raises `PblError` DB_NOT_FOUND for an unknown video or one without the
         copy that is asked for, HEAD_NOT_FOUND, VIDEO_MISSING."""
         with self._lock:
-            if video_id in self._open:
-                self._open.move_to_end(video_id)
-                return self._open[video_id][0]
+            for old in [k for k in self._open if k[0] == video_id and k[1] != privacy.copy_of(video_id)]:
+                self._open.pop(old)[1].close()
+            if (key := (video_id, privacy.copy_of(video_id))) in self._open:
+                self._open.move_to_end(key)
+                return self._open[key][0]
             stack = contextlib.ExitStack()
             copy = stack.enter_context(privacy.shown(video_id))
             if copy is None:
                 return video.present_file(video_id)
-            self._open[video_id] = (copy, stack)
+            self._open[key] = (copy, stack)
             while len(self._open) > _KEPT:
                 self._open.popitem(last=False)[1][1].close()
             return copy
@@ -134,6 +139,7 @@ class TablesSource:
 
         number = about.row.session_id
         film = phone_recordings.filming(number)
+        film |= {"usual": usual_seconds() if film["sent"] else None}
         film |= {"steps": protocols.steps_of(number, film["sent"]), "protocols": protocols.protocols()}
         return {
             "decisions": review_decisions.decisions(number),

@@ -42,7 +42,7 @@ from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of
 from .computing import told as told_of
 from .pages import Pages, as_json, plain, reader_language
-from .phone import verdict
+from .phone import usual_words, verdict
 from .source import Source
 from .tables import Asks, Tables
 
@@ -125,7 +125,8 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         values |= await asks.ask(_drawn, about, reader_language(request))
         if as_json(request):  # loads arrays, which not every thread may
             values = await asks.ask(plain, values)
-        return pages.show(request, "visit.html", interval=interval, sided=SIDED, verdict=verdict, **values)
+        shown = {"interval": interval, "sided": SIDED, "verdict": verdict, "usual_words": usual_words}
+        return pages.show(request, "visit.html", **shown, **values)
 
     async def letter(request: Request) -> Response:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))

@@ -262,7 +262,7 @@ async function show() {
   const waits = found.filter((one) => one.complete && one.visit === visit).pop();
   if (waits) tell(".latest", states.get(waits.name) ?? t("on_phone"));
   else if (told) tell(".latest", told.recordings[0]?.verdict ?? "");
-  if (told) tell(".next", told.next);
+  if (told) tell(".next", told.next), $(".usual").hidden = !told.checked || !$(".usual").textContent;
   if (told && !take) lead(told.protocol);
   fill(list, lines.length ? lines : [item("", t("none_yet"))]);
   const { quota = 0, usage = 0 } = await navigator.storage.estimate();

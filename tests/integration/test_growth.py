@@ -1,0 +1,118 @@
+"""Commands over many visits: statements do not grow with the rows, and end with the command that sent them."""
+
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from pbl_schemas import computed_tables, connection, fit, rows
+from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.datajoint_setup import LIMIT_S
+from pbl_schemas.operations import catalog
+from pbl_schemas.plan import plan_fit_sets
+from pbl_workers import requeue
+from pbl_workers.populate import populate
+from research.benchmarks import growth, worker_standins, workers
+from tests import mysql, not_none
+from tests.database import embedded_only
+from tests.integration import chain
+
+pytestmark = pytest.mark.database
+
+#: Visits of the small and the large database, and values in a restriction.
+FEW, MANY, PART = 30, 90, 10
+#: Pages of the list of visits that are looked at.
+PAGES = ("everything", "WARN", "ACCEPTED", "computed", "pending")
+#: Most statements of a command for each part of its visits.
+EACH_PART = 16
+
+
+def test_statements_stay_as_short_as_they_are(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    monkeypatch.setattr(rows, "PART", PART)
+    monkeypatch.setattr(requeue, "CHUNK", PART)
+    monkeypatch.setattr(workers, "EACH", 1)  # a video a visit
+    monkeypatch.setenv(worker_standins.RECORDED, str(chain.small_video(tmp_path, "recorded")))
+    worker_standins.install(monkeypatch)
+    first = [t.__name__ for t in computed_tables() if t.__name__ not in ON_REQUEST]
+    costs: list[dict[str, growth.Cost]] = []
+    for before, visits in ((0, FEW), (FEW, MANY)):
+        growth.grow(visits, before, lambda: populate(first))
+        calls = {name: call for name, call in growth.walk().items() if "page" not in name or name.endswith(PAGES)}
+        calls["pbl cron refresh --all"]()  # queues the jobs of the new rows
+        costs.append({name: growth.measured(call) for name, call in calls.items()})
+        assert len(fit.FitSet()) >= visits
+    few, many = costs
+    # A page has at most 50 visits.
+    longer = {n: many[n].text for n in few if many[n].longest > max(few[n].longest + 100, 8_000)}
+    assert longer == {}
+    most = EACH_PART * (MANY - FEW) // PART
+    more = {n: many[n].statements - few[n].statements for n in few}
+    assert {name: n for name, n in more.items() if n > most} == {}
+    # Of what was planned before the server knew of the rows, nothing is looked up anew for each of them.
+    with growth.counted() as cost:
+        plan_fit_sets()
+    planned = [sql for sql in cost.texts if "__trial_input" in sql]
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        for sql in planned:
+            cursor.execute(f"EXPLAIN {sql}")
+            found = [(row[1], row[2]) for row in cursor.fetchall()]
+            assert not [table for kind, table in found if kind == "DEPENDENT SUBQUERY" and "fit_s" in str(table)], found
+    assert planned
+
+
+@embedded_only
+def test_a_server_knows_how_many_rows_came_at_once(tables: None):
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        (table,) = [name for name in catalog.names() if name[1] == "#clinical_instrument"]
+        asked = "SELECT table_rows FROM information_schema.tables WHERE table_schema = %s AND table_name = %s"
+        name = catalog.quote(*table)
+        cursor.execute(f"ALTER TABLE {name} STATS_AUTO_RECALC = 0")
+        try:
+            cursor.execute(f"SELECT COUNT(*) FROM {name}")
+            before = not_none(cursor.fetchone())[0]
+            catalog.analyse()
+            cursor.execute(asked, table)
+            assert cursor.fetchone() == (before,)
+        finally:
+            cursor.execute(f"ALTER TABLE {name} STATS_AUTO_RECALC = DEFAULT")
+
+
+SLOW = """
+import pbl_schemas
+from pbl_pipeline.cli import main
+from pbl_schemas import connection
+pbl_schemas.activate = lambda **_: connection.connect().query("SELECT SLEEP(60) /* of an interrupted command */")
+import sys
+sys.argv = ["pbl", "list", "visits"]
+main()
+"""
+
+
+def test_the_query_of_an_interrupted_command_ends_and_no_query_goes_on_for_ever(tables: None):
+    asked = "SELECT COUNT(*) FROM information_schema.processlist WHERE info LIKE 'SELECT SLEEP(60)%'"
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+
+        def there(wanted: int) -> bool:
+            end = time.monotonic() + 60
+            while time.monotonic() < end:
+                cursor.execute(asked)
+                if cursor.fetchone() == (wanted,):
+                    return True
+                time.sleep(0.05)
+            return False
+
+        with subprocess.Popen([sys.executable, "-c", SLOW], stderr=subprocess.PIPE) as command:
+            assert there(1)
+            command.send_signal(signal.SIGINT)
+            assert command.wait(30) == 130
+        cursor.execute(asked)
+        assert cursor.fetchone() == (0,)
+    name = "max_execution_time" if mysql.chosen() else "max_statement_time"
+    (limit,) = connection.connect().query(f"SELECT @@SESSION.{name}").fetchone()
+    assert float(limit) == (1000 if mysql.chosen() else 1) * LIMIT_S
