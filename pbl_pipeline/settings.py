@@ -57,6 +57,11 @@ def deidentify_how() -> str:
     return how
 
 
+def letter_head() -> list[str]:
+    """Lines at the head of a letter: name and address of the clinic. Empty if none are set."""
+    return [line.strip() for line in os.environ.get("PBL_LETTER_HEAD", "").split(";") if line.strip()]
+
+
 def audit_looks() -> bool:
     """True if each viewing of a recording in the review page has to leave a row."""
     return os.environ.get("PBL_AUDIT_LOOKS", "") not in ("", "0")

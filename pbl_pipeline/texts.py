@@ -27,6 +27,8 @@ _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 #: A command or its option, and one in brackets behind what it does.
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
+#: The code of an error before what was found: of use to engineers, not on a page.
+_CODED = re.compile(rf"\b(?:{'|'.join(CODES)}): ")
 #: Tags of a page, and its parts that are not read or are marked as names.
 _TAGS = re.compile(r'(?s)(<style>.*?</style>|<b translate="no">.*?</b>|<[^>]+>)')
 _LABELS = re.compile(r'(?<= (?:aria-label|data-label)=")[^"]+(?=")|(?<= alt=")[^"]+(?=")')
@@ -202,7 +204,9 @@ def library(language: str, english: str) -> str:
 
 
 def on_page(language: str, english: str) -> Markup:
-    """Return a text as `library` does, without the sentences that name a command: a page says what to click."""
+    """Return a text as `library` does, without codes of errors and without the sentences that name a command: a page
+    says what to click."""
+    english = _CODED.sub("", english)
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown

@@ -23,6 +23,13 @@ STAGES = {
     "KinematicError": "comparison with a reference",
     "Deidentified": "copy with hidden heads",
 }
+
+
+def role_words(role: str) -> str:
+    """Return the role of a visit as texts write it: "6 months" of "6_months"."""
+    return role.replace("_", " ")
+
+
 #: Ends of the names of measures and their units, longer ones before those that they end with.
 _UNITS = (
     ("_nm_per_kg", "Nm/kg"),

@@ -156,7 +156,7 @@ def render_overlay(
 
 
 def overlay_frames(
-    video_path: str | Path,
+    video_path: str | Path | None,
     fit: TrialFit,
     indices: Sequence[int],
     keypoints: Keypoints | None = None,
@@ -164,7 +164,8 @@ def overlay_frames(
     max_side_px: int = 1280,
     crop_to_body: bool = False,
 ) -> list[np.ndarray]:
-    """Frames `indices` with the fitted body drawn, in this order: BGR pictures (H, W, 3) uint8.
+    """Frames `indices` with the fitted body drawn, in this order: BGR pictures (H, W, 3) uint8. Without a video the
+    body is drawn on white.
 
     `crop_to_body` crops each picture to the drawn person with a margin (4:3 if the frame allows it); a frame without a
     fit stays whole. The longer side is then scaled down to at most `max_side_px`.
@@ -182,23 +183,28 @@ def overlay_frames(
         )
     painter = _Painter(fit, keypoints)
     pictures: dict[int, np.ndarray] = {}
-    if wanted:
-        for frame in read_frames(video_path, stop=wanted[-1] + 1):
-            if frame.index not in wanted:
-                continue
-            _check_frame(frame.image, frame.index, fit, video_path)
-            image = frame.image.copy()
-            painter.paint(image, frame.index)
-            if crop_to_body and painter.known(frame.index):
-                image = _crop(image, painter.box_px(frame.index))
-            scale = max_side_px / max(image.shape[:2])
-            if scale < 1:
-                image = _resized(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
-            pictures[frame.index] = np.ascontiguousarray(image)
+    for index, image in _images(video_path, fit, wanted):
+        painter.paint(image, index)
+        if crop_to_body and painter.known(index):
+            image = _crop(image, painter.box_px(index))
+        scale = max_side_px / max(image.shape[:2])
+        if scale < 1:
+            image = _resized(image, (round(image.shape[1] * scale), round(image.shape[0] * scale)))
+        pictures[index] = np.ascontiguousarray(image)
     missing = [i for i in wanted if i not in pictures]
     if missing:
         raise _changed(f"no frame {missing[0]}", f"{len(fit.time_s)} frames, as when it was fitted", key=video_path)
     return [pictures[int(i)] for i in indices]
+
+
+def _images(video_path: str | Path | None, fit: TrialFit, indices: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+    if video_path is None:
+        yield from ((i, np.full((*reversed(fit.image_size_px), 3), 255, np.uint8)) for i in indices)
+    elif indices:
+        for frame in read_frames(video_path, stop=indices[-1] + 1):
+            if frame.index in indices:
+                _check_frame(frame.image, frame.index, fit, video_path)
+                yield frame.index, frame.image.copy()
 
 
 def report_indices(fit: TrialFit) -> list[int]:

@@ -14,6 +14,7 @@ from pbl_pipeline.files import check_out_folder
 from pbl_pipeline.shipped import shipped_page
 from pbl_pipeline.stats import CurveTest, Estimate
 from pbl_pipeline.study import StudyData, content_hash
+from pbl_pipeline.words import role_words
 
 from .figures import (
     AFTER,
@@ -28,7 +29,7 @@ from .figures import (
     draw_pairs,
     draw_scatter,
 )
-from .page_tables import all_tables, number, p_text, short_of, title_of
+from .page_tables import all_tables, number, p_said, p_text, short_of, title_of
 from .results import StudyResults, reason, score_classes, study_results
 from .statement import statement
 from .visit_values import INDEX, of_scores, pairs, plan
@@ -65,7 +66,12 @@ def write_study_report(
         (folder / sub).mkdir(parents=True, exist_ok=True)
     paths = [folder / PAGE]
     page = shipped_page("study_report/templates/report.html").render(
-        head=head, tables=tables, sections=sections, plan=results.plan, formats="SVG and PDF" if pdf else "SVG"
+        head=head,
+        tables=tables,
+        sections=sections,
+        plan=results.plan,
+        role_words=role_words,
+        formats="SVG and PDF" if pdf else "SVG",
     )
     paths[0].write_text(page, encoding="utf-8")
     for figure in (f for figures in sections.values() for f in figures):
@@ -150,7 +156,7 @@ def _paper_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]:
         return
     at: Any = results.table[results.table["role"] == results.plan.change_from]
     title = title_of(study, measure)
-    where = f"visit {results.plan.change_from}"
+    where = f"visit {role_words(results.plan.change_from)}"
     for score, labels in score_classes(study, results.plan, at).items():
         by_class = {str(c): at.loc[labels == c, measure].dropna().to_numpy(float) for c in labels.cat.categories}
         if by_class := {c: v for c, v in by_class.items() if len(v)}:
@@ -189,7 +195,7 @@ def _correlations(results: StudyResults, measure: str, score: str) -> str:
 def _tests(results: StudyResults, measure: str, by: str) -> str:
     frame: Any = results.groups
     rows = frame[(frame["name"] == measure) & (frame["by"] == by)].to_dict("records")
-    words = [f"{r['a']} and {r['b']}: " + (r["message"] or f"{r['test']}, p = {p_text(r['p'])}") for r in rows]
+    words = [f"{r['a']} and {r['b']}: " + (r["message"] or f"{r['test']}, {p_said(r)}") for r in rows]
     return "; ".join(words) or "one group only"
 
 
@@ -206,7 +212,8 @@ def _srm_figure(results: StudyResults) -> Iterator[Figure]:
     ]
     if rows:
         plan = results.plan
-        note = f"{plan.change_group}, {plan.change_from} to {plan.change_to}; 95 % interval by the jackknife"
+        when = f"{role_words(plan.change_from)} to {role_words(plan.change_to)}"
+        note = f"{plan.change_group}, {when}; 95 % interval by the jackknife"
         colours = {"gait measures": GROUP_COLOURS[0], "clinical scores": GROUP_COLOURS[1]}
         title = "Standardised response mean of gait measures and clinical scores"
         yield Figure("srm", title, note, draw_forest(rows), colours)
@@ -235,7 +242,7 @@ def _paired_figures(study: StudyData, results: StudyResults) -> Iterator[Figure]
         if not len(both):
             continue
         row = frame[(frame["name"] == name) & (frame["statistic"] == "effect_size")].iloc[0]
-        test = row["message"] or f"Wilcoxon p = {p_text(row['p'])}, r = {number(row['value'], 2)}"
+        test = row["message"] or f"Wilcoxon {p_said(row)}, r = {number(row['value'], 2)}"
         drawing = draw_pairs(both, (plan.change_from, plan.change_to), title_of(study, name))
         yield Figure(
             _file("paired", name), title_of(study, name), f"{plan.change_group}, n {len(both)}; {test}", drawing
@@ -251,6 +258,7 @@ def _curve_figures(study: StudyData, results: StudyResults, of_change: bool) -> 
         a, b = c.names
         title = title_of(study, c.angle)
         if of_change:
+            a, b = role_words(a), role_words(b)
             colours, n = (BEFORE, AFTER), f"n {len(c.a)}"
             name, title = _file("curves", c.angle), f"{title}, {b} to {a}"
         else:
@@ -258,7 +266,7 @@ def _curve_figures(study: StudyData, results: StudyResults, of_change: bool) -> 
             name, title = _file("5A", f"{c.angle}_{b}"), f"A  {title}, {a} and {b}"
         if isinstance(c.test, CurveTest):
             spans = ", ".join(f"{x.first:.0f} to {x.last:.0f} %" for x in c.test.phases)
-            test = f"differ at {spans}" if spans else f"differ nowhere (p = {p_text(c.test.p_value)})"
+            test = f"differ at {spans}" if spans else f"differ nowhere (p {p_text(c.test.p_value)})"
         else:
             test = reason(c.test)
         left = f"; {c.left_out} left out for unknown points" if c.left_out else ""

@@ -14,18 +14,17 @@ from pbl_pipeline import words
 from pbl_pipeline.latex import tex_escape
 from pbl_pipeline.stats import CurveTest
 from pbl_pipeline.study import StudyData
-from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS
+from pbl_pipeline.words import ANGLES, FOOT_ANGLES, MEASURES, PELVIS_ANGLES, TASKS, role_words
 
 from .results import ALPHA, StudyResults, reason
-from .visit_values import INDEX, of_scores
+from .visit_values import INDEX, Plan, of_scores
 
 GAIT, SCORES = "Gait measures", "Clinical scores"
 _MINUS = "\N{MINUS SIGN}"
 _NONE = "\N{EN DASH}"
 _INDICES = {INDEX: "GDI", "gps_deg": "Gait Profile Score"}
-_STARS = "* p < 0.05, not corrected for the number of tests"
-#: Note of tables with this column.
-_HOLM = "p, Holm: corrected for those"
+#: Note of tables with stars; the family of tests follows.
+_STARS = "* p < 0.05 after Holm's correction for the tests of"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,19 +129,25 @@ def digits_of(values: Any) -> int:
 
 
 def p_text(p: float) -> str:
-    """Format p with two digits, below 0.001 as a power."""
+    """Format p with two digits, or as "< 0.001"."""
     if not math.isfinite(p):
         return ""
-    return f"{p:.2g}" if p >= 0.001 else f"{p:.0e}".replace("e-0", "e-").replace("-", _MINUS)
+    return f"{p:.2g}" if p >= 0.001 else "< 0.001"
+
+
+def p_said(row: Any) -> str:
+    """Write p of a test and p corrected, as in "p < 0.001, Holm 0.012"."""
+    text = p_text(row["p"])
+    return f"p {'' if text.startswith('<') else '= '}{text}, Holm {p_text(row['p_holm'])}"
 
 
 def estimate(row: Any, marks: _Marks, digits: int = 2, star: bool = False) -> str:
-    """Format a row with `value, low, high, p, code, message` as `0.84 (0.81 to 0.86)`, with a star for p < 0.05."""
+    """Format a row with `value, low, high, code, message` as `0.84 (0.81 to 0.86)`, with a star for `p_holm` < 0.05."""
     if row["code"]:
         return marks(row["message"])
     limits = f"({number(row['low'], digits)} to {number(row['high'], digits)})"
     shown = limits if math.isfinite(row["low"]) else "(no interval)"
-    return f"{number(row['value'], digits)} {shown}{'*' if star and row['p'] < ALPHA else ''}"
+    return f"{number(row['value'], digits)} {shown}{'*' if star and row['p_holm'] < ALPHA else ''}"
 
 
 def all_tables(study: StudyData, results: StudyResults) -> dict[str, PageTable]:
@@ -172,7 +177,7 @@ def _table(name: str, title: str, note: str, frame: pd.DataFrame, columns: _Colu
 def flow(results: StudyResults) -> PageTable:
     columns: _Columns = {
         "Group": lambda r: str(r["group"]),
-        "Visit": lambda r: str(r["role"]),
+        "Visit": lambda r: role_words(r["role"]),
         "Persons of the group": lambda r: str(r["persons"]),
         "No visit": lambda r: str(r["persons"] - r["took_place"]),
         "Took place": lambda r: str(r["took_place"]),
@@ -188,23 +193,26 @@ def flow(results: StudyResults) -> PageTable:
 def table2(results: StudyResults) -> PageTable:
     """The paper's Table 2: repeatability over cycles, correlation with the scores, effect size of change."""
     plan, marks = results.plan, _Marks()
-    rows = []
+    rows: list[dict[Any, str]] = []
+    # All, and the changing group if that is not the same.
+    persons_of = {s: list(dict.fromkeys(rows["persons"])) for s, rows in results.validity.groupby("score")}
     for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
         for i, name in enumerate(names):
             row: dict[Any, str] = {("", ""): "" if i else kind, (" ", "Measure"): short_of(name)}
             for icc_kind, head in (("2,1", "ICC2"), ("2,k", "ICC2k")):
                 found = _one(results.repeatability, name=name, of="cycles", kind=icc_kind)
                 row["Repeatability", head] = _NONE if found is None else estimate(found, marks)
-            for score in plan.scores:
-                found = _one(results.validity, name=name, score=score, persons="all")
+            for score, persons in ((s, p) for s in plan.scores for p in persons_of.get(s, ("all",))):
+                found = _one(results.validity, name=name, score=score, persons=persons)
                 text = _NONE
                 if found is not None:
                     text = (
                         marks(found["message"])
                         if found["code"]
-                        else f"{number(found['value'], 2)}{'*' if found['p'] < ALPHA else ''}"
+                        else f"{number(found['value'], 2)}{'*' if found['p_holm'] < ALPHA else ''}"
                     )
-                row["Validity", f"r {short_of(score)}"] = text
+                several = len(persons_of.get(score, ())) > 1
+                row["Validity", f"r {short_of(score)}" + f", {persons}" * several] = text
             found = _one(results.change, name=name, statistic="effect_size")
             row["Responsiveness", "Effect size"] = _NONE if found is None else estimate(found, marks, star=True)
             rows.append(row)
@@ -212,9 +220,9 @@ def table2(results: StudyResults) -> PageTable:
     body.columns = pd.MultiIndex.from_tuples(list(body.columns))
     note = (
         "ICC of cycles (Shrout & Fleiss 2,1 and 2,k), one visit per person, with 95 % interval. r: Spearman for "
-        f"ordinal scores, else Pearson, all persons with both values at the visit {plan.change_from}. Effect size: "
-        f"Wilcoxon's with bootstrap interval, {plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}. "
-        f"{_STARS}."
+        f"ordinal scores, else Pearson, persons with both values at the visit {role_words(plan.change_from)}; over all "
+        "it also holds the difference between groups. Effect size: Wilcoxon's with bootstrap interval, "
+        f"{plan.change_group}, {_when(plan)}. {_STARS} the same persons, or of the effect sizes."
     )
     return PageTable("table2", "Reliability, validity and responsiveness", note, body, marks.messages())
 
@@ -225,8 +233,8 @@ def srm_table(study: StudyData, results: StudyResults) -> PageTable:
     rows = []
     for kind, names in ((SCORES, plan.scores), (GAIT, plan.measures)):
         for i, name in enumerate(names):
-            srm, mean = (_one(results.change, name=name, statistic=s) for s in ("srm", "mean"))
-            if srm is None or mean is None:
+            srm, mean, ranks = (_one(results.change, name=name, statistic=s) for s in ("srm", "mean", "effect_size"))
+            if srm is None or mean is None or ranks is None:
                 continue
             digits = digits_of([mean["value"], mean["low"], mean["high"]])
             rows.append(
@@ -234,17 +242,23 @@ def srm_table(study: StudyData, results: StudyResults) -> PageTable:
                     "": "" if i else kind,
                     "Measure": title_of(study, name),
                     "SRM": estimate(srm, marks, star=True),
-                    "p, Holm": p_text(srm["p_holm"]),
+                    "p, jackknife": p_text(srm["p"]),
+                    "Holm": p_text(srm["p_holm"]),
+                    "p, Wilcoxon": p_text(ranks["p"]),
+                    "Holm, Wilcoxon": p_text(ranks["p_holm"]),
                     "Mean change": estimate(mean, marks, digits),
                     "Persons": str(srm["n"]),
                 }
             )
     note = (
         f"Standardised response mean (mean change / its standard deviation) with the jackknife's 95 % interval; "
-        f"{plan.change_group}, {plan.change_from} to {plan.change_to or 'none'}, persons with both visits. {_STARS}; "
-        f"{_HOLM} of this table."
+        f"{plan.change_group}, {_when(plan)}, persons with both visits. {_STARS} a column. p: the jackknife's t test "
+        "asks if the mean change, in units of its spread, differs from 0, and a few large changes decide it; "
+        "Wilcoxon's signed-rank test weighs changes by their rank. They can differ much for skewed changes and few "
+        "persons: report the one that the protocol names."
     )
-    body = pd.DataFrame(rows, columns=["", "Measure", "SRM", "p, Holm", "Mean change", "Persons"])
+    heads = ["", "Measure", "SRM", "p, jackknife", "Holm", "p, Wilcoxon", "Holm, Wilcoxon", "Mean change", "Persons"]
+    body = pd.DataFrame(rows, columns=heads)
     return PageTable("srm", "Standardised response mean", note, body, marks.messages())
 
 
@@ -260,7 +274,7 @@ def by_visit(study: StudyData, results: StudyResults) -> PageTable:
     columns: _Columns = {
         "Measure": lambda r: title_of(study, r["name"]) if r["first"] else "",
         "Group": lambda r: r["group"],
-        "Visit": lambda r: r["role"],
+        "Visit": lambda r: role_words(r["role"]),
         "n": lambda r: str(r["n"]),
         "Mean": lambda r: number(r["mean"], digits[r["name"]]),
         "95 % interval": interval,
@@ -297,7 +311,10 @@ def repeatability(study: StudyData, results: StudyResults) -> PageTable:
 
 def validity(results: StudyResults) -> PageTable:
     marks = _Marks()
-    note = f"At the visit {results.plan.change_from}, with 95 % interval. {_STARS}; {_HOLM} of the same persons."
+    note = (
+        f"At the visit {role_words(results.plan.change_from)}, with 95 % interval; p by Student's t. "
+        f"{_STARS} the same persons."
+    )
     columns: _Columns = {
         "Measure": lambda r: short_of(r["name"]),
         "Score": lambda r: short_of(r["score"]),
@@ -314,8 +331,8 @@ def validity(results: StudyResults) -> PageTable:
 def groups(results: StudyResults) -> PageTable:
     marks = _Marks()
     note = (
-        f"At the visit {results.plan.change_from}. Student's t where Shapiro-Wilk rejects neither group, else "
-        f"Mann-Whitney U. {_STARS}; {_HOLM} with the same By."
+        f"At the visit {role_words(results.plan.change_from)}. Student's t where Shapiro-Wilk rejects neither group, "
+        f"else Mann-Whitney U. {_STARS} the same By."
     )
     columns: _Columns = {
         "Measure": lambda r: short_of(r["name"]),
@@ -368,7 +385,13 @@ def phases(results: StudyResults) -> PageTable:
 def comparison_of(result: Any) -> str:
     """Names of the compared groups or roles, as a - b."""
     a, b = result.names
-    return f"{a or 'none'} {_MINUS} {b}"
+    return (
+        f"{role_words(a) or 'none'} {_MINUS} {role_words(b)}" if result.comparison == "change" else f"{a} {_MINUS} {b}"
+    )
+
+
+def _when(plan: Plan) -> str:
+    return f"{role_words(plan.change_from)} to {role_words(plan.change_to) or 'none'}"
 
 
 def _one(frame: pd.DataFrame, **values: str) -> dict[str, Any] | None:

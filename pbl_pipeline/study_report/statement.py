@@ -13,6 +13,7 @@ import pandas as pd
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.study import StudyData, content_hash
+from pbl_pipeline.words import role_words
 
 from .page_tables import PageTable, digits_of, number, short_of, title_of
 from .results import StudyResults
@@ -52,7 +53,10 @@ def statement(study: StudyData, results: StudyResults) -> PageTable:
 def _design(study: StudyData, results: StudyResults) -> Iterator[tuple[str, str]]:
     visits: Any = study.visits
     counted = visits[visits["included"]]
-    yield "Visits", f"{', '.join(results.plan.roles)}" + (f"; days from {e}" if (e := study.description.event) else "")
+    yield (
+        "Visits",
+        ", ".join(map(role_words, results.plan.roles)) + (f"; days from {e}" if (e := study.description.event) else ""),
+    )
     groups = counted.groupby("group")
     yield "Persons who count", "; ".join(f"{g}: {own['subject'].nunique()}" for g, own in groups)
     yield "Visits that count", "; ".join(f"{g}: {len(own)}" for g, own in groups)
@@ -113,8 +117,8 @@ def _statistics(results: StudyResults) -> Iterator[tuple[str, str]]:
     yield (
         "Assumption",
         (
-            f"persons do not change between visits; where they do ({change.change_group}, {change.change_from} to "
-            f"{change.change_to or 'no other'}), that counts as error"
+            f"persons do not change between visits; where they do ({change.change_group}, "
+            f"{role_words(change.change_from)} to {role_words(change.change_to) or 'no other'}), that counts as error"
         ),
     )
 

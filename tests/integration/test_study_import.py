@@ -3,6 +3,7 @@
 import datetime
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from openpyxl import Workbook
@@ -95,6 +96,28 @@ def test_a_study_from_two_sheets(empty: None, tmp_path: Path):
     )
     assert not any(line.changes for line in left.lines)
     assert stored()["P001", "pre"]["assistive_device"] == "walker"
+
+
+def test_height_and_mass_are_columns(empty: None, tmp_path: Path):
+    head = "subject,visit,role,height_m,mass_kg\n"
+    text = f"{head}P001,2026-01-10,pre,1.72,70.5\nP001,2026-05-10,3_months,1.72,68\n"
+    assert run(sheet(tmp_path, text)).done
+
+    def known() -> tuple[Any, list[float]]:
+        masses = session.BodyMass().to_arrays("body_mass", order_by="session_id")
+        return (lab.Subject & {"subject": "P001"}).fetch1("subject_height"), masses.tolist()
+
+    assert known() == (1.72, [70.5, 68.0])
+    assert not any(line.changes for line in run(sheet(tmp_path, text)).lines)
+    changed = run(sheet(tmp_path, f"{head}P001,2026-01-10,pre,1.74,-\n"))
+    assert [line.changes for line in changed.lines] == [["height 1.72 -> 1.74", "mass 70.5 -> nothing"]]
+    assert known() == (1.74, [68.0])
+    for row, code in (("P001,2026-01-10,pre,172,", "FIT_INPUT"), ("P001,2026-01-10,pre,,700", "FIT_INPUT"),
+                      ("P001,2026-01-10,pre,1.7,\nP001,2026-05-10,3_months,1.8,", "SHEET_CONFLICT")):  # fmt: skip
+        refused = run(sheet(tmp_path, f"{head}{row}\n"))
+        assert not refused.done
+        assert {e.code for line in refused.lines for e in line.errors} == {code}
+    assert known() == (1.74, [68.0])
 
 
 HEAD = "subject,visit,date,role,intervention_date,birth_date,record,mJOA\n"

@@ -150,6 +150,8 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
         answer = sign_in(client, name, password)
         assert answer.status_code == 401
         assert "do not belong together" in answer.text
+        assert f'value="{name}" required' in answer.text
+        assert not password or password not in answer.text
         client.app.state.sign_in.attempts._failures.clear()  # type: ignore[attr-defined]
     answer = sign_in(client)
     assert (answer.status_code, answer.headers["location"]) == (303, "/")

@@ -398,3 +398,46 @@ def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     assert [(round(t * 30), s, k) for t, s, k, _ in set_by_hand] == [(frame - 2, *before.detected[6][1:3])]
     assert (len(found.hand), found.n_changed, found.by) == (len(before.detected) - 1, 2, "A. First")
     assert Decision.fetch1("decision_by") == "A. First"
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_picture_marks_and_curves_are_in_one_view_while_events_are_corrected(
+    chromium: Any, visit: str, axe: str, language: str
+):
+    def upright(route: Any) -> None:
+        movement = route.fetch().json()
+        route.fulfill(json=movement | {"size": movement["size"][::-1]})
+
+    with web.shown(chromium, locale=language, bypass_csp=True) as page:
+        for width, height, turned in ((1280, 900, 0), (1024, 768, 1), (390, 844, 0), (390, 844, 1)):
+            page.set_viewport_size({"width": width, "height": height})
+            page.unroute("**/movement")
+            if turned:  # filmed in portrait
+                page.route("**/movement", upright)
+            page.goto("/recordings/1")
+            page.wait_for_selector("[data-ready]")
+            page.locator("#correct").click()
+            marks = page.locator(".track .mark")
+            marks.nth(6).click()
+            for seen in (".stage", ".line", "#curves figure >> nth=0"):
+                box = page.locator(seen).bounding_box()
+                assert 0 <= box["y"] < box["y"] + box["height"] <= height, (seen, width, box)
+            # Each curve has its values at the mark, and at the pointer while it is over one.
+            values = page.locator("#curves output")
+            found = values.all_inner_texts()
+            words = ("Left", "Right") if language == "en" else ("Links", "Rechts")
+            assert len(found) == page.locator("#curves figure").count() > 4
+            assert all(w in text and "°" in text for text in found for w in words)
+            marks.nth(7).press("ArrowRight")
+            page.wait_for_function(
+                "(last) => document.querySelector('#curves output').innerText !== last", arg=found[0]
+            )
+            found = values.all_inner_texts()
+            page.locator("#curves .u-over").first.hover(position={"x": 150, "y": 40})
+            page.wait_for_function(
+                "(last) => document.querySelector('#curves output').innerText !== last", arg=found[0]
+            )
+            assert sum(a != b for a, b in zip(found, values.all_inner_texts(), strict=True)) >= 3
+            page.evaluate(axe)
+            assert not page.evaluate("axe.run('.look')")["violations"]
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

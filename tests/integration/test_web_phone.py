@@ -38,6 +38,7 @@ from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, usual_words, verdict
+from tests import not_none
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
@@ -175,6 +176,9 @@ def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
     assert key not in str(row)
     assert mine.cookies["pbl_phone"] not in str(row)
     reviewer = web.client(target=nothing)
+    made = web.post(reviewer, f"/visits/{visit}/film", hours="2").text
+    address = not_none(re.search(r'<a href="(http[^"]+)"><code>([^<]+)</code></a>', made))
+    assert address[1] == address[2]
     assert "opened by a phone" in reviewer.get(f"/visits/{visit}").text
     web.post(reviewer, f"/visits/{visit}/film/end", link=row["phone_link"])
     ended = mine.get("/phone/state.json")

@@ -499,6 +499,36 @@ ASKING = """
 """
 
 
+#: In the page: what it says aloud and how long it vibrates.
+CUES = """() => {
+  window.cues = [];
+  navigator.vibrate = (ms) => { window.cues.push(ms); return true; };
+  speechSynthesis.speak = (said) => window.cues.push(`${said.lang} ${said.text}`);
+}"""
+
+
+@pytest.mark.parametrize(("language", "go", "end"), [("en", "en Go", "en Stop"), ("de", "de Los", "de Stopp")])
+def test_filming_starts_after_a_countdown_with_cues_that_are_heard_and_felt(
+    camera: Any, visit: int, language: str, go: str, end: str
+):
+    with filming(camera, visit, script=CUES, locale=language) as page:
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='soon']")
+        page.locator(".record").click()  # another tap ends it
+        page.wait_for_timeout(2300)
+        assert page.locator("main").get_attribute("data-filming") == "no"
+        page.evaluate("cues.length = 0")
+        began = page.evaluate("performance.now()")
+        page.locator(".record").click()
+        page.wait_for_selector("main[data-filming='yes']")
+        assert page.evaluate("performance.now()") - began >= 1900
+        page.wait_for_timeout(800)
+        page.locator(".record").click()
+        page.wait_for_selector(".after:not([hidden])")
+        two, one = (f"{language} {n}" for n in (2, 1))
+        assert page.evaluate("cues") == [60, two, 60, one, 200, go, 400, end]
+
+
 def test_says_what_to_do_where_there_is_no_camera(chromium: Any, camera: Any, visit: int):
     with filming(chromium, visit, denied=True) as page:  # has none
         page.locator(".said", has_text="camera").wait_for()

@@ -11,6 +11,7 @@ import pytest
 from pbl_pipeline import texts
 from pbl_pipeline.names import HEIGHT_M, MASS_KG
 from pbl_schemas import lab, session, study, video
+from pbl_schemas.reading.shown import shown_visit
 from pbl_schemas.reading.visit_list import STATES, Filter, visit_page
 from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
@@ -116,17 +117,58 @@ def test_a_wrong_field_is_said_beside_it_and_keeps_what_was_typed(
 
 def test_a_visit_is_registered_once_and_codes_that_are_alike_are_asked_about():
     browser = web.client()
+    asked = "resembles another one"
+    assert asked not in browser.get("/visits/new").text
     assert new(browser).status_code == 303
     before = everything()
     again = new(browser).text
     assert "SHEET_CONFLICT" in again
     assert 'id="visit"' in again
+    assert asked not in again
     alike = new(browser, subject="p1")
     assert alike.status_code == 200
     assert "the codes p1 and P001" in alike.text
+    assert asked in alike.text
     assert "--" not in re.sub(r"<!--|-->", "", alike.text)
     assert everything() == before
     assert new(browser, subject="p1", distinct="yes").status_code == 303
+
+
+@pytest.mark.parametrize(
+    ("language", "empty", "none"),
+    [("en", "No visits yet.", "No visit matches."), ("de", "Noch keine Termine.", "Kein Termin passt.")],
+)
+def test_an_empty_list_says_what_comes_first(language: str, empty: str, none: str):
+    browser = web.client()
+    browser.headers["accept-language"] = language
+    assert empty in browser.get("/visits").text
+    assert none in browser.get("/visits?state=failed").text
+    new(browser)
+    assert none in browser.get("/visits?state=failed").text
+
+
+@pytest.mark.parametrize(("language", "anew"), [("en", "being computed anew"), ("de", "wird neu berechnet")])
+def test_the_index_stays_while_that_with_an_added_recording_is_computed(tmp_path: Path, language: str, anew: str):
+    register(small_video(tmp_path, "one"), session_label="2026-01-10")
+    populate()
+    index = f'<span class="big">{shown_visit(1).results[0].index:.1f}'.replace(".", "," if language == "de" else ".")
+    browser = web.client()
+    browser.headers["accept-language"] = language
+    assert anew not in browser.get("/visits/1").text
+    register(small_video(tmp_path, "two"), session_label="2026-01-10")
+    populate(["VideoInfo", "Tracking", "SubjectChoice", "Keypoints", "TrialInput"])
+    populate(["SessionFit"])
+    page = browser.get("/visits/1").text
+    assert anew in page
+    assert index in page
+    # Not one of which a recording does not count any more.
+    fields = web.form_of(browser, "/recordings/1", "/recordings/1/usable")
+    web.post(browser, "/recordings/1/usable", **fields, usable="no", reason="interrupted")
+    populate(["TrialInput"])
+    assert shown_visit(1).earlier is None
+    assert anew not in browser.get("/visits/1").text
+    populate()
+    assert anew not in browser.get("/visits/1").text
 
 
 @pytest.mark.parametrize("language", ["en", "de"])
@@ -390,8 +432,10 @@ def test_a_good_file_beside_a_bad_one_is_taken(tmp_path: Path):
     assert answer.status_code == 200
     assert "UPLOAD_REFUSED" in answer.text
     assert ">walk.mp4</a>: registered" in answer.text
+    assert '<a href="/visits/1">Go on to the visit' in answer.text
     assert '<option value="slow" selected>' in answer.text
     assert len(video.Video()) == 1
+    assert "Go on to the visit" not in upload(browser, ("a.mp4", b"x")).text  # nothing arrived
     assert upload(browser).status_code in (200, 415)  # nothing was chosen
 
 

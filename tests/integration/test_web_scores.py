@@ -207,7 +207,8 @@ def test_an_instrument_is_added_in_a_browser(own: None, chromium: Any, language:
             one.select_option(text) if text in ("yes", "no") else one.fill("" if field == "instrument_unit" else text)
         page.get_by_role("button", name=saved).click()
         page.get_by_role("alert").wait_for()
-        assert "SHEET_FORMAT" in page.locator(".problem").inner_text()
+        assert page.locator(".problem").get_attribute("data-code") == "SHEET_FORMAT"
+        assert ("ein leeres Feld." if language == "de" else "an empty field.") in page.locator(".problem").inner_text()
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         page.locator("#instrument_unit").fill("Punkte" if language == "de" else "points")
         page.get_by_role("button", name=saved).click()

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from pbl_schemas import gait, gdi
 from pbl_schemas.intake.records import set_condition
 from pbl_schemas.reading import comparison
 from pbl_schemas.reading.trend import trend_of
+from pbl_schemas.studies.visit_forms import enter_scores, scores_form
 from pbl_workers.populate import populate
 from tests import not_none
 from tests.integration import web
@@ -143,4 +145,41 @@ def test_the_letter_is_one_visit_on_a_page(visits: None):
     assert "R. Viewer" in page
     assert page.count('<svg viewBox="0 0 280 200"') == 4
     assert "<form method" not in page.split("<main")[1]  # nothing to decide on paper
+    assert "Clinical scores" not in page
     assert "no measures yet" in browser.get("/visits/7/letter").text
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_the_letter_has_the_clinic_the_scores_a_comment_and_the_body(
+    visits: None, language: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("PBL_LETTER_HEAD", "Clinic <North>; Station 1, 12345 Town")
+    form = scores_form(2)
+    enter_scores(2, form.values | {"role": "6_months", "mJOA": "14"}, "A", form.seen)
+    browser = web.client()
+    browser.headers["accept-language"] = language
+    page = " ".join(browser.get("/visits/2/letter?result=0").text.split())
+    assert '<p class="head">Clinic &lt;North&gt;<br>Station 1, 12345 Town</p>' in page
+    assert page.count('<img src="data:image/jpeg;base64,') == 3  # the body of its recording, without the picture
+    words = {
+        "en": ("Letter for the record", "6 months", "mJOA 14", "Comment", "an adult as well"),
+        "de": ("Messbericht für die Akte", "6 Monate", "mJOA 14", "Kommentar", "auch einen Erwachsenen"),
+    }
+    for word in words[language]:
+        assert word in page, word
+    assert not re.search("Befund|6_months|UTC", page)
+
+
+def test_a_comment_is_printed_and_stays_on_the_page(visits: None, chromium: Any):
+    with web.shown(chromium) as page:
+        page.goto("/visits/3/letter?result=0")
+        comment = page.get_by_role("textbox", name="Comment")
+        page.emulate_media(media="print")
+        assert not page.locator(".comment").is_visible()  # nothing was written
+        page.emulate_media(media="screen")
+        comment.fill("Walks with more confidence.")
+        page.emulate_media(media="print")
+        assert comment.is_visible()
+        assert not page.locator(".print-hint").first.is_visible()
+        assert page.evaluate("document.querySelector('.overview img').naturalWidth > 50")
+        assert len(re.findall(rb"/Type\s*/Page\b", page.pdf(prefer_css_page_size=True))) == 1

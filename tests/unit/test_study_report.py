@@ -153,6 +153,35 @@ def test_p_is_corrected_within_its_family(results):
         assert known["p_holm"].min() == pytest.approx(min(1.0, known["p"].min() * len(known))), by
 
 
+def test_tables_are_as_a_journal_has_them(study, results):
+    tables = all_tables(study, results)
+    # Stars follow the corrected p alone; these values have p that are small only before it.
+    nearly = results.validity.assign(p=0.01, p_holm=0.2, code="")
+    change = results.change.assign(p=0.0004, p_holm=0.06)
+    groups = results.groups.assign(p=0.01, p_holm=0.2)
+    uncorrected = all_tables(study, dataclasses.replace(results, validity=nearly, change=change, groups=groups))
+    for name in ("table2", "srm", "validity", "groups"):
+        assert not uncorrected[name].body.map(lambda cell: "*" in cell).any(axis=None), name
+        assert tables[name].body.map(lambda cell: "*" in cell).any(axis=None), name
+        assert "Holm" in tables[name].note, name
+    # Which test, and its p before and after the correction.
+    srm = uncorrected["srm"].body
+    assert list(srm.columns[3:7]) == ["p, jackknife", "Holm", "p, Wilcoxon", "Holm, Wilcoxon"]
+    assert set(srm["p, jackknife"]) == {"< 0.001"}
+    assert "skewed" in tables["srm"].note
+    # r of the patients beside r of all.
+    table2 = tables["table2"].body["Validity"]
+    assert {"r 10MWT, all", f"r 10MWT, {made.PATIENTS}"} <= set(table2.columns)
+    index = tables["table2"].body[" ", "Measure"].eq("GDI")
+    for persons in ("all", made.PATIENTS):
+        r = row(results.validity, name="gdi", score="10MWT", persons=persons)["value"]
+        assert f"{abs(r):.2f}" in table2.loc[index, f"r 10MWT, {persons}"].item()
+    # A role is written in words.
+    for table in tables.values():
+        assert "6_months" not in table.note + table.body.to_string() + table.latex(""), table.name
+    assert "6 months" in set(tables["by_visit"].body["Visit"])
+
+
 def test_repeatability_is_of_one_visit_per_person_and_of_visits_by_group(study, results):
     controls = [by_hand(study, role, made.CONTROLS) for role in made.ROLES]
     persons = sorted(set().union(*controls))
@@ -261,6 +290,7 @@ def test_the_files_of_a_report(written):
     page = (out / "report.html").read_text()
     assert not re.findall(r"(?:src|href)=\"(?!#|data:image/svg)", page)
     assert '<ul class="why">' not in page
+    assert "6_months" not in re.sub(r"<[^>]*>", " ", page)
     assert "nan" not in re.sub(r"<[^>]*>", " ", page).lower().split()
     for path in (out / "figures").glob("*.svg"):
         root = ET.parse(path).getroot()
@@ -269,6 +299,7 @@ def test_the_files_of_a_report(written):
         _, _, width, height = map(float, root.attrib["viewBox"].split())
         at = [(float(t.attrib["x"]), float(t.attrib["y"])) for t in texts if "x" in t.attrib]
         assert all(0 <= x < width and 0 < y < height for x, y in at), (path.name, at)  # none is cut off
+        assert "6_months" not in words, path.name
         for said in ("synthetic spine cohort", "80 persons", "no video", f"PBL pipeline {code_version()}"):
             assert said in words, path.name
         assert "nan" not in path.read_text().lower()

@@ -98,7 +98,7 @@ def test_a_recording_without_a_camera_or_a_pose_is_sent_too():
     fit = handheld_walk()
     markers = dataclasses.replace(
         fit,
-        camera=Camera(np.full((3, 3), np.nan), np.zeros(5), "none"),
+        camera=Camera(np.full((3, 3), np.nan), np.full(5, np.nan), "none"),
         phone_quat_wxyz=np.full_like(fit.phone_quat_wxyz, np.nan),
         camera_position_m=np.full(3, np.nan),
         image_size_px=(0, 0),

@@ -16,7 +16,7 @@ from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from ..decisions.review_decisions import may_be_accepted
 from . import registered
-from .visit_list import VisitRow, results_of, visits_of
+from .visit_list import VisitRow, earlier_result, results_of, visits_of
 from .visits import load_recording, load_visit
 from .why import whys
 
@@ -59,6 +59,7 @@ class ShownVisit:
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person
     marks: Mapping[int, Unusable] = dataclasses.field(default_factory=dict)  # recordings marked as not usable
     computed: str = ""  # when the checks were computed
+    earlier: Result | None = None  # without a result: the last one of a part of the recordings
 
     @property
     def result(self) -> Result | None:
@@ -144,7 +145,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
         marks=unusable([r.number for r in recordings if r.number is not None]),
     )
     if not results:
-        return about
+        return dataclasses.replace(about, earlier=earlier_result(session_id))
     names = ("fit_method", "gait_method", "gdi_method", "norm")
     chain = dict(zip(names, results[shown].methods, strict=True))
     # Restricted before it is projected: DataJoint leaves out conditions on columns that are not there.

@@ -142,12 +142,25 @@ def choices() -> dict[str, list[str]]:
     return {"cohort": [str(c) for (c,) in cohorts], "role": by_time}
 
 
-def results_of(sessions: Iterable[int]) -> dict[int, list[Result]]:
-    """Results of the current sets of visits, by session: videos of one camera first, then the newest methods."""
-    return {i: of for some in parts(dict.fromkeys(int(s) for s in sessions)) for i, of in _results_of(some).items()}
+def earlier_result(session_id: int) -> Result | None:
+    """Return the newest result of a part of the recordings that a current set of the visit has; None without one."""
+    videos = fit.FitSet.Video & (fit.FitSet & {"session_id": session_id}).proj()
+    members: dict[str, set[int]] = {}
+    for row in videos.proj().to_dicts():
+        members.setdefault(row["fit_set"], set()).add(int(row["video_id"]))
+    now = [members[name] for name in set((fit.current() & inside("fit_set", members)).to_arrays("fit_set"))]
+    older = [name for name, own in members.items() if any(own < every for every in now)]
+    return next(iter(results_of([session_id], older)[session_id]), None) if older else None
 
 
-def _results_of(ids: list[int]) -> dict[int, list[Result]]:
+def results_of(sessions: Iterable[int], sets: Sequence[str] = ()) -> dict[int, list[Result]]:
+    """Results of the current sets of visits, or of `sets`, by session: videos of one camera first, then the newest
+    methods."""
+    ids = dict.fromkeys(int(s) for s in sessions)
+    return {i: of for some in parts(ids) for i, of in _results_of(some, sets).items()}
+
+
+def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
     found: dict[int, list[Result]] = {i: [] for i in ids}
     open_checks = _open_checks(ids)
     rows = _ask(
@@ -155,11 +168,12 @@ def _results_of(ids: list[int]) -> dict[int, list[Result]]:
         " g.session_status, g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd,"
         " g.session_gdi_minimal_change, g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
         f" FROM {_name(fit.FitSet)} f"
-        f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set AND c.fit_current = 1"
+        f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set"
+        f" AND {f'c.fit_set IN ({_places(sets)})' if sets else 'c.fit_current = 1'}"
         f" JOIN {_name(gdi.SessionGdi)} g ON g.fit_set = c.fit_set AND g.fit_method = c.fit_method"
         f" LEFT JOIN {_name(qc.SessionQc)} q ON {_SAME_RESULT}"
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
-        ids,
+        [*sets, *ids],
     )
     names = ("session_id", "fit_set", "fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
     filmed = filming_of([dict(zip(names, row, strict=False)) for row in rows])

@@ -13,13 +13,13 @@ from typing import Any
 
 from pbl_pipeline.csv_cells import quoted
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.names import check_label, normalised_label
+from pbl_pipeline.names import check_height, check_label, check_mass, normalised_label
 from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
 from ..instruments import disagreement
-from ..intake.records import VisitRecord, add_people, delete_forces, session_ids, set_condition
+from ..intake.records import VisitRecord, add_people, delete_forces, session_ids, set_condition, set_height, set_mass
 from ..intake.sheets import (
     Imported,
     Line,
@@ -85,7 +85,7 @@ def _add(row: Row, by: str) -> dict[str, PblError]:
 def _value(row: Row, field: str) -> Any:
     text = row.cells.get(field, "")
     if not text and field in _NEEDED:
-        raise refused("nothing", "a value", "write it", field)
+        raise refused("an empty field", "a value", "write it", field)
     if field in FLAGS:
         if text not in ("yes", "no"):
             raise refused(repr(text[:20]), "yes or no", "choose one of them", field)
@@ -121,7 +121,9 @@ VISIT_COLUMNS = {
 }
 MEMBER_COLUMNS = {"group": "member_group", "included": "member_included", "reason": "member_reason"}
 _DATED = ("date", "birth_date")
-COLUMNS = ("subject", "visit", *_DATED, *VISIT_COLUMNS, "population", "record", "cohort", *MEMBER_COLUMNS)
+#: Height of the person and mass at the visit, with the checks of their values.
+_SIZES = {"height_m": check_height, "mass_kg": check_mass}
+COLUMNS = ("subject", "visit", *_DATED, *VISIT_COLUMNS, *_SIZES, "population", "record", "cohort", *MEMBER_COLUMNS)
 SCORE_COLUMNS = ("subject", "visit", "instrument", "value")
 TRIAL_COLUMNS = ("video", "subject", "visit", "activity", "pace")
 #: Columns whose words are codes (`texts.code_of`) -> kind of the codes.
@@ -182,6 +184,7 @@ class _Plan:
         self.sessions: dict[tuple[str, str], _Stated] = {}
         self.visits: dict[tuple[str, str], _Stated] = {}
         self.members: dict[tuple[str, str], _Stated] = {}
+        self.masses: dict[tuple[str, str], _Stated] = {}
         self.scores: dict[tuple[str, str, str], _Stated] = {}
         self.trials: list[_Stated] = []
         self.instruments = {r["instrument"]: r for r in study.ClinicalInstrument().to_dicts()}
@@ -254,6 +257,8 @@ class _Plan:
             _flag(row, column)
         elif column in _DATED:
             _day(row, column)
+        elif column in _SIZES:
+            _size(row, column)
         else:
             check_label(column, text, _LONGEST.get(column, 32))
 
@@ -284,13 +289,18 @@ class _Plan:
         cells = row.cells
         code = self._person(row)
         self._identity(row, code)
+        if "height_m" in cells:
+            self._same(row, self.people[code], "subject_height", _size(row, "height_m"), "height", code)
         if "cohort" in cells or {*MEMBER_COLUMNS} & {*cells}:
             self._member(row, code)
         scores = [c for c in cells if c in self.instruments]
         stated = {c for c in VISIT_COLUMNS if c in cells}
-        if not scores and not stated and not ({"visit", "date"} & {*cells}):
+        if not scores and not stated and not ({"visit", "date", "mass_kg"} & {*cells}):
             return
         key = self._session(row, code)
+        if "mass_kg" in cells:
+            mass = self.masses.setdefault(key, _Stated(row, {}))
+            self._same(row, mass, "body_mass", _size(row, "mass_kg"), "mass", f"{code}, {key[1]}")
         if stated:
             with self._line(row).about():
                 if key in self.visits:
@@ -367,10 +377,12 @@ class _Plan:
     # ------------------------------------------------------------------------------------------------------- the tables
     def _load(self) -> None:
         people = {*self.people, *(c for _, c in self.members)}
-        self.known = {r["subject"]: r for r in lab.Subject.proj("population").to_dicts()}
+        self.known = {r["subject"]: r for r in lab.Subject.proj("population", "subject_height").to_dicts()}
         self.registered = session.by_label(rows_inside(session.Session(), "subject", people))
         labels = {int(r["session_id"]): key for key, r in self.registered.items()}
         self.stored_visits = {labels[int(r["session_id"])]: r for r in rows_inside(study.Visit(), "session_id", labels)}
+        masses = rows_inside(session.BodyMass(), "session_id", labels)
+        self.stored_masses = {labels[int(r["session_id"])]: r for r in masses}
         scores = rows_inside(study.ClinicalScore(), "session_id", labels)
         self.stored_scores = {(*labels[int(r["session_id"])], r["instrument"]): r for r in scores}
         members = rows_inside(study.CohortMember(), "subject", people)
@@ -496,6 +508,7 @@ class _Plan:
         self._differences(self.people, self.known, lambda code, _: f"new person {code}")
         self._differences(self.sessions, self.registered, lambda key, _: f"new session {key[1]} of {key[0]}")
         self._differences(self.visits, self.stored_visits, _new_visit)
+        self._differences(self.masses, self.stored_masses, lambda _, values: f"mass {_shown(values['body_mass'])}")
         self._differences(self.members, self.stored_members, lambda key, _: f"new member {key[1]} of cohort {key[0]}")
         self._differences(self.scores, self.stored_scores, _new_score)
         self._compare_trials()
@@ -534,6 +547,9 @@ class _Plan:
     def apply(self) -> None:
         """Write what `_compare` has left. Inside a transaction."""
         add_people(VisitRecord(code, population=s.values.get("population")) for code, s in self.people.items())
+        for code, stated in self.people.items():
+            if "subject_height" in stated.values:
+                set_height(code, stated.values["subject_height"])
         numbers = {key: int(r["session_id"]) for key, r in self.registered.items()} | session_ids(
             VisitRecord(*key, date=s.values.get("session_date")) for key, s in self.sessions.items()
         )
@@ -541,6 +557,8 @@ class _Plan:
         visits = {key: ({"session_id": numbers[key]}, s.values) for key, s in self.visits.items()}
         _write(study.Visit, visits, self.stored_visits, blank)
         delete_forces(key["session_id"] for key, values in visits.values() if "assistive_device" in values)
+        for key, stated in self.masses.items():
+            set_mass(numbers[key], stated.values["body_mass"])
         study.Cohort.insert(({"cohort": c} for c in sorted({c for c, _ in self.members})), skip_duplicates=True)
         blank = {"member_included": True, "member_group": "", "member_reason": ""}
         members = {key: ({"cohort": key[0], "subject": key[1]}, s.values) for key, s in self.members.items()}
@@ -572,11 +590,12 @@ def _new_score(key: tuple[str, str, str], values: Mapping[str, Any]) -> str:
 
 def _column(key: Any, column: str) -> str:
     """The name of a column in words: of a score that of its instrument."""
-    return key[2] if column == "score_value" else re.sub("^(visit|member|session)_", "", column)
+    return key[2] if column == "score_value" else re.sub("^(visit|member|session|subject|body)_", "", column)
 
 
 def _default(column: str) -> Any:
-    return None if column in ("visit_days", "visit_age", "intervention_date", "score_value") else ""
+    empty = ("visit_days", "visit_age", "intervention_date", "score_value", "subject_height", "body_mass")
+    return None if column in empty else ""
 
 
 def _day(row: Row, column: str) -> datetime.date:
@@ -585,6 +604,15 @@ def _day(row: Row, column: str) -> datetime.date:
     if column == "birth_date" and re.fullmatch(r"(18|19|20)\d\d", text):
         return datetime.date(int(text), 7, 1)
     return date_of(row, column)
+
+
+def _size(row: Row, column: str) -> float | str:
+    text = row.cells[column]
+    if text == CLEAR:
+        return CLEAR
+    value = number_of(row, column, text)
+    _SIZES[column](value)
+    return value
 
 
 def _flag(row: Row, column: str) -> bool:

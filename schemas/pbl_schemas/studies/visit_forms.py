@@ -94,7 +94,8 @@ class Form:
 def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
     """Register a visit, and its person where the code is new.
 
-    Returns the number of the visit, None if nothing was written; errors by field, "" for what is wrong with several.
+    Returns the number of the visit, None if nothing was written; errors by field, `DISTINCT` for a code that
+    is like another one, "" for what is wrong with several.
 
     `values`: text by field: `NEW`, "height_m", and `DISTINCT` ("yes" or empty). Only the first two are needed.
     """
@@ -107,7 +108,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
     errors: dict[str, PblError] = {}
     for name in ("subject", "visit"):
         if name not in given:
-            errors[name] = refused("nothing", "a value", "write it", name)
+            errors[name] = refused("an empty field", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
         "visit": functools.partial(check_label, "visit", longest=NEW["visit"]),
@@ -128,7 +129,8 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
     if found.errors:
         error = found.errors[0]
         if "--distinct-codes" in error.next_step:
-            error = conflict(error.found, error.expected, "correct the code, or tick that they are different people")
+            step = "correct the code, or tick that they are different people"
+            return None, {DISTINCT: conflict(error.found, error.expected, step)}
         return None, {"": error.with_key(None)}
     number = int((session.Session & of_visit).fetch1("session_id"))
     record("visit", by, {}, {}, {"visit": given["visit"]}, session_id=number)

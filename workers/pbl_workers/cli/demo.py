@@ -17,15 +17,24 @@ SUBJECT, SESSION, PROJECT = "DEMO", "sports2d-demo", "demo"
 
 @click.command(epilog="Example: pbl demo --out pbl_demo")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("pbl_demo"), show_default=True)
+@click.option("--visits", is_flag=True, help="Three drawn persons with two visits each, to look at the pages with.")
 @click.option("--no-database", is_flag=True, help="On files alone, as `pbl run` does; needs no database server.")
 @LANGUAGE
 @click.pass_context
-def demo(context: click.Context, out: Path, no_database: bool, language: str) -> None:
+def demo(context: click.Context, out: Path, visits: bool, no_database: bool, language: str) -> None:
     """Set up what the default needs, put the demo recording through every table, show the rows and write the report.
 
     Safe to repeat: existing results are not computed again. The database is stopped at the end if it was not
-    running before; the next command that needs it starts it again.
+    running before; the next command that needs it starts it again. With --visits synthetic markers (no film, no real
+    person) go through the tables instead, for the lists, comparison, trend, letter, study and forces of `pbl web`.
     """
+    if no_database and visits:
+        raise PblError(
+            "USAGE",
+            found="--visits with --no-database",
+            expected="one of them: the drawn visits are rows of the database",
+            next_step="leave one out",
+        )
     if no_database:
         from pbl_pipeline.cli.run import run
 
@@ -45,12 +54,12 @@ def demo(context: click.Context, out: Path, no_database: bool, language: str) ->
 
     check_out_folder(out)
     begin = time.monotonic()
-    _step(1, "models and the demo recording")
+    _step(1, "database server" if visits else "models and the demo recording")
     embedded.prepare(say=click.echo)  # no files are fetched where there can be no server, and without them no database
-    files = _fetched()
+    files = {} if visits else _fetched()
     was_running = embedded.status().running
     try:
-        _run(files, out, language)
+        _run_visits(out) if visits else _run(files, out, language)
     finally:
         if not was_running:
             embedded.stop(say=click.echo, on_demand=True)
@@ -63,34 +72,58 @@ def _fetched() -> dict[str, Path]:
     return {name: assets.fetch(name) for name in assets.needed()}
 
 
-def _run(files: dict[str, Path], out: Path, language: str) -> None:
+def _activated() -> None:
     import pbl_schemas
     from pbl_schemas import connection
-    from pbl_schemas.intake import VisitRecord, ingest
     from pbl_schemas.operations import embedded
-    from pbl_schemas.reading import frames
-    from pbl_schemas.reading.visits import write_visit
-    from pbl_workers.cli.populate import summary
-    from pbl_workers.populate import populate
 
-    for name, path in files.items():
-        click.echo(f"{name}: {path}")
     _step(2, "database")
     embedded.start(say=click.echo)
     connection.connect()
     pbl_schemas.activate()
-    _step(3, "ingest")
-    visit = VisitRecord(SUBJECT, SESSION, PROJECT, camera_file=files["demo_camera"])
-    for result in ingest([files["demo_video"]], visit):
-        if result.error is not None:
-            raise result.error
-        click.echo(f"{result.status}: video_id {result.video_id}; {result.note}")
+
+
+def _populated() -> None:
+    from pbl_workers.cli.populate import summary
+    from pbl_workers.populate import populate
+
     _step(4, "populate")
     run = populate()
     click.echo("\n".join(summary(run)))
     if run.interrupted:
         raise click.exceptions.Exit(130)
     _step(5, "result")
+
+
+def _run_visits(out: Path) -> None:
+    from pbl_schemas.reading import frames
+    from pbl_workers.drawn_visits import PROJECT, register_drawn
+
+    _activated()
+    _step(3, "drawn visits")
+    register_drawn(out)
+    _populated()
+    for row in frames.session_summary({"project": PROJECT}).to_dict("records"):
+        click.echo(f"{row['subject']} {row['session_label']}: index {_number(row['session_gdi'], 1)}{_interval(row)}")
+    click.echo(f"drawn, of no real person; the markers are in {out}")
+    click.echo("look at them in a browser: pbl web")
+
+
+def _run(files: dict[str, Path], out: Path, language: str) -> None:
+    from pbl_schemas.intake import VisitRecord, ingest
+    from pbl_schemas.reading import frames
+    from pbl_schemas.reading.visits import write_visit
+
+    for name, path in files.items():
+        click.echo(f"{name}: {path}")
+    _activated()
+    _step(3, "ingest")
+    visit = VisitRecord(SUBJECT, SESSION, PROJECT, camera_file=files["demo_camera"])
+    for result in ingest([files["demo_video"]], visit):
+        if result.error is not None:
+            raise result.error
+        click.echo(f"{result.status}: video_id {result.video_id}; {result.note}")
+    _populated()
     here = {"subject": SUBJECT, "session_label": SESSION}
     paths = write_visit(here, out, language)
     summary_rows = frames.session_summary(here)

@@ -294,7 +294,7 @@ def routes(pages: Pages, way: SignIn, used: Callable[[], None]) -> list[Address]
         return response
 
     async def ask(request: Request) -> Response:
-        return pages.show(request, "sign_in.html", problem="", wait=0)
+        return pages.show(request, "sign_in.html", problem="", wait=0, name="")
 
     async def sign_in(request: Request) -> Response:
         assert way.accounts is not None
@@ -305,14 +305,14 @@ def routes(pages: Pages, way: SignIn, used: Callable[[], None]) -> list[Address]
         if wait > 0:
             seconds = math.ceil(wait)
             headers = {"retry-after": str(seconds)}
-            return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds)
+            return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds, name=name)
         way.attempts.failed(name, address)
         async with turn:
             account = await asyncio.to_thread(way.accounts.check, name, password)
         if account is None:
             # No name: people write their password into the wrong field.
             log.warning("a failed sign-in from %s", address)
-            return pages.show(request, "sign_in.html", 401, problem="sign_in.wrong", wait=0)
+            return pages.show(request, "sign_in.html", 401, problem="sign_in.wrong", wait=0, name=name)
         way.attempts.succeeded(name, address)
         return opened(request, way.sessions.open(account.name, account.roles, account.changed), "/")
 

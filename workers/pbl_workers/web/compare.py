@@ -74,7 +74,7 @@ def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
             bounds=_bounds,
             percent=lambda p: number(100.0 * min(p, 0.99), 0),
             least_important=IMPORTANT_CHANGE,
-            now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC",
+            now=datetime.datetime.now(datetime.UTC),
             version=code_version(),
         )
 

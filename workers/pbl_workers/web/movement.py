@@ -109,7 +109,7 @@ def body_json(found: Recording) -> tuple[dict[str, Any], bytes]:
     known = _finite(track.quat_wxyz) & _finite(track.root_m)
     quat, position = np.asarray(fit.phone_quat_wxyz, float), np.asarray(fit.camera_position_m, float)
     aimed = _finite(quat) & bool(np.isfinite(position).all() and np.isfinite(fit.camera.matrix).all())
-    turning = turning_radius2(fit.camera)
+    turning = turning_radius2(fit.camera) if aimed.any() else np.inf
     start = track.root_m[np.argmax(known)] if known.any() else np.zeros(3)
     channels = np.concatenate(
         [

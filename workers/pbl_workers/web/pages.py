@@ -126,6 +126,7 @@ class Pages:
             stage_words=STAGES,
             codes=texts.codes,
             measure_words=MEASURES | TASKS,
+            moment=moment,
             angle_words=[title for title, _ in ANGLES.values()],
         )
         self._environment.filters["capital"] = capital
@@ -170,7 +171,7 @@ class Pages:
             error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
             return self.error(request, error, _REFUSED[reason])
         if reason == "session" and self._sign_in:
-            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0)
+            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0, name="")
         return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
     def error(self, request: Request, error: PblError, status: int) -> Response:
@@ -192,6 +193,13 @@ class Pages:
 def visit_name(language: str, label: str) -> str:
     """Return the label of a visit; of one that got none, the words for that in a language."""
     return texts.text(language, "visits.unlabelled") if label == UNLABELLED else label
+
+
+def moment(at: datetime.datetime | str) -> str:
+    """Return a moment (UTC if it has no zone) as the clock of this machine shows it, to the minute."""
+    at = datetime.datetime.fromisoformat(at) if isinstance(at, str) else at
+    zoned = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
+    return f"{zoned.astimezone():%Y-%m-%d %H:%M}"
 
 
 def in_field(language: str, number: str) -> str:

@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
+import numpy as np
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
-from pbl_pipeline import texts
+from pbl_pipeline import settings, texts
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import (
@@ -27,6 +28,8 @@ from pbl_pipeline.gait import (
 )
 from pbl_pipeline.kinetics import GRAVITY
 from pbl_pipeline.names import normalised_label, whole_number
+from pbl_pipeline.render import overlay_frames, report_indices
+from pbl_pipeline.report import Picture, picture
 from pbl_pipeline.report.curves import CycleCurve, Ranges, cycle_curves
 from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
@@ -45,6 +48,8 @@ from .tables import Asks, Tables
 
 #: Angles of the first screen: those of the index of three angles, and the ankle.
 SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
+#: Recordings in the overview of a letter, and the longer side of its pictures (px).
+_OVERVIEW, _OVERVIEW_PX = 2, 240
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +94,19 @@ def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:
     return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": drawn}
 
 
+def overview(visit: Visit) -> list[dict[str, Any]]:
+    """Return pictures of the fitted body on white, of the first recordings that have a camera: name, `pictures`."""
+    found = []
+    for r in visit.fitted[:_OVERVIEW]:
+        fit = r.fit
+        if fit is None or not np.isfinite(fit.camera.matrix).all() or not (indices := report_indices(fit)):
+            continue
+        drawn = overlay_frames(None, fit, indices, max_side_px=_OVERVIEW_PX, crop_to_body=True)
+        frames = [Picture(i, float(fit.time_s[i]), image) for i, image in zip(indices, drawn, strict=True)]
+        found.append({"name": r.name, "pictures": [picture(r.name, p) | {"time_s": p.time_s} for p in frames]})
+    return found
+
+
 def norm_people(norm: str) -> int | None:
     """Return how many typically developing children a set of the index that ships is of; None for other sets."""
     return load_norm(norm).n if norm in norm_names() else None
@@ -114,8 +132,9 @@ def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
         about = await asks.ask(source.visit, number_of(request), shown_of(request))
         values = {"about": about, **await asks.ask(source.around, about)}
         values |= await asks.ask(_drawn, about, reader_language(request))
-        now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC"
-        more = {"interval": interval, "sided": SIDED, "now": now, "version": code_version()}
+        values["pictures"] = [] if about.visit is None else await asks.ask(overview, about.visit)
+        more = {"interval": interval, "sided": SIDED, "version": code_version(), "head": settings.letter_head()}
+        more["now"] = datetime.datetime.now(datetime.UTC)
         return pages.show(request, "letter.html", **values, **more)
 
     return [

@@ -160,12 +160,10 @@ export function drawBody(canvas, m, poses, frame) {
     capsule(c, v[0], v[1], v[2], v[3], v[4], v[5]);
     c.fillStyle = FILLS[side];
     c.strokeStyle = pale ? FILLS[side] : "rgba(0,0,0,.55)";
-    c.setLineDash(pale ? [5 * c.lineWidth, 4 * c.lineWidth] : []);
     c.globalAlpha = pale ? 0.12 : 0.5;
     c.fill();
-    c.globalAlpha = pale ? 0.9 : 0.35;
+    c.globalAlpha = pale ? 0.6 : 0.35;
     c.stroke();
   }
   c.globalAlpha = 1;
-  c.setLineDash([]);
 }

@@ -4,7 +4,7 @@ import { openCamera, Take } from "./capture_film.js";
 import { logOf, Sensors, up } from "./capture_sensors.js";
 import { all, keep, newFile, Refusal, remove, request, send } from "./capture_takes.js";
 
-const LEAST_ROOM = 3e8, AGAIN_MS = 3000;
+const LEAST_ROOM = 3e8, AGAIN_MS = 3000, COUNT_S = 2;
 const page = /** @type {HTMLElement} */ (document.querySelector("main"));
 const texts = JSON.parse(page.dataset.said ?? "{}"), language = document.documentElement.lang;
 const visit = Number(page.dataset.visit), size = Number(page.dataset.part);
@@ -56,11 +56,39 @@ async function open() {
 }
 allow.onclick = open;
 
-record.onclick = () => (take ? stop("") : start());
+/** Say and vibrate, for who looks at the person and not at the screen. @param {string} text @param {number} ms */
+function cue(text, ms) {
+  navigator.vibrate?.(ms);
+  if (!globalThis.SpeechSynthesisUtterance) return;
+  speechSynthesis.cancel();
+  speechSynthesis.speak(Object.assign(new SpeechSynthesisUtterance(text), { lang: language }));
+}
+
+let counting = 0;  // a timer: another tap, or a page that goes away, ends it
+
+/** Seconds until filming starts. @param {number} left */
+function count(left) {
+  page.dataset.filming = "soon";
+  record.textContent = t("cancel");
+  clock.textContent = String(left);
+  $(".said").textContent = t("soon", { n: left });
+  cue(String(left), 60);
+  counting = setTimeout(() => { if (left > 1) return count(left - 1); counting = 0; start(); }, 1000);
+}
+
+function uncount() {
+  clearTimeout(counting);
+  counting = 0;
+  page.dataset.filming = "no";
+  record.textContent = t("start");
+  clock.textContent = "";
+  say("ready");
+}
+record.onclick = () => (take ? stop("") : counting ? uncount() : count(COUNT_S));
 
 async function start() {
   const { quota = 1e12, usage = 0 } = await navigator.storage.estimate();
-  if (quota - usage < LEAST_ROOM) return say("full");
+  if (quota - usage < LEAST_ROOM) { uncount(); return say("full"); }
   navigator.storage.persist?.();
   /** @type {any} */ (navigator).wakeLock?.request("screen").catch(() => {});
   const name = `take-${Date.now()}-${Math.random().toString(36).slice(2, 8)}`;
@@ -74,6 +102,7 @@ async function start() {
   page.dataset.filming = "yes";
   record.textContent = t("stop");
   say("filming");
+  cue(t("say_start"), 200);
 }
 
 /** What is stated of the recording that is filmed now. */
@@ -98,7 +127,9 @@ async function phoneModel() {
 
 /** @param {string} reason a text, where it ended by itself */
 async function stop(reason) {
+  if (counting) uncount();
   if (!take || why) return;
+  cue(t("say_stop"), 400);
   const ending = take;
   why = reason || "stopped";
   await ending.stop();

@@ -165,8 +165,18 @@ function edit(form, look, times, frame) {
     if (at < line.scrollLeft + 30 || at > line.scrollLeft + line.clientWidth - 30) line.scrollLeft = at - line.clientWidth / 3;
   };
   look.addEventListener("frame", (e) => { frame = /** @type {CustomEvent<number>} */ (e).detail; follow(); });
-  form.closest("details")?.addEventListener("toggle", follow);
-  follow();
+  // On a narrow screen the curves come between the marks and their buttons while marks are corrected.
+  const opened = /** @type {HTMLDetailsElement} */ (form.closest("details")), narrow = matchMedia("(max-width: 900px)");
+  const curves = /** @type {HTMLElement} */ (look.querySelector(".curves")), seen = /** @type {HTMLElement} */ (look.querySelector(".seen"));
+  const arrange = () => {
+    (opened.open && narrow.matches ? line : seen).after(curves);
+    curves.tabIndex = opened.open ? 0 : -1;  // it scrolls then
+    if (opened.open) look.scrollIntoView();
+    follow();
+  };
+  opened.addEventListener("toggle", arrange);
+  narrow.addEventListener("change", arrange);
+  arrange();
   for (const button of form.querySelectorAll("button.add")) {
     const { side, event } = /** @type {HTMLElement} */ (button).dataset;
     button.addEventListener("click", () => {

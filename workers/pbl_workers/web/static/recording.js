@@ -83,16 +83,30 @@ class Clock {
   }
 }
 
-/** Charts of the joint angles; the returned function moves their cursors. @param {Movement} m @param {(at: number) => void} seek */
+/** Charts of the joint angles; the returned function moves their cursors. Each writes its values at the pointer, else at the shown frame.
+ * @param {Movement} m @param {(at: number) => void} seek */
 function charts(m, seek) {
   const into = $("curves"), names = JSON.parse(into.dataset.names), made = [];
   const named = (/** @type {string} */ text, /** @type {string} */ name) => text.replace("{name}", names[name] ?? name);
+  let shown = 0;
+  const write = (/** @type {number|null|undefined} */ pointed) => {
+    for (const { curve, now } of made) {
+      now.replaceChildren(...["left", "right"].flatMap((side) => {
+        const { value, half } = curve[side] ?? {}, i = pointed ?? shown;
+        if (value?.[i] == null) return [];
+        const said = document.createElement("span"), error = half[i] == null ? "" : ` \u00B1${Math.ceil(half[i])}`;
+        said.className = side;
+        said.textContent = `${into.dataset[side]} ${String(Math.round(value[i])).replace("-", "\u2212")}\u00B0${error}`;
+        return [said];
+      }));
+    }
+  };
   const build = () => {
     into.replaceChildren();
     made.length = 0;
     for (const curve of m.curves) {
-      const figure = document.createElement("figure"), title = document.createElement("figcaption");
-      title.textContent = named(into.dataset.angle, curve.name);
+      const figure = document.createElement("figure"), title = document.createElement("figcaption"), now = document.createElement("output");
+      title.append(`${named(into.dataset.angle, curve.name)} `, now);
       figure.append(title);
       into.append(figure);
       const data = [m.time], series = [{}], bands = [];
@@ -102,16 +116,18 @@ function charts(m, seek) {
         const edge = (sign) => value.map((v, i) => (v === null || half[i] === null ? null : v + sign * half[i]));
         bands.push({ series: [series.length, series.length + 1], fill: ink + "30" });
         for (const sign of [1, -1]) { series.push({ stroke: "transparent", width: 0, points: { show: false } }); data.push(edge(sign)); }
-        series.push({ stroke: ink, width: 2, points: { show: false } });
+        const dash = side === "left" ? [7, 3] : [];  // as in the charts of a visit; less certain is faint there as well
+        series.push({ stroke: ink, width: 2, dash, points: { show: false } });
         data.push(value.map((v, i) => (unsure[i] ? null : v)));
-        series.push({ stroke: ink, width: 1.5, dash: [5, 3], points: { show: false } });
+        series.push({ stroke: `${ink}66`, width: 2, dash, points: { show: false } });
         data.push(value.map((v, i) => (unsure[i] || unsure[i - 1] || unsure[i + 1] ? v : null)));
       }
       const axis = { stroke: colour("soft"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
       const chart = new uPlot({
         width: Math.max(200, into.clientWidth), height: 130, legend: { show: false }, series, bands,
-        scales: { x: { time: false } }, cursor: { drag: { x: false, y: false }, points: { show: false } },
-        axes: [{ ...axis, size: 26 }, { ...axis, size: 38 }],
+        scales: { x: { time: false } }, cursor: { drag: { x: false, y: false }, points: { show: false }, sync: { key: "curves" } },
+        axes: [{ ...axis, size: 26, values: (_, ticks) => ticks.map((t) => `${t} s`) }, { ...axis, size: 38 }],
+        hooks: { setCursor: [(u) => write(u.cursor.idx)] },
       }, data, figure);
       chart.root.setAttribute("role", "img");
       chart.root.setAttribute("aria-label", named(into.dataset.chart, curve.name));
@@ -119,23 +135,23 @@ function charts(m, seek) {
       line.className = "now-line";
       chart.over.append(line);
       chart.over.addEventListener("click", (e) => seek(chart.posToVal(e.offsetX, "x")));
-      made.push({ chart, line });
+      made.push({ chart, line, curve, now });
     }
   };
   build();
-  let at = 0;
-  const move = (/** @type {number} */ time) => {
-    at = time;
-    for (const { chart, line } of made) line.style.transform = `translateX(${chart.valToPos(time, "x")}px)`;
+  const move = (/** @type {number} */ frame) => {
+    shown = frame;
+    for (const { chart, line } of made) line.style.transform = `translateX(${chart.valToPos(m.time[frame], "x")}px)`;
+    write(made[0]?.chart.cursor.idx);
   };
   let width = into.clientWidth;
   new ResizeObserver(() => {
     if (into.clientWidth === width) return;
     width = into.clientWidth;
     for (const { chart } of made) chart.setSize({ width: Math.max(200, width), height: 130 });
-    move(at);
+    move(shown);
   }).observe(into);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); move(at); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); move(shown); });
   return move;
 }
 
@@ -168,10 +184,13 @@ async function start() {
   if (m.body.camera) {
     canvas.width = Math.min(width, 1280); canvas.height = Math.round(canvas.width * height / width);
     stage.style.aspectRatio = `${width} / ${height}`;
-    stage.style.width = `min(100%, calc(70vh * ${width / height}))`;
-  } else stage.hidden = true;  // markers of a laboratory: they have no picture
+    stage.style.setProperty("--wide", String(width / height));
+  } else {  // markers of a laboratory have no picture: the 3D view is in its place
+    stage.hidden = true;
+    stage.after(/** @type {HTMLElement} */ (look.querySelector(".space")));
+  }
   const controls = /** @type {HTMLElement} */ (look.querySelector(".controls"));
-  controls.hidden = false;
+  controls.hidden = /** @type {HTMLElement} */ (look.querySelector(".about")).hidden = false;
   const position = $("position"), now = $("now"), play = $("play");
   position.max = m.time.length - 1;
   const seek = (/** @type {number} */ at) => clock.go(frameAt(m.time, at));
@@ -182,7 +201,7 @@ async function start() {
     canvas.dataset.frame = String(frame);
     position.value = frame;
     now.textContent = `${seconds(m.time[frame])} s, ${now.dataset.text.replace("{n}", frame + 1).replace("{total}", m.time.length)}`;
-    cursor(m.time[frame]);
+    cursor(frame);
     for (const seen of watching) seen(frame);
     look.dispatchEvent(new CustomEvent("frame", { detail: frame }));
   };
