@@ -396,7 +396,7 @@ def _failed(column: str = "") -> str:
 
 _STATES = {
     "waiting": _waiting,
-    "failed": _failed_visits,
+    "failed": _failed,
     "empty": _empty,
     "unusable": _unusable,
     "unrecorded": _unrecorded,
