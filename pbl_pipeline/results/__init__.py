@@ -1,4 +1,4 @@
-"""What a computation returns: frozen records, each with the columns of its row."""
+"""Results of computations: frozen records, each with the columns of its row."""
 
 from .cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
 from .events import EVENTS, FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
