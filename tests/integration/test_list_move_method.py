@@ -11,7 +11,7 @@ import pytest
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import METHODS
-from pbl_schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, video
+from pbl_schemas import fit, gait, gdi, intake, keypoints, kinetics, lab, session, study, video
 from pbl_schemas.decisions import review_decisions
 from pbl_schemas.intake import Methods, SeveralCameras, VisitRecord, ingest
 from pbl_schemas.intake.move import carry_out, plan_move
@@ -234,3 +234,5 @@ def test_all_lists_and_filters_take_every_kind_of_row(tables: None, tmp_path: Pa
         for state in ("", *visit_list.STATES):
             for quality in ("", *visit_list.OUTCOMES):
                 visit_list.visit_page(visit_list.Filter("P0", "", role, quality, state))
+    (study.ClinicalScore & {"instrument": "FAC"}).delete(prompt=False)
+    (study.ClinicalInstrument & {"instrument": "FAC"}).delete(prompt=False)  # methods and instruments stay otherwise

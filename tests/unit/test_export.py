@@ -971,7 +971,7 @@ def test_no_table_is_written_past_it():
     root = Path(__file__).parents[2]
     allowed = {
         "pbl_pipeline/csv_cells.py",
-        "pbl_pipeline/gait/events/types.py",
+        "pbl_pipeline/results/events.py",
         "pbl_pipeline/export/keypoints_csv.py",
     }
     found = {
