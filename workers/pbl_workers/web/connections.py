@@ -72,6 +72,7 @@ class Connection(H11Protocol):
                 return
             if self.limit_concurrency is not None and len(others) >= self.limit_concurrency - 1:
                 self._make_room(others)
+                self.limit_concurrency += 1  # the request of the one that was closed may not have ended yet
         self._abort_after("request", REQUEST_S)
         if self.tls is not None:
             self._shakes_hands = self.loop.create_task(self._shake_hands(transport, self.tls))
