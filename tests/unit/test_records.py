@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -51,9 +51,8 @@ def test_a_definition_has_the_columns_in_their_order():
 
 
 def test_a_record_is_read_as_it_was_written():
-    whole = Whole(
-        np.int64(3), np.float32(0.5), ((1.0, 2.0), (np.float64(3.0), 4.0)), np.ones(2), Part(1.5, "short"), "left"
-    )
+    numbers: tuple[Any, Any] = np.int64(3), np.float32(0.5)
+    whole = Whole(*numbers, ((1.0, 2.0), (np.float64(3.0), 4.0)), np.ones(2), Part(1.5, "short"), "left")
     row = to_row(whole, "x")
     assert row == {
         "x_no": 3, "x_mean": 0.5, "x_side": "left", "x_pairs": [[1.0, 2.0], [3.0, 4.0]], "x_long": True, "x_size": 1.5,
