@@ -284,7 +284,7 @@ def score_gdi(
         cycles=scored,
         qc=(
             *_checks(scored, {c.angle_model for c in usable}, basis, reason, params),
-            *(_agreement(passes, basis) if error_model else _trials_agree(usable, basis)),
+            *(_agreement(passes, basis) if error_model else _trials_agree(usable, vectors, basis)),
         ),
         profile=profile,
         sd=sd,
@@ -401,14 +401,17 @@ def _agreement(passes: Sequence[Pass], norm: NormativeSet) -> tuple[Check, ...]:
     return (warn_if(advice, "passes_agree", float(len(doubted)), 0.0, advice),)
 
 
-def _trials_agree(cycles: Sequence[GaitCycle], norm: NormativeSet) -> tuple[Check, ...]:
+def _trials_agree(cycles: Sequence[GaitCycle], vectors: Sequence[np.ndarray], norm: NormativeSet) -> tuple[Check, ...]:
     """Check `passes_agree` where no model of the error is known: the mean curves of each trial against those of all, of
     two trials against each other (`APART_DEG`)."""
     names = list(dict.fromkeys(c.trial for c in cycles))
     if len(names) < 2:
         return ()
     curves = [
-        [[gdi_vector(c, norm) for c in cycles if (c.trial, c.side) == (trial, side)] for side in (LEFT, RIGHT)]
+        [
+            [v for c, v in zip(cycles, vectors, strict=True) if (c.trial, c.side) == (trial, side)]
+            for side in (LEFT, RIGHT)
+        ]
         for trial in names
     ]
     unseen = np.full(norm.components.shape[1], np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -356,13 +357,9 @@ def measure_rows(
     without: Collection[str] = OF_VISIT,
 ) -> list[dict]:
     """Rows of a part table with `measure_columns(prefix)`; `without`: fields of `Measure` that it does not have."""
-    unknown = dict.fromkeys(to_row(Measure(None, None, 0.0, None, 0), prefix, without)) | {f"{prefix}_n": 0}
+    unknown = Measure(None, None, math.nan, None, 0)
     return [
-        {
-            prefix: name,
-            f"{prefix}_missing": reasons.get(name, "")[:255],
-            **(unknown if m is None else to_row(m, prefix, without)),
-        }
+        {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255], **to_row(m or unknown, prefix, without)}
         for name, m in measures.items()
     ]
 
