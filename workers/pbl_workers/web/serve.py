@@ -22,9 +22,10 @@ from pbl_pipeline.names import check_label
 
 from .access import Sessions, host_name
 from .accounts import Accounts
-from .app import Options, create_app
+from .app import create_app
 from .connections import Connection
 from .folder import ResultsFolder
+from .site import Options
 
 #: Addresses of this machine alone, and those that mean all of its addresses.
 LOOPBACK, EVERYWHERE = ("127.0.0.1", "::1", "localhost"), ("0.0.0.0", "::", "")  # noqa: S104
