@@ -68,21 +68,10 @@ def create_app(options: Options, sessions: Sessions | None = None) -> Starlette:
     else:
         asks, source = Tables(), TablesSource()
         looks = audit.Looks(asks) if settings.audit_looks() else None
-        parts = [
-            *visits.LIST_ROUTES,
-            *decide.ROUTES,
-            *corrections.ROUTES,
-            *reports.ROUTES,
-            *computing.ROUTES,
-            *compare.ROUTES,
-            *entry.ROUTES,
-            *registration.ROUTES,
-            *operate.ROUTES,
-            *trend.ROUTES,
-            *phone.routes(),
-        ]
-    made = site.Site(options, sessions, asks, source, looks)
-    routes: list[Address] = [
+        of_tables = (decide, corrections, reports, computing, compare, entry, registration, operate, trend)
+        parts = [*visits.LIST_ROUTES, *(one for part in of_tables for one in part.ROUTES), *phone.routes()]
+    cookie, phone_cookie = access.Cookie(options.secure), access.Cookie(options.secure, "pbl_phone")
+    routes = [
         Address("/", home, OPEN),
         *(sign_in.BY_LINK if options.accounts is None else sign_in.BY_PASSWORD),
         *sign_in.ROUTES,
@@ -100,21 +89,15 @@ def create_app(options: Options, sessions: Sessions | None = None) -> Starlette:
             access.Refused: refused,
             PblError: coded,
             HTTPException: missing,
-            Exception: unforeseen,
+            Exception: pages.unforeseen,
         },
         middleware=[
-            Middleware(
-                access.Gate,
-                sessions=sessions,
-                hosts=options.hosts,
-                refuse=pages.refused,
-                cookie=made.cookie,
-            ),
+            Middleware(access.Gate, sessions=sessions, hosts=options.hosts, refuse=pages.refused, cookie=cookie),
             Middleware(GZipMiddleware, minimum_size=1000),
         ],
         lifespan=_life,
     )
-    app.state.site = made
+    app.state.site = site.Site(options, sessions, cookie, phone_cookie, asks, source, looks)
     app.router.default, app.router.redirect_slashes = unknown, False
     return app
 
@@ -154,10 +137,6 @@ async def coded(request: Request, error: Exception) -> Response:
 async def missing(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     return pages.missing(request, error.status_code, error.headers)
-
-
-async def unforeseen(request: Request, error: Exception) -> Response:
-    return pages.unforeseen(request)
 
 
 class _Files(StaticFiles):

@@ -26,16 +26,9 @@ async def form(
     entry, language = await site.ask(request, visit_forms.scores_form, number_of(request)), reader_language(request)
     scores = {name: in_field(language, entry.values[name]) for name in entry.instruments}
     role = {visit_forms.ROLE: texts.coded(language, visit_forms.ROLE, entry.values[visit_forms.ROLE])}
-    return pages.show(
-        request,
-        "scores.html",
-        entry=entry,
-        values={**entry.values, **scores, **role, **values},
-        errors=errors,
-        field=_FIELD,
-        role=visit_forms.ROLE,
-        usual_roles=visit_forms.USUAL_ROLES,
-    )
+    values = {**entry.values, **scores, **role, **values}
+    more = {"field": _FIELD, "role": visit_forms.ROLE, "usual_roles": visit_forms.USUAL_ROLES}
+    return pages.show(request, "scores.html", entry=entry, values=values, errors=errors, **more)
 
 
 async def send(request: Request) -> Response:
@@ -63,18 +56,9 @@ async def instruments(
     request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
 ) -> Response:
     rows = await site.ask(request, visit_forms.instruments)
-    fields = (*study_sheets.TEXTS, *study_sheets.NUMBERS, *study_sheets.FLAGS)
-    known = {name: values.get(name, "") for name in fields}
-    return pages.show(
-        request,
-        "instruments.html",
-        instruments=rows,
-        values=known,
-        errors=errors,
-        texts=study_sheets.TEXTS,
-        numbers=study_sheets.NUMBERS,
-        flags=study_sheets.FLAGS,
-    )
+    fields = {"texts": study_sheets.TEXTS, "numbers": study_sheets.NUMBERS, "flags": study_sheets.FLAGS}
+    known = {name: values.get(name, "") for names in fields.values() for name in names}
+    return pages.show(request, "instruments.html", instruments=rows, values=known, errors=errors, **fields)
 
 
 ROUTES = [

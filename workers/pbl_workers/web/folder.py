@@ -215,24 +215,13 @@ def _folder(request: Request) -> ResultsFolder:
 
 async def visits(request: Request) -> Response:
     listed = await site.ask(request, _folder(request).listed)
-    return pages.show(
-        request,
-        "visits.html",
-        page=listed,
-        choices={},
-        bad=False,
-        older="",
-        newest="",
-        is_first=True,
-        interval=interval,
-    )
+    more = {"bad": False, "older": "", "newest": "", "is_first": True, "interval": interval}
+    return pages.show(request, "visits.html", page=listed, choices={}, **more)
 
 
 async def report(request: Request) -> Response:
-    headers = {"content-security-policy": REPORT_POLICY}
-    return FileResponse(
-        _folder(request).report(number_of(request)), media_type="text/html; charset=utf-8", headers=headers
-    )
+    path, headers = _folder(request).report(number_of(request)), {"content-security-policy": REPORT_POLICY}
+    return FileResponse(path, media_type="text/html; charset=utf-8", headers=headers)
 
 
 async def overlay(request: Request) -> Response:

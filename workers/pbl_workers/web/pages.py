@@ -132,11 +132,7 @@ def _environment() -> jinja2.Environment:
 
 
 def show(
-    request: Request,
-    template: str,
-    status: int = 200,
-    headers: Mapping[str, str] | None = None,
-    **values: Any,
+    request: Request, template: str, status: int = 200, headers: Mapping[str, str] | None = None, **values: Any
 ) -> Response:
     """Return a page, or its values as JSON if the address ends so. `values`: variables of its template."""
     if as_json(request):
@@ -168,8 +164,8 @@ def refused(request: Request, reason: str) -> Response:
     name = "enter.title" if reason == "session" else f"enter.{reason}_title"
     text = "enter.text" if reason == "session" else f"enter.{reason}"
     if as_json(request):
-        error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
-        return error(request, error, _REFUSED[reason])
+        coded = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
+        return error(request, coded, _REFUSED[reason])
     if reason == "session" and site.of(request).options.accounts is not None:
         return show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0, name="")
     return show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
@@ -186,7 +182,7 @@ def missing(request: Request, status: int, headers: Mapping[str, str] | None = N
     return show(request, "missing.html", status, headers)
 
 
-def unforeseen(request: Request) -> Response:
+async def unforeseen(request: Request, error: Exception) -> Response:
     """Return the answer to a failure of the program; the traceback is in the terminal."""
     if as_json(request):
         return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)

@@ -45,29 +45,21 @@ _no_file = functools.partial(
 )
 
 
-async def new(request: Request) -> Response:
-    today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
-    return await new_page(request, {"visit": today})
-
-
-async def new_page(request: Request, values: Mapping[str, str], errors: Mapping[str, PblError] = NOTHING) -> Response:
+async def new(
+    request: Request, values: Mapping[str, str] | None = None, errors: Mapping[str, PblError] = NOTHING
+) -> Response:
+    values = {"visit": f"{datetime.datetime.now():%Y-%m-%d}"} if values is None else values  # today where the clinic is
     known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
-    return pages.show(
-        request,
-        "new_visit.html",
-        values=known,
-        errors=errors,
-        longest={**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]},
-        usual_roles=visit_forms.USUAL_ROLES,
-        populations=await site.ask(request, _populations),
-    )
+    longest = {**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]}
+    more = {"usual_roles": visit_forms.USUAL_ROLES, "populations": await site.ask(request, _populations)}
+    return pages.show(request, "new_visit.html", values=known, errors=errors, longest=longest, **more)
 
 
 async def register(request: Request) -> Response:
     fields = await form_of(request)
     number, errors = await site.ask(request, visit_forms.register_visit, fields, sender(request))
     if errors:
-        return await new_page(request, fields, errors)
+        return await new(request, fields, errors)
     if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
         await site.ask(request, _queue_visits_of_person, number)
     return RedirectResponse(f"/visits/{number}", 303)
@@ -81,16 +73,10 @@ async def facts(
     stored, language = await site.ask(request, visit_forms.facts_form, number_of(request)), reader_language(request)
     numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
     words = {n: texts.coded(language, n, stored.values[n]) for n in ("population", "orthosis")}
-    return pages.show(
-        request,
-        "facts.html",
-        facts=stored,
-        values={**stored.values, **numbers, **words, **values},
-        errors=errors,
-        longest=visit_forms.FACTS,
-        choices={"activity": ACTIVITIES, "pace": PACES},
-        populations=await site.ask(request, _populations),
-    )
+    values = {**stored.values, **numbers, **words, **values}
+    more = {"longest": visit_forms.FACTS, "choices": {"activity": ACTIVITIES, "pace": PACES}}
+    more["populations"] = await site.ask(request, _populations)
+    return pages.show(request, "facts.html", facts=stored, values=values, errors=errors, **more)
 
 
 async def correct(request: Request) -> Response:
@@ -111,15 +97,9 @@ async def upload(request: Request) -> Response:
 def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
     from pbl_pipeline.gait import ACTIVITIES, PACES
 
-    return pages.show(
-        request,
-        "upload.html",
-        to=to,
-        values={"activity": "walking", "pace": "", **values},
-        outcomes=outcomes,
-        choices={"activity": ACTIVITIES, "pace": PACES},
-        accepted=", ".join(VIDEO_ENDINGS),
-    )
+    values = {"activity": "walking", "pace": "", **values}
+    more = {"choices": {"activity": ACTIVITIES, "pace": PACES}, "accepted": ", ".join(VIDEO_ENDINGS)}
+    return pages.show(request, "upload.html", to=to, values=values, outcomes=outcomes, **more)
 
 
 async def send(request: Request) -> Response:

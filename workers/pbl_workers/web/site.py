@@ -46,6 +46,8 @@ class Site:
 
     options: Options
     sessions: Sessions
+    cookie: Cookie
+    phone_cookie: Cookie
     asks: Asks
     source: Source
     looks: Looks | None
@@ -53,14 +55,6 @@ class Site:
     comparing: asyncio.Semaphore = dataclasses.field(default_factory=lambda: asyncio.Semaphore(AT_ONCE))
     making: ProcessQueue = dataclasses.field(default_factory=lambda: ProcessQueue(most=20, kept=8))
     computing: ProcessQueue = dataclasses.field(default_factory=lambda: ProcessQueue(most=50, kept=50))
-
-    @property
-    def cookie(self) -> Cookie:
-        return Cookie(self.options.secure)
-
-    @property
-    def phone_cookie(self) -> Cookie:
-        return Cookie(self.options.secure, "pbl_phone")
 
     def close(self) -> None:
         for one in (self.making, self.computing, self.source, self.asks):

@@ -166,18 +166,9 @@ async def visits(request: Request) -> Response:
     listed = await site.ask(request, visit_list.visit_page, wanted, after)
     kept = {k: asked[k] for k in ("q", *_FIELDS) if asked.get(k)}
     older = urlencode({**kept, "after": f"{listed.after[0]}~{listed.after[1]}"}) if listed.after else ""
-    return pages.show(
-        request,
-        "visits.html",
-        page=listed,
-        wanted=wanted,
-        choices={**choices, "quality": visit_list.OUTCOMES, "state": visit_list.STATES},
-        bad=bad,
-        older=older,
-        newest=urlencode(kept),
-        is_first=after is None,
-        interval=interval,
-    )
+    choices |= {"quality": visit_list.OUTCOMES, "state": visit_list.STATES}
+    more = {"older": older, "newest": urlencode(kept), "is_first": after is None, "interval": interval}
+    return pages.show(request, "visits.html", page=listed, wanted=wanted, choices=choices, bad=bad, **more)
 
 
 async def search(request: Request) -> Response:
