@@ -39,13 +39,11 @@ async def show(request: Request) -> Response:
     state, jobs, server = await site.ask(
         request, lambda: (pipeline_status(most=MOST), running(MOST), database_status())
     )
+    shown = {"state": state, "jobs": jobs, "server": server, "groups": groups_of(state.errors)}
     return pages.show(
         request,
         "operate.html",
-        state=state,
-        jobs=jobs,
-        server=server,
-        groups=groups_of(state.errors),
+        **shown,
         n_errors=sum(t.error for t in state.tables),
         retried=whole_number(request.query_params.get("retried", "")),
         now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",

@@ -72,15 +72,9 @@ async def make(request: Request) -> Response:
     make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
     link, key = await site.ask(request, make_link, number, sender(request), float(hours))
     page = f"{request.url.scheme}://{request.headers['host']}/phone"
-    address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
-    shown = {
-        "number": number,
-        "link": link,
-        "address": address,
-        "hours": hours,
-        "secure": request.url.scheme == "https",
-        "trust": qr_code(trust) if certificates.authority().is_file() else "",
-    }
+    address, secure = f"{page}/open?key={key}", request.url.scheme == "https"
+    trust = qr_code(f"{page}/authority.crt") if certificates.authority().is_file() else ""
+    shown = {"number": number, "link": link, "address": address, "hours": hours, "secure": secure, "trust": trust}
     return pages.show(request, "film.html", code=qr_code(address), **shown)
 
 

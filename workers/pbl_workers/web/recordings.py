@@ -10,7 +10,6 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.visit import Recording
 
 from . import pages, site
 from .address import Address, number_of, page
@@ -75,12 +74,10 @@ class Movements:
 
 
 async def _prepare(request: Request) -> Movement:
-    return await asyncio.to_thread(Movement.of, await site.ask(request, _loaded, request))
-
-
-def _loaded(request: Request) -> Recording:
-    """Load the arrays in the thread that may."""
-    return site.of(request).source.recording(number_of(request)).fitted().loaded()
+    source, number = site.of(request).source, number_of(request)
+    # Arrays are loaded in the thread that may.
+    found = await site.ask(request, lambda: source.recording(number).fitted().loaded())
+    return await asyncio.to_thread(Movement.of, found)
 
 
 def routes() -> list[Address]:
