@@ -228,7 +228,7 @@ async def overlay(request: Request) -> Response:
     return FileResponse(await site.ask(request, _folder(request).overlay, number_of(request)), media_type="video/mp4")
 
 
-#: What a folder answers in its own way: the list, and files that are there already.
+#: Addresses that a folder answers in its own way: the list, and files that are there already.
 ROUTES = [
     *page("/visits", visits, "look"),
     Address("/visits/{session_id:int}/report", report, "look", look="report"),

@@ -187,7 +187,7 @@ class Phones:
     """Views that remember: what was said of the last visits, and which recordings are being finished."""
 
     def __init__(self) -> None:
-        #: By visit and language, and the gain of one more pass, with the rows that they are of.
+        #: Answers by visit and language, and the gain of one more pass by visit, with the rows that they are of.
         self._said: dict[tuple[int, str], tuple[dict[str, str], tuple[bytes, str]]] = {}
         self._worth: dict[int, tuple[list[str | None], Next | None]] = {}
         #: Of each visit one recording at a time is finished; of all, as many are opened at once.

@@ -20,22 +20,22 @@ log = logging.getLogger(__name__)
 
 def opened(request: Request, value: str, to: str) -> Response:
     # The browser never chooses its session, and the one that it had ends.
-    way = site.of(request)
-    way.sessions.leave(way.cookie.of(request))
+    here = site.of(request)
+    here.sessions.leave(here.cookie.of(request))
     response = RedirectResponse(to, 303)
-    way.cookie.set(response, value, int(3600 * HOURS))
+    here.cookie.set(response, value, int(3600 * HOURS))
     return response
 
 
 async def by_link(request: Request) -> Response:
-    way = site.of(request)
-    value = way.sessions.enter(request.query_params.get("key", ""))
+    here = site.of(request)
+    value = here.sessions.enter(request.query_params.get("key", ""))
     if value is None:
         return pages.refused(request, "session")
     to = request.query_params.get("to", "")
     response = opened(request, value, to if to.startswith("/visits/") and whole_number(to[8:]) else "/")
-    if way.options.on_entry is not None:
-        way.options.on_entry(way.sessions.new_link(way.options.name, *way.options.roles))
+    if here.options.on_entry is not None:
+        here.options.on_entry(here.sessions.new_link(here.options.name, *here.options.roles))
     return response
 
 
@@ -44,33 +44,33 @@ async def ask(request: Request) -> Response:
 
 
 async def sign_in(request: Request) -> Response:
-    way, accounts = site.of(request), site.of(request).options.accounts
+    here, accounts = site.of(request), site.of(request).options.accounts
     assert accounts is not None
     fields = await read_form(request)
     name, password = fields.get("name", "").strip(), fields.get("password", "")
     address = request.client.host if request.client else ""
-    wait = way.attempts.wait_s(name, address)
+    wait = here.attempts.wait_s(name, address)
     if wait > 0:
         seconds = math.ceil(wait)
         headers = {"retry-after": str(seconds)}
         return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds, name=name)
-    way.attempts.failed(name, address)
-    async with way.comparing:
+    here.attempts.failed(name, address)
+    async with here.comparing:
         account = await asyncio.to_thread(accounts.check, name, password)
     if account is None:
         # No name: people write their password into the wrong field.
         log.warning("a failed sign-in from %s", address)
         return pages.show(request, "sign_in.html", 401, problem="sign_in.wrong", wait=0, name=name)
-    way.attempts.succeeded(name, address)
-    return opened(request, way.sessions.open(account.name, account.roles, account.changed), "/")
+    here.attempts.succeeded(name, address)
+    return opened(request, here.sessions.open(account.name, account.roles, account.changed), "/")
 
 
 async def leave(request: Request) -> Response:
     await form_of(request)
-    way = site.of(request)
-    way.sessions.leave(way.cookie.of(request))
+    here = site.of(request)
+    here.sessions.leave(here.cookie.of(request))
     response = RedirectResponse("/", 303)
-    way.cookie.forget(response)
+    here.cookie.forget(response)
     return response
 
 

@@ -1,4 +1,4 @@
-"""Options of the page, and what its views share: a view reads it from its request (`of`)."""
+"""Options of the page, and the parts that its views share, which a view takes from its request (`of`)."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Options:
 
 @dataclasses.dataclass(frozen=True)
 class Site:
-    """What the views of an application share: `app.state.site`. looks: None if they are not recorded; comparing: turn
-    of those whose password is compared; making: overlays and reports; computing: visits."""
+    """Parts that the views of an application share: `app.state.site`. looks: None if they are not recorded; comparing:
+    turn of those whose password is compared; making: overlays and reports; computing: visits."""
 
     options: Options
     sessions: Sessions
@@ -62,7 +62,7 @@ class Site:
 
 
 def of(request: Request) -> Site:
-    """Return what the views of the application share that answers a request."""
+    """Return the parts that the views of an application share, from one of its requests."""
     return request.app.state.site
 
 
