@@ -84,6 +84,8 @@ def test_a_server_knows_how_many_rows_came_at_once(tables: None):
 
 
 SLOW = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs the tests in the background
 import pbl_schemas
 from pbl_pipeline.cli import main
 from pbl_schemas import connection
