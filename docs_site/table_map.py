@@ -13,9 +13,9 @@ from pbl_schemas.datajoint_setup import dj
 from pbl_schemas.stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
-#: What `columns` returns of each.
+#: A column as `columns` returns it: name, type, comment, in the key.
 _Column = tuple[str, str, str, bool]
-#: What the names of a visit's columns begin with, where those of a trial are the same.
+#: Prefix of a visit's columns, where a trial has the same ones without it.
 _VISIT = "session_"
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
 #: Columns of a method and of a check after their prefix: they stand at the top of the page, each table has the word.
