@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import sys
 import textwrap
@@ -12,8 +13,17 @@ from pbl_schemas.datajoint_setup import dj
 from pbl_schemas.stages import STAGES, modules
 
 _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "computed")
+#: A column as `columns` returns it: name, type, comment, in the key.
+_Column = tuple[str, str, str, bool]
+#: Prefix of a visit's columns, where a trial has the same ones without it.
+_VISIT = "session_"
 _KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
-#: So many leading columns have to be alike for a table to be described by another one.
+#: Columns of a method and of a check after their prefix: they stand at the top of the page, each table has the word.
+_GROUPS = {
+    "method": ("_method", "_method_name", "_method_version", "_params", "_method_sha"),
+    "check": ("_check", "_check_outcome", "_check_value", "_check_threshold", "_check_advice"),
+}
+#: So many consecutive columns have to be alike to be described by those of another table.
 _LEAST_ALIKE = 4
 #: Longer names of columns do not widen the others'.
 _WIDEST = 40
@@ -21,10 +31,18 @@ _WIDEST = 40
 _START = """\
 # Tables
 
-Each section is a schema of the server, `pbl_<section>`, in the order of computing. *Manual* tables are filled by people and
-`pbl ingest`, *lookup* tables hold methods and terms, `pbl populate` fills *computed* ones. The primary key stands above `---`; `->` is a
-foreign key, whose columns the table also has; a part has the key of its table. *origin* stands for the columns that state where a computed
-row comes from: `<prefix>_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed` (UTC).
+Each section is a schema of the server, `pbl_<section>`, in the order of computing. People and `pbl ingest` fill *manual* tables, `pbl populate`
+*computed* ones; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
+has the key of its table.
+
+A column without a type is float64. `datetime` is in UTC; `_created`: when the row was made. *its unit*: the unit in the name of the row. *as in*
+a table: the same columns without `session_`. Words that stand for columns with a prefix:
+
+- *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
+- *method*: `_method` varchar(48), the key: name and version, such as demo-v1; `_method_name` varchar(40); `_method_version` int16 counts up when
+  parameters change; `_params` json; `_method_sha` char(16), hash of all these
+- *check*: `_check` varchar(64), the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
+  `_check_threshold` (its unit); `_check_advice` varchar(1000), what to do about it
 
 Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
 """  # noqa: E501
@@ -65,7 +83,7 @@ def kind(cls: Any) -> str:
     return next(word for base, word in _KINDS.items() if issubclass(cls, base))
 
 
-def columns(cls: Any) -> list[tuple[str, str, str, bool]]:
+def columns(cls: Any) -> list[_Column]:
     """(name, type, comment, in the key) of each column a definition states itself."""
     out, in_key = [], True
     for line in cls.definition.splitlines():
@@ -95,30 +113,52 @@ def table_map() -> str:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
         lines += ["", f"### {name} ({kind(cls)})", "", *([comment(cls), ""] if comment(cls) else [])]
-        lines += ["```text", *_listed(name, cls, written), "```"]
+        lines += [f"    {line}" for line in _listed(name, cls, written)]
     return "\n".join(lines) + "\n"
 
 
-def _listed(name: str, cls: Any, written: dict[str, list[tuple[str, str]]]) -> list[str]:
-    """The lines of a definition: alike columns in one, those that a table before has as well by their names only."""
+def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]:
+    """The lines of a definition: groups by their word, those that a table before has as well by their names only."""
     own = [c for c in columns(cls) if not _is_origin(c[0], cls)]
-    alike, n = _alike(own, written)
-    written[name] = _without_key(own)
-    rows = [(", ".join(c[0] for c in own[:n]), f"as in {alike}, in this order", "", True)] if n else []
-    for column, type_, text, in_key in own[n:]:
-        said = (type_.replace("', '", "','"), text, in_key)
-        if rows and rows[-1][1:] == said:
-            rows[-1] = (f"{rows[-1][0]}, {column}", *said)
+    rows: list[_Column] = []
+    bare, i = _bare(own), 0
+    while i < len(own):
+        column, type_, text, in_key = own[i]
+        group = _group([c[0] for c in own], i)
+        alike, n = _alike(bare[i:], written)
+        if group:
+            rows.append((f"{column.removesuffix(_GROUPS[group][0])}_*", group, "", in_key))
+        elif n:
+            rows.append((", ".join(c[0] for c in own[i : i + n]), f"as in {alike}", "", in_key))
         else:
-            rows.append((column, *said))
-    if origin_prefix(cls):
-        rows.append(("origin", "", "", False))
+            said = (_type(type_), _meaning(column, type_, text, own[0][0]), in_key)
+            if rows and rows[-1][1:] == said:
+                rows[-1] = (f"{rows[-1][0]}, {column}", *said)
+            else:
+                rows.append((column, *said))
+        i += len(_GROUPS[group]) if group else max(n, 1)
+    written[name] = bare
+    prefix = origin_prefix(cls)
+    if prefix is not None:
+        rows.append((f"{prefix}*", "origin", "", False))
     keys, others = ([row[:3] for row in rows if row[3] is key] for key in (True, False))
     of_key, of_row = _refers_to(name, cls)
     wide = max([len(row[0]) for row in rows if len(row[0]) <= _WIDEST] or [0])
     lines = [*of_key, *(line for row in keys for line in _line(row, wide))]
     below = [*of_row, *(line for row in others for line in _line(row, wide))]
     return [*lines, "---", *below] if lines and below else lines + below
+
+
+def _type(text: str) -> str:
+    return "" if text == "float64" else text.replace("', '", "','")
+
+
+def _meaning(column: str, type_: str, text: str, key: str) -> str:
+    """The comment of a column, less what the top of the page states for all."""
+    if type_ == "datetime":
+        text = re.sub(r",? UTC$", "", text)
+        text = "" if column.endswith("_created") and text == "when registered" else text
+    return text.replace(f"in the unit (see {key})", "(its unit)")
 
 
 def _line(row: tuple[str, str, str], wide: int) -> list[str]:
@@ -128,20 +168,31 @@ def _line(row: tuple[str, str, str], wide: int) -> list[str]:
     return textwrap.wrap(text, 130, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
 
-def _alike(own: list[tuple[str, str, str, bool]], written: dict[str, list[tuple[str, str]]]) -> tuple[str, int]:
-    """The first table with the most leading columns of the same types and meanings, and their number."""
+def _group(names: list[str], i: int) -> str:
+    """Word for the columns from the i-th on, where they are those of a method or a check."""
+    for word, endings in _GROUPS.items():
+        if names[i].endswith(endings[0]):
+            prefix = names[i].removesuffix(endings[0])
+            if tuple(names[i : i + len(endings)]) == tuple(prefix + e for e in endings):
+                return word
+    return ""
+
+
+def _alike(own: list[_Column], written: dict[str, list[_Column]]) -> tuple[str, int]:
+    """The table that has most of these columns, from the first on, next to each other; and their number."""
     best, most = "", 0
     for name, theirs in written.items():
-        n = next((i for i, (a, b) in enumerate(zip(_without_key(own), theirs, strict=False)) if a != b), None)
-        n = min(len(own), len(theirs)) if n is None else n
-        if n > most and n == len(theirs):
-            best, most = name, n
+        for start in range(len(theirs)):
+            pairs = zip(own, theirs[start:], strict=False)
+            n = sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1] and pair[0][3] == own[0][3], pairs))
+            if n > most:
+                best, most = name, n
     return (best, most) if most >= _LEAST_ALIKE else ("", 0)
 
 
-def _without_key(own: list[tuple[str, str, str, bool]]) -> list[tuple[str, str]]:
-    """Types and meanings, without the name of the first column in them."""
-    return [(type_, text.replace(f"(see {own[0][0]})", "(see the name)")) for _, type_, text, _ in own]
+def _bare(own: list[_Column]) -> list[_Column]:
+    """The columns as those of a trial, which a table of visits repeats after `session_`."""
+    return [(name.removeprefix(_VISIT), kind, text.replace(_VISIT, ""), in_key) for name, kind, text, in_key in own]
 
 
 def joins() -> list[str]:
@@ -166,8 +217,9 @@ def _refers_to(name: str, cls: Any) -> tuple[list[str], list[str]]:
         if line.startswith("->"):
             table, new = next(names)
             if table != master:
-                found[not in_key].append(f"-> {table} as {new}" if new else f"-> {table}")
-    return found
+                found[not in_key].append(f"{table} as {new}" if new else table)
+    of_key, of_row = ([f"-> {', '.join(tables)}"] if tables else [] for tables in found)
+    return of_key, of_row
 
 
 def _is_origin(column: str, cls: Any) -> bool:
