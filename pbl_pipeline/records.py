@@ -34,7 +34,7 @@ class Column(NamedTuple):
     null: bool = False  # NULL for None, "" and what is not finite
     empty: bool = False  # '' in the rows that were there when it was added
     key: bool = False  # in the primary key of the table
-    before: str = ""  # field before whose column it stands; "": in the order of the fields
+    before: str = ""  # field before whose column it stands; "": in the order of the fields, "(end)": after all
 
 
 class Declared(NamedTuple):
@@ -87,6 +87,11 @@ def definition(cls: type, prefix: str = "", without: Collection[str] = (), only:
     own = [d.column for d in declared(cls) if d.path[0] not in without and (not only or d.path[0] in only)]
     keys, values = ([_line(c, prefix) for c in own if c.key == key] for key in (True, False))
     return "\n".join([*keys, "---", *values] if keys else values)
+
+
+def names(cls: type, prefix: str = "", without: Collection[str] = ()) -> list[str]:
+    """Return the names of the columns of a class, as `to_row` writes them."""
+    return [d.column.name.format(prefix) for d in declared(cls) if d.path[0] not in without]
 
 
 def _line(c: Column, prefix: str) -> str:

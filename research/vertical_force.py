@@ -28,7 +28,7 @@ from pbl_pipeline.body import load_body, stature_m
 from pbl_pipeline.kinetics import GRAVITY, contact_of, inverse_dynamics, smooth_motion
 from pbl_pipeline.kinetics import vertical as stage
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
-from pbl_pipeline.kinetics.types import WIDTH_SD
+from pbl_pipeline.results.forces import WIDTH_SD
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
 
 TARGET = Path(stage.__file__).with_name("vertical_models") / "vertical-force-2.json"

@@ -6,6 +6,7 @@ Each step is a function with a frozen result: `feet_from_fit` or `feet_from_keyp
 
 from pbl_pipeline.results.cycles import BODY_ANGLES, Exclusion, GaitCycle, Lengths
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
+from pbl_pipeline.results.index import GDI_MODEL, GILLETTE_MODEL, NUMBERS, PAPER_INDEX, Gdi, GdiCycle, interval_90
 from pbl_pipeline.results.measures import Z90, Measure
 
 from ._angles import ANGLE_NAMES, LEG_ANGLES, AngleSeries, angle_series, leg_angles, leg_angles_sd, pelvis_angles
@@ -13,15 +14,8 @@ from ._bands import CURVE_FRAME_COLUMNS, AdultRanges, NormalBands, adult_ranges,
 from ._cycles import REPORT_PERCENT, cycle_curves, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
     GDI_METHODS,
-    GDI_MODEL,
-    GILLETTE_MODEL,
     MODEL_ANGLES,
-    NUMBERS,
-    PAPER_INDEX,
-    Gdi,
-    GdiCycle,
     GdiParams,
-    interval_90,
     intervals_with_one_more,
     passes_of,
     score_gdi,

@@ -15,6 +15,13 @@ from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import LEFT, RIGHT
+from pbl_pipeline.results.index import (
+    GDI_MODEL,
+    GILLETTE_MODEL,
+    PAPER_INDEX,
+    Gdi,
+    GdiCycle,
+)
 from pbl_pipeline.results.measures import Z90
 
 from .cycle_measures import far_leg_of
@@ -37,7 +44,7 @@ from .normative import (
     load_norm,
     norm_names,
 )
-from .types import ANY_PACE, SELF_SELECTED, MovementProfile, feature_vector, movement_profile, variable_scores
+from .types import ANY_PACE, SELF_SELECTED, feature_vector, movement_profile, variable_scores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +91,6 @@ class GdiParams:
     lengthening: float = later(0.0)
 
 
-#: The paper's index, and the original one (Schwartz & Rozumalski 2008).
-GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
-#: The index of three angles by the paper's own recipe: the mean of the indices of all steps of a session, nothing taken
-#: back. Its components are those of norm and patients together in a set of `norm_from_cycles(pooled=...)`.
-PAPER_INDEX = "paper-2025"
 #: Angles that an index is made of.
 MODEL_ANGLES: dict[str, tuple[str, ...]] = {GDI_MODEL: THREE_ANGLES, GILLETTE_MODEL: NINE_ANGLES}
 #: Version 1 of the index of three angles had the norm `gillette-166-three-angles`; version 2 is the mean of the indices
@@ -107,11 +109,6 @@ GDI_METHODS.register(
 )
 GDI_METHODS.register(GILLETTE_MODEL, 1, GdiParams(norm="gillette-166-nine-angles"), "pbl_pipeline.gait:score_gdi")
 GDI_METHODS.register(PAPER_INDEX, 1, GdiParams(average="cycles", pace=ANY_PACE))
-_NAMES = {
-    GDI_MODEL: "GDI of three angles",
-    PAPER_INDEX: "GDI of three angles, the paper's recipe",
-    GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)",
-}
 
 
 #: Errors count as at most so many times the squared distance that was found: a larger correction would be a guess.
@@ -119,79 +116,6 @@ MOST_LONGER = 2.0
 #: A trial whose mean curve of an angle is farther than this from the others' (deg, root mean square) is named: twice
 #: the error above which gait analysis misleads (McGinley et al. 2009, Gait & Posture 29:360-369).
 APART_DEG = 10.0
-#: Numbers of an index: fields of `Gdi`, statistics of files.
-NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
-
-
-@dataclasses.dataclass(frozen=True)
-class GdiCycle:
-    """The index of one cycle. `z` is the standardised log distance; `explained` the fraction (0..1) of the squared
-    deviation from the normative mean that lies in the normative components; the rest does not count."""
-
-    trial: str
-    number: int
-    side: str
-    gdi: float
-    z: float
-    explained: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Gdi:
-    """The index of one trial or session, of its `n` used cycles; None if these are too few (`reason`).
-
-    `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
-    a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
-    index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
-    detectable change (90 %) between two visits filmed alike. `unshrunk`: the index without people's distribution as
-    prior knowledge of this person, for correlations and means over people; `mean` where that knows nothing of them
-    either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
-    """
-
-    status: str
-    reason: str
-    left: float | None
-    right: float | None
-    mean: float | None
-    n: int
-    n_left: int
-    n_right: int
-    norm: str
-    model: str
-    params_hash: str
-    cycles: tuple[GdiCycle, ...]
-    qc: tuple[Check, ...]
-    profile: MovementProfile | None = None
-    sd: float | None = None
-    minimal_change: float | None = None
-    unshrunk: float | None = None
-    unshrunk_sd: float | None = None
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """90 % interval of the true index; None if `sd` is not known."""
-        return interval_90(self.mean, self.sd)
-
-    @property
-    def title(self) -> str:
-        """Display name of the index."""
-        return _NAMES.get(self.model, self.model)
-
-    def to_dict(self) -> dict:
-        """`gdi` of metrics.json."""
-        rounded = {k: _rounded(getattr(self, k)) for k in NUMBERS}
-        interval = interval_90(rounded["mean"], rounded["sd"])  # as a reader of the file computes it
-        counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
-        cycles = [dataclasses.asdict(c) for c in self.cycles]
-        of_mean = None if interval is None else [_rounded(v) for v in interval]
-        return {**rounded, "interval": of_mean, **counted, "params_hash": self.params_hash, "cycles": cycles}
-
-
-def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
-    """The 90 % interval of an index whose error has the standard deviation `sd`; None if one is not known."""
-    if mean is None or sd is None or not np.isfinite(sd):
-        return None
-    return mean - Z90 * sd, mean + Z90 * sd
 
 
 def score_gdi(
@@ -304,10 +228,6 @@ def params_of(norm: NormativeSet, model: Method[GdiParams] | str | None) -> GdiP
     """Parameters of a model; without one, of the index with the norm's angles, if there is one."""
     method = GDI_METHODS.find(model)
     return method.params if model is not None else GDI_METHODS.get(_model_of(norm, None), method).params
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 3)
 
 
 def worth_of_one_more(cycles: Sequence[GaitCycle], index: Gdi) -> str:

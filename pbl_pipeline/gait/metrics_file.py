@@ -13,14 +13,13 @@ from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
+from pbl_pipeline.results.index import NUMBERS, Gdi, GdiCycle, MovementProfile
 from pbl_pipeline.results.measures import Measure
 
 from ._cycles import REPORT_PERCENT, GaitCycle
-from ._gdi import NUMBERS, Gdi, GdiCycle
 from .cycle_measures import MEASURES, Spatiotemporal
 from .metrics import GaitMetrics, TrialMetrics
 from .tasks import TRIAL_MEASURES
-from .types import MovementProfile
 
 
 class Curves(NamedTuple):

@@ -9,35 +9,12 @@ import numpy as np
 
 from pbl_pipeline.names import check_label
 from pbl_pipeline.results.events import LEFT, RIGHT, SIDES
+from pbl_pipeline.results.index import MovementProfile
 from pbl_pipeline.texts import code_of
 
 from .normative import NINE_ANGLES, NormativeSet
 
 _PELVIS = ("pelvis_tilt", "pelvis_obliquity", "pelvis_rotation")
-
-
-@dataclasses.dataclass(frozen=True)
-class MovementProfile:
-    """Gait Variable Scores (deg) per side and angle: together the Movement Analysis Profile.
-
-    A score is the root mean square, over the cycle, of the distance from the normative mean curve; of several cycles
-    their mean. `gps_left`, `gps_right` are the Gait Profile Scores of a side and `gps` that of the person, None unless
-    the norm has all nine angles (`NINE_ANGLES`). Empty sides have no scores.
-    """
-
-    left: dict[str, float]
-    right: dict[str, float]
-    gps_left: float | None
-    gps_right: float | None
-    gps: float | None
-
-    def of_side(self, side: str) -> dict[str, float]:
-        """The scores of "left" or "right"."""
-        return self.right if side == RIGHT else self.left
-
-    def to_dict(self) -> dict:
-        """`profile_deg` of metrics.json."""
-        return {k: _rounded(v) for k, v in dataclasses.asdict(self).items()}
 
 
 def feature_vector(curves: Mapping[str, np.ndarray], variables: Sequence[str], percent: np.ndarray) -> np.ndarray:
@@ -72,12 +49,6 @@ def movement_profile(scores: Mapping[str, np.ndarray], norm: NormativeSet) -> Mo
 
 def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _rounded(value: float | dict | None) -> float | dict | None:
-    if isinstance(value, dict):
-        return {k: round(v, 3) for k, v in value.items()}
-    return None if value is None else round(value, 3)
 
 
 #: Usual activities and paces; others are allowed.

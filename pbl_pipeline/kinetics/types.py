@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from pbl_pipeline import words
 from pbl_pipeline.gait import GaitCycle, GaitEvents
 from pbl_pipeline.qc import Check
+from pbl_pipeline.results.forces import KineticMeasure
 
 from .joints import MOMENTS
 
@@ -25,8 +26,6 @@ CURVES = (
 )
 #: Measures of a cycle; the unit is in the name.
 MEASURES = tuple(words.KINETICS)
-#: Half of a 90 % interval in standard deviations.
-WIDTH_SD = 1.645
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,39 +51,6 @@ class Walk(Protocol):
 
     @property
     def pooled(self) -> bool: ...
-
-
-@dataclasses.dataclass(frozen=True)
-class KineticMeasure:
-    """Means over the used cycles of each side and over both sides, with their standard deviations (None: not known).
-
-    The error is that of the fit, by sampling, that of the method, by force plates, of one camera what its fit loses in
-    any walk, by known walks, and the spread of the cycles; `interval` is the 90 % interval of `mean`.
-    `asymmetry_percent` is 100 (right - left) / ((right + left) / 2), None for what is not a measure of one leg, where
-    one camera saw the same leg behind the other, and where its standard deviation is more than
-    `compute.MAX_ASYMMETRY_SD`.
-    """
-
-    left: float | None
-    right: float | None
-    mean: float
-    sd_left: float | None
-    sd_right: float | None
-    sd: float | None
-    n: int
-    asymmetry_percent: float | None = None
-    asymmetry_sd: float | None = None
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """90 % interval of the mean."""
-        return None if self.sd is None else (self.mean - WIDTH_SD * self.sd, self.mean + WIDTH_SD * self.sd)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the measure for JSON."""
-        own = {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
-        interval = dataclasses.replace(self, **own).interval
-        return {**own, "interval": None if interval is None else [round(v, 4) for v in interval]}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from pbl_pipeline import charts
 from pbl_pipeline.gait.events import SIDES
 from pbl_pipeline.kinetics import GRAVITY, KineticMeasure, Kinetics
-from pbl_pipeline.kinetics.types import WIDTH_SD
 from pbl_pipeline.qc import PASS
 from pbl_pipeline.report.words import plural, sentence
+from pbl_pipeline.results.forces import WIDTH_SD
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import KINETICS, KINETICS_CURVES, number
 

@@ -2,4 +2,7 @@
 
 from .cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
 from .events import EVENTS, FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
+from .forces import KineticMeasure
+from .index import Gdi, GdiCycle, MovementProfile, VariableScore
 from .measures import OF_VISIT, Z90, Measure
+from .video_facts import FirstPicture, VideoInfo

@@ -1,5 +1,7 @@
 """Video files: probe, frames in order with their own time stamps, intrinsics, pose and orientation of the camera."""
 
+from pbl_pipeline.results.video_facts import FirstPicture, VideoInfo
+
 from .attitude import Attitude, camera_in_device, check_attitude, unknown_at
 from .boards import Board
 from .calibrate import Calibration, calibrate_video, draw_calibration
@@ -32,4 +34,4 @@ from .lens_calibration import (
 )
 from .phone_log import SENSORS, VIDEO_CLOCK, PhoneLog, Sensor
 from .sensor_logger import read_phone_log
-from .types import CAMERA_KINDS, Camera, FirstPicture, Frame, VideoInfo, cut_image
+from .types import CAMERA_KINDS, Camera, Frame, cut_image

@@ -21,8 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
-
-from .types import VideoInfo
+from pbl_pipeline.results.video_facts import VideoInfo
 
 CAMERA, DEVICE = "camera", "device"
 #: Four numbers of a smaller norm define no rotation.

@@ -20,12 +20,13 @@ import numpy as np
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.video_facts import VideoInfo
 
 from .boards import Board
 from .camera import reaches_corners
 from .file_facts import probe
 from .frames import read_frames
-from .types import Camera, VideoInfo
+from .types import Camera
 
 #: The sharpest frame of each part of the video is a candidate: largest number of parts, and their least length (s).
 MOST_CANDIDATES, SHORTEST_PART_S = 160, 0.2

@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.bounded import read_json, read_toml
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.video_facts import VideoInfo
 
-from .types import Camera, VideoInfo
+from .types import Camera
 
 #: Largest deviation of R R^T from 1: float32 poses pass, a scaled or mistyped matrix does not.
 _ORTHONORMAL_TOL = 1e-4

@@ -21,12 +21,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline import progress
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.video_facts import VideoInfo
 
 from .attitude import DEVICE, MAX_HOLE_S, Attitude, camera_in_device, check_roll, held_deg, log_error, unknown_at
 from .frames import read_frames
 from .phone_log import PICTURES_CLOCK, UTC_CLOCK, VIDEO_CLOCK, PhoneLog
 from .sensor_logger import read_phone_log
-from .types import VideoInfo
 
 #: Longer side (px) of the reduced picture, and the longest stretch of a video that is used (s): some seconds suffice.
 _SIDE_PX, LONGEST_S = 256, 90.0

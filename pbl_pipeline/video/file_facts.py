@@ -25,6 +25,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
+from pbl_pipeline.results.video_facts import FirstPicture, VideoInfo
 from pbl_pipeline.runs import runs
 from pbl_pipeline.sampling import interval_of
 
@@ -32,7 +33,6 @@ from .container_tags import Tags, read_tags
 from .decode import Decoder, check_file
 from .frames import Orientation, orientation_of
 from .kept import keeping
-from .types import FirstPicture, VideoInfo
 
 #: A recorded rate that differs from the stored one by less than this factor is rounding or a dropped frame.
 _MOST_RATIO = 1.1

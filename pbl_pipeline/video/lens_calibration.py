@@ -28,10 +28,11 @@ import numpy as np
 
 from pbl_pipeline.bounded import read_json
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.video_facts import FirstPicture, VideoInfo
 
 from .camera import guess_camera, load_camera, scaled_matrix
 from .file_facts import probe
-from .types import Camera, FirstPicture, VideoInfo
+from .types import Camera
 
 #: Standard deviation of a preset's focal length as a fraction of it, our estimate. The two recording formats that are
 #: published of one phone differ by 1.2 % (iPhone 11) and 0.1 % (iPhone 12 Pro); the rest allows for the crop of

@@ -43,7 +43,7 @@ from pbl_pipeline.gait.laboratory import read_lab_trial
 from pbl_pipeline.kinetics import MEASURES, METHODS, Kinetics, visit_kinetics
 from pbl_pipeline.kinetics.compute import CYCLE_SD, HEALTHY_SD, MAX_ASYMMETRY_SD, METHOD_SD, too_uncertain, trial_series
 from pbl_pipeline.kinetics.dynamics import GRID_HZ
-from pbl_pipeline.kinetics.types import WIDTH_SD
+from pbl_pipeline.results.forces import WIDTH_SD
 from research.benchmarks.kinetics import FOLDER, TUNING, fit_walk, read_walk, steps_of
 from research.corpus.walks import Case, Walk, detector_model, recorded_walks, synthetic_walk
 from research.paths import SHARED

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import definition, number, to_row
+from pbl_pipeline.records import definition, from_row, to_row
+from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, VariableScore
 from pbl_pipeline.results.measures import OF_VISIT, Measure
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
@@ -22,17 +23,6 @@ if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
 
 schema = dj.Schema()
-
-
-def profile_columns(prefix: str) -> str:
-    """Definition lines of a part table of the Movement Analysis Profile; `profile_rows` returns its rows."""
-    return f"""
-    -> master
-    {prefix}_angle             : varchar(32)   # name
-    ---
-    {prefix}_score_left=null   : float64       # (deg) root mean square distance from the normative mean curve
-    {prefix}_score_right=null  : float64       # (deg)
-    """
 
 
 @schema
@@ -86,37 +76,25 @@ class GDI(dj.Computed):
     -> NormativeSet
     ---
     -> session.Session
-    gdi_status      : enum('PASS', 'EMPTY')
-    gdi_reason      : varchar(1000)            # why EMPTY
-    gdi=null        : float64                  # (-) mean over all used cycles
-    gdi_left=null   : float64                  # (-)
-    gdi_right=null  : float64                  # (-)
-    gdi_sd=null     : float64                  # (-) standard deviation of the error of gdi
-    gdi_minimal_change=null : float64          # (-) minimal detectable change (90 percent) between two such visits
-    gdi_unshrunk=null    : float64             # (-) not drawn towards the mean of people: for correlations and means over people
-    gdi_unshrunk_sd=null : float64             # (-) standard deviation of the error of gdi_unshrunk
-    gdi_n           : int16                    # cycles with an index
-    gdi_gps=null       : float64               # (deg) Gait Profile Score of the person; null unless the norm has nine angles
-    gdi_gps_left=null  : float64               # (deg)
-    gdi_gps_right=null : float64               # (deg)
+    {definition(Gdi, "gdi")}
+    {definition(MovementProfile, "gdi")}
     {origin_columns("gdi")}
     index (gdi_status)
-    """  # noqa: E501
+    """
 
     class Cycle(dj.Part):
-        definition = """
+        definition = f"""
         -> master
         -> gait.GaitCycle.Cycle
         ---
-        cycle_gdi       : float64              # (-)
-        cycle_z         : float64              # (-) standardised log distance to the normative mean
-        cycle_explained : float64              # (0..1) share of the deviation that the index sees
+        {definition(GdiCycle)}
         """
 
     class Profile(dj.Part):
         definition = f"""
         # Movement Analysis Profile: how far each angle of the norm is from it
-        {profile_columns("gdi")}
+        -> master
+        {definition(VariableScore, "gdi")}
         """
 
     class Check(dj.Part):
@@ -142,7 +120,7 @@ class GDI(dj.Computed):
     @computes
     def make_compute(
         self, key: dict, name: str, rows: Sequence[Mapping[str, Any]], ref: dict, norm: tuple, method: Mapping[str, Any]
-    ) -> tuple[lib.Gdi, str, str]:
+    ) -> tuple[Gdi, str, str]:
         from pbl_pipeline.gait import score_gdi
 
         index = methods.stored(**method)
@@ -150,22 +128,18 @@ class GDI(dj.Computed):
         result = score_gdi(cycles, norm_of_row(*norm), index.params, index)
         return result, index.hash, norm[1]
 
-    def make_insert(self, key: dict, result: lib.Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, result: Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
                 "session_id": fit.session_of_set(key),
-                "gdi_status": result.status,
-                **index_row(result, "gdi"),
-                **gps_row(result.profile, "gdi"),
+                **to_row(result, "gdi"),
+                **to_row(result.profile or _NO_PROFILE, "gdi"),
                 **origin.row("gdi", method_hash=sha, model_sha256=norm_sha),
             }
         )
-        self.Cycle.insert(
-            {**key, "cycle_no": c.number, "cycle_gdi": c.gdi, "cycle_z": c.z, "cycle_explained": c.explained}
-            for c in result.cycles
-        )
-        self.Profile.insert({**key, **row} for row in profile_rows(result.profile, "gdi"))
+        self.Cycle.insert({**key, "cycle_no": c.number, **to_row(c)} for c in result.cycles)
+        self.Profile.insert({**key, **to_row(s, "gdi")} for s in (result.profile or _NO_PROFILE).scores)
         self.Check.insert({**key, **to_row(check, "index")} for check in result.qc)
 
 
@@ -181,18 +155,8 @@ class SessionGdi(dj.Computed):
     -> session.Session
     session_status              : enum('PASS', 'EMPTY')
     session_reason              : varchar(2000)  # why EMPTY
-    session_gdi_reason          : varchar(1000)  # why there is no index
-    session_gdi=null            : float64      # (-) mean over all used cycles
-    session_gdi_left=null       : float64      # (-)
-    session_gdi_right=null      : float64      # (-)
-    session_gdi_sd=null         : float64      # (-) standard deviation of the error of session_gdi
-    session_gdi_minimal_change=null : float64  # (-) minimal detectable change (90 percent) between two such visits
-    session_gdi_unshrunk=null    : float64     # (-) not drawn towards the mean of people: for correlations and means over people
-    session_gdi_unshrunk_sd=null : float64     # (-) standard deviation of the error of session_gdi_unshrunk
-    session_gdi_n               : int16        # cycles with an index
-    session_gps=null            : float64      # (deg) Gait Profile Score of the person; null unless the norm has nine angles
-    session_gps_left=null       : float64      # (deg)
-    session_gps_right=null      : float64      # (deg)
+    {definition(Gdi, "session_gdi", without=("status",))}
+    {definition(MovementProfile, "session")}
     session_cycles              : int16        # used cycles
     session_corrected           : int16        # trials of the set whose events a person corrected
     session_params_hash         : char(16)     # hash over the parameters of events and index together
@@ -204,7 +168,7 @@ class SessionGdi(dj.Computed):
     session_double_support=null : float64      # (percent) of the cycle
     {origin_columns("session_gdi")}
     index (session_status)
-    """  # noqa: E501
+    """
 
     class Trial(dj.Part):
         definition = """
@@ -224,7 +188,8 @@ class SessionGdi(dj.Computed):
     class Profile(dj.Part):
         definition = f"""
         # Movement Analysis Profile: how far each angle of the norm is from it
-        {profile_columns("session")}
+        -> master
+        {definition(VariableScore, "session")}
         """
 
     class Check(dj.Part):
@@ -307,8 +272,8 @@ class SessionGdi(dj.Computed):
                 "session_id": fit.session_of_set(key),
                 "session_status": result.status,
                 "session_reason": result.reason[:2000],
-                **index_row(index, "session_gdi"),
-                **gps_row(index.profile, "session"),
+                **to_row(index, "session_gdi", without=("status",)),
+                **to_row(index.profile or _NO_PROFILE, "session"),
                 "session_cycles": measures.n_cycles_used,
                 "session_corrected": sum(r["correction_no"] is not None for r in trials),
                 "session_params_hash": result.params_hash,
@@ -319,62 +284,26 @@ class SessionGdi(dj.Computed):
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
         rows = gait.measure_rows(measures.measures, measures.reasons, "session_measure", without=())
         self.Measure.insert({**key, **row} for row in rows)
-        self.Profile.insert({**key, **row} for row in profile_rows(index.profile, "session"))
+        self.Profile.insert({**key, **to_row(s, "session")} for s in (index.profile or _NO_PROFILE).scores)
         self.Check.insert({**key, **to_row(check, "gdi")} for check in result.qc)
 
 
-#: End of a column of the index -> field of the library's `Gdi`.
-_INDEX = {"": "mean"} | {f"_{k}": k for k in ("left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")}
-
-
-def index_row(index: lib.Gdi, prefix: str) -> dict[str, Any]:
-    """Return the columns of the index, `prefix` ("gdi", "session_gdi") that of its mean."""
-    values = {f"{prefix}{end}": number(getattr(index, field)) for end, field in _INDEX.items()}
-    return {**values, f"{prefix}_n": index.n, f"{prefix}_reason": index.reason[:1000]}
-
-
-def index_fields(row: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the fields of the library's `Gdi` that `index_row` wrote."""
-    values: dict[str, Any] = {field: number(row[f"{prefix}{end}"]) for end, field in _INDEX.items()}
-    return {**values, "n": int(row[f"{prefix}_n"]), "reason": row[f"{prefix}_reason"]}
-
-
-def gps_row(profile: lib.MovementProfile | None, prefix: str) -> dict[str, float | None]:
-    """The columns of the Gait Profile Score."""
-    scores = ("gps", "gps_left", "gps_right")
-    return {f"{prefix}_{k}": None if profile is None else number(getattr(profile, k)) for k in scores}
-
-
-def profile_rows(profile: lib.MovementProfile | None, prefix: str) -> list[dict[str, Any]]:
-    """Rows of a part table with `profile_columns(prefix)`."""
-    if profile is None:
-        return []
-    return [
-        {
-            f"{prefix}_angle": angle,
-            f"{prefix}_score_left": number(profile.left.get(angle)),
-            f"{prefix}_score_right": number(profile.right.get(angle)),
-        }
-        for angle in dict.fromkeys([*profile.left, *profile.right])
-    ]
+#: The profile of a trial or a visit without an index.
+_NO_PROFILE = MovementProfile({}, {}, None, None, None)
 
 
 def profile_of_rows(
     rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str
-) -> lib.MovementProfile | None:
+) -> MovementProfile | None:
     """Return the library's `MovementProfile`; None without rows."""
-    from pbl_pipeline.gait import NINE_ANGLES, MovementProfile
+    from pbl_pipeline.gait import NINE_ANGLES
 
     if not rows:
         return None
     order = {angle: i for i, angle in enumerate(NINE_ANGLES)}
-    rows = sorted(rows, key=lambda r: order.get(r[f"{prefix}_angle"], len(order)))
-    sides = {
-        side: {r[f"{prefix}_angle"]: float(v) for r in rows if (v := r[f"{prefix}_score_{side}"]) is not None}
-        for side in ("left", "right")
-    }
-    gps = (number(master[f"{prefix}_{k}"]) for k in ("gps_left", "gps_right", "gps"))
-    return MovementProfile(sides["left"], sides["right"], *gps)
+    scores = sorted((from_row(VariableScore, r, prefix) for r in rows), key=lambda s: order.get(s.angle, len(order)))
+    left, right = ({s.angle: v for s in scores if (v := getattr(s, side)) is not None} for side in ("left", "right"))
+    return from_row(MovementProfile, master, prefix, left=left, right=right)
 
 
 def pace_of(gdi_method: str, rows: Rows = stored_rows) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
+from pbl_pipeline.results.forces import KineticMeasure
 from pbl_pipeline.temporary import new_folder
 
 from . import capture, fit, gait, gdi, session, study, video
@@ -62,22 +64,14 @@ class Kinetics(dj.Computed):
     """  # noqa: E501
 
     class Measure(dj.Part):
-        definition = """
+        definition = f"""
         # every measure of the visit with both sides and the standard deviation of its error
         -> master
         force_measure            : varchar(64) # name, with its unit
         ---
-        force_mean=null          : float64     # in the unit (see force_measure): both sides
-        force_left=null          : float64     # in the unit (see force_measure)
-        force_right=null         : float64     # in the unit (see force_measure)
-        force_sd=null            : float64     # in the unit (see force_measure): standard deviation of the error of force_mean
-        force_sd_left=null       : float64     # in the unit (see force_measure)
-        force_sd_right=null      : float64     # in the unit (see force_measure)
-        force_asymmetry=null     : float64     # (percent) right minus left, of their mean; null where too uncertain
-        force_asymmetry_sd=null  : float64     # (percent) standard deviation of its error
-        force_n                  : int16       # values
+        {definition(KineticMeasure, "force")}
         force_missing            : varchar(255)  # why it is null
-        """  # noqa: E501
+        """
 
     class Trial(dj.Part):
         definition = """
@@ -180,12 +174,16 @@ class Kinetics(dj.Computed):
                 **origin.row("forces", method_hash=found.params_hash),
             }
         )
-        absent = dict.fromkeys(MEASURE_PARTS)
-        for name in (*found.measures, *found.reasons):
-            own = found.measures.get(name)
-            values = absent if own is None else {c: number(getattr(own, k)) for c, k in MEASURE_PARTS.items()}
-            missing, n = found.reasons.get(name, "")[:255], 0 if own is None else own.n
-            self.Measure.insert1({**key, "force_measure": name, **values, "force_n": n, "force_missing": missing})
+        unknown = KineticMeasure(None, None, math.nan, None, None, None, 0)
+        self.Measure.insert(
+            {
+                **key,
+                "force_measure": name,
+                **to_row(found.measures.get(name, unknown), "force"),
+                "force_missing": found.reasons.get(name, "")[:255],
+            }
+            for name in (*found.measures, *found.reasons)
+        )
         with new_folder() as folder:
             for number_of, trial in zip(ids, found.trials, strict=True):
                 path = folder / f"{number_of}.kinetics.npz"
@@ -207,19 +205,6 @@ class Kinetics(dj.Computed):
             for c in trial.cycles
         )
         self.Check.insert({**key, **to_row(check, "forces")} for check in found.qc)
-
-
-#: Column of `Kinetics.Measure` -> attribute of the library's `KineticMeasure`.
-MEASURE_PARTS = {
-    "force_mean": "mean",
-    "force_left": "left",
-    "force_right": "right",
-    "force_sd": "sd",
-    "force_sd_left": "sd_left",
-    "force_sd_right": "sd_right",
-    "force_asymmetry": "asymmetry_percent",
-    "force_asymmetry_sd": "asymmetry_sd",
-}
 
 
 @dataclasses.dataclass(frozen=True)

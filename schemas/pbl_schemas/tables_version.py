@@ -9,10 +9,10 @@ created.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import pkgutil
 import re
 from collections.abc import Callable, Collection
+from pathlib import Path
 
 import pymysql
 
@@ -56,8 +56,9 @@ def title(number: int, name: str) -> str:
 def numbered() -> list[tuple[int, str]]:
     """Return number and name of every migration of this version, in the order of their numbers. Raises ValueError for a
     number that is missing or used twice, a mistake in the code."""
-    package = importlib.import_module("pbl_schemas.migrations")
-    names = (_NAME.fullmatch(module.name) for module in pkgutil.iter_modules(package.__path__))
+    names = (
+        _NAME.fullmatch(module.name) for module in pkgutil.iter_modules([str(Path(__file__).parent / "migrations")])
+    )
     found = sorted((int(match[1]), match[2]) for match in names if match)
     if [number for number, _ in found] != list(range(1, len(found) + 1)):
         raise ValueError(f"migrations must be numbered 1, 2, 3 ...: {[number for number, _ in found]}")

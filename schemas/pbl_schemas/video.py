@@ -10,16 +10,17 @@ import numpy as np
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
-from pbl_pipeline.records import number
+from pbl_pipeline.records import definition, from_row, number, to_row
+from pbl_pipeline.results.video_facts import OF_FILE
+from pbl_pipeline.results.video_facts import VideoInfo as Info
 from pbl_pipeline.words import UNUSABLE
 
 from . import lab, session  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
-from .rows import Rows, one, or_nan, row_of, stored_rows
+from .rows import Rows, one, row_of, stored_rows
 
 if TYPE_CHECKING:
-    from pbl_pipeline import video as lib
     from pbl_pipeline.gait import Condition
 
 schema = dj.Schema()
@@ -173,24 +174,7 @@ class VideoInfo(dj.Computed):
     # what the file holds; sizes after the rotation flag is applied
     -> Video
     ---
-    container            : varchar(64)
-    codec                : varchar(32)
-    pixel_format         : varchar(32)
-    width                : int32               # (px) of the upright frame
-    height               : int32               # (px) of the upright frame
-    rotation             : int16               # (deg) rotation flag of the file
-    fps=null             : float64             # (1/s) 1 / sampling interval, a description only
-    duration=null        : float64             # (s) from the first frame to the end of the last
-    n_frames             : int32               # frames that decode
-    n_frames_announced   : int32               # frames the header claims, 0 when it says nothing
-    variable_frame_rate  : bool                # whether frame intervals differ
-    recorded_utc=null    : varchar(40)         # recording time as the file states it
-    phone_make=null      : varchar(64)
-    phone_model=null     : varchar(64)
-    phone_lens=null      : varchar(128)        # lens as the phone names it
-    focal_35mm=null      : float64             # (mm) focal length of the same view on 35 mm film, as the file states it
-    capture_fps=null     : float64             # (1/s) rate at which the phone says it recorded
-    video_notes          : json                # remarks on the file, such as a mirrored picture
+    {definition(Info, without=OF_FILE)}
     frame_time           : <npy@arrays>       # (s) float64 (T): the container's own time stamps, first frame 0
     {origin_columns("video_info")}
     """
@@ -204,72 +188,25 @@ class VideoInfo(dj.Computed):
         return one(Video & key, "video_path", "video_sha256")
 
     @computes
-    def make_compute(self, key: dict, path: str, sha256: str) -> tuple[lib.VideoInfo]:
+    def make_compute(self, key: dict, path: str, sha256: str) -> tuple[Info]:
         from pbl_pipeline.video import probe
 
         return (probe(registered_file(path, sha256, key)),)
 
-    def make_insert(self, key: dict, info: lib.VideoInfo, origin: Origin) -> None:
+    def make_insert(self, key: dict, info: Info, origin: Origin) -> None:
         self.insert1(
             {
                 **key,
-                "container": info.container[:64],
-                "codec": info.codec[:32],
-                "pixel_format": info.pixel_format[:32],
-                "width": info.width_px,
-                "height": info.height_px,
-                "rotation": info.rotation_deg,
-                "fps": number(info.fps),
-                "duration": number(info.duration_s),
-                "n_frames": info.n_frames,
-                "n_frames_announced": info.n_frames_announced,
-                "variable_frame_rate": info.variable_frame_rate,
-                # Tags of the file, which are not trusted.
-                "recorded_utc": _cut(info.recorded_utc, 40),
-                "phone_make": _cut(info.make, 64),
-                "phone_model": _cut(info.model, 64),
-                "phone_lens": _cut(info.lens, 128),
-                "focal_35mm": number(info.focal_35mm),
-                "capture_fps": number(info.capture_fps),
-                "video_notes": list(info.notes),
+                **to_row(info, without=OF_FILE),
                 "frame_time": info.time_s,
                 **origin.row("video_info"),
             }
         )
 
 
-def _cut(text: str | None, limit: int) -> str | None:
-    return None if text is None else text[:limit]
-
-
-def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> lib.VideoInfo:
+def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Info:
     """The library's `VideoInfo` from a joined row of Video and VideoInfo and the array in `frame_time`."""
-    from pbl_pipeline import video as lib
-
-    return lib.VideoInfo(
-        path=row["video_path"],
-        sha256=row["video_sha256"],
-        size_bytes=int(row["video_size"]),
-        container=row["container"],
-        codec=row["codec"],
-        pixel_format=row["pixel_format"],
-        width_px=int(row["width"]),
-        height_px=int(row["height"]),
-        rotation_deg=int(row["rotation"]),
-        time_s=time_s,
-        fps=or_nan(row["fps"]),
-        duration_s=or_nan(row["duration"]),
-        n_frames=int(row["n_frames"]),
-        n_frames_announced=int(row["n_frames_announced"]),
-        variable_frame_rate=bool(row["variable_frame_rate"]),
-        recorded_utc=row["recorded_utc"],
-        make=row["phone_make"],
-        model=row["phone_model"],
-        notes=tuple(row["video_notes"]),
-        lens=row["phone_lens"],
-        focal_35mm=number(row["focal_35mm"]),
-        capture_fps=number(row["capture_fps"]),
-    )
+    return from_row(Info, row, time_s=time_s)
 
 
 def conditions(videos: Any) -> dict[int, Condition]:

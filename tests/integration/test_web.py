@@ -122,7 +122,7 @@ def visit_list_key(number: int) -> dict[str, str]:
 # ---------------------------------------------------------------------------------------------------------- the way in
 def test_a_link_opens_one_browser_once():
     app = create_app(Options())
-    key = app.state.sessions.new_link("A", "reader")
+    key = app.state.site.sessions.new_link("A", "reader")
     browser, other = (web.TestClient(app, base_url=web.BASE) for _ in range(2))
     answer = browser.get("/enter", params={"key": key, "to": "/visits/12"}, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/visits/12")
@@ -131,7 +131,7 @@ def test_a_link_opens_one_browser_once():
     assert other.get("/enter", params={"key": key}, follow_redirects=False).status_code == 401
     assert other.get("/visits").status_code == 401
     for to in ("//evil.example", "https://evil.example", "/visits/1/../../x", "/visits/1\r\nx: y", "/recordings"):
-        key = app.state.sessions.new_link("A", "reader")
+        key = app.state.site.sessions.new_link("A", "reader")
         answer = other.get("/enter", params={"key": key, "to": to}, follow_redirects=False)
         assert answer.headers["location"] == "/"
 

@@ -143,7 +143,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
     assert client.get("/visits").status_code == 401
     assert "<form" in client.get("/visits").text
     assert "by the link in the terminal" not in client.get("/visits").text  # links are no way in here
-    key = client.app.state.sessions.new_link("X", "reviewer")  # type: ignore[attr-defined]
+    key = client.app.state.site.sessions.new_link("X", "reviewer")  # type: ignore[attr-defined]
     assert client.get(f"/enter?key={key}", follow_redirects=False).status_code == 200
     assert client.get("/visits").status_code == 401
     for name, password in (("A", "wrong password words"), ("nobody", WORDS), ("", ""), ("A", "x" * 300)):
@@ -152,7 +152,7 @@ def test_the_way_in_and_out(known: Accounts, tables: None):
         assert "do not belong together" in answer.text
         assert f'value="{name}" required' in answer.text
         assert not password or password not in answer.text
-        client.app.state.sign_in.attempts._failures.clear()  # type: ignore[attr-defined]
+        client.app.state.site.attempts._failures.clear()  # type: ignore[attr-defined]
     answer = sign_in(client)
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     cookie = answer.headers["set-cookie"].lower()
@@ -176,7 +176,7 @@ def test_a_session_is_never_the_browsers_choice_and_the_old_one_ends(known: Acco
     assert answer.status_code == 303
     first = answer.headers["set-cookie"].partition("=")[2].partition(";")[0]
     assert "planted" not in first
-    sessions = client.app.state.sessions  # type: ignore[attr-defined]
+    sessions = client.app.state.site.sessions  # type: ignore[attr-defined]
     assert sessions.find("planted") is None
     client.cookies.clear()
     client.cookies.set("__Host-pbl_session", first)

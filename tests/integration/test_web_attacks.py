@@ -239,7 +239,7 @@ def test_a_body_that_nobody_reads_keeps_no_connection(one_visit: None, line: str
 
 def test_a_form_that_comes_in_pieces_and_requests_in_one_are_answered(one_visit: None):
     app, cookie = web.app_with_cookie()
-    session = app.state.sessions.find(cookie)
+    session = app.state.site.sessions.find(cookie)
     body = f"token={session.token}&role=pre".encode()
     with web.running(app, Where()) as port:
         with head_sent(port, "POST /visits HTTP/1.1", cookie, f"Content-Length: {len(body)}") as slow:

@@ -34,7 +34,7 @@ def hold(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 def browser(hold: Path) -> Iterator[Any]:
     found: Any = web.client(name="A. First", target=compute_target.compute)
     yield found
-    found.app.state.computing.close()
+    found.app.state.site.computing.close()
 
 
 @computed_once

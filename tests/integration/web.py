@@ -14,8 +14,8 @@ from starlette.testclient import TestClient
 from pbl_schemas.connection import dj
 from pbl_workers.on_request import compute_visit
 from pbl_workers.web import Options, ResultsFolder, Where, create_app
-from pbl_workers.web.computing import Target
 from pbl_workers.web.serve import config
+from pbl_workers.web.site import Target
 
 BASE = "http://127.0.0.1:8484"
 
@@ -32,7 +32,7 @@ def client(
     app = create_app(Options(name=name, roles=tuple(role.split(",")), target=target, folder=folder))
     browser = TestClient(app, base_url=BASE, raise_server_exceptions=False, headers={"accept-language": "en"})
     if signed_in:
-        key = app.state.sessions.new_link(name, *role.split(","))
+        key = app.state.site.sessions.new_link(name, *role.split(","))
         found = browser.get("/enter", params={"key": key}, follow_redirects=False)
         assert found.status_code == 303, found.text
     return browser
@@ -41,7 +41,7 @@ def client(
 def app_with_cookie(role: str = "reviewer") -> tuple[Any, str]:
     """The page, and the cookie of a session, for tests that speak HTTP themselves."""
     app = create_app(Options())
-    sessions = app.state.sessions
+    sessions = app.state.site.sessions
     return app, sessions.enter(sessions.new_link("A", role))
 
 
@@ -112,7 +112,7 @@ def shown(
         opened, errors = made.new_page(), []
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
-        opened.goto(f"/enter?key={app.state.sessions.new_link(name, *role.split(','))}")
+        opened.goto(f"/enter?key={app.state.site.sessions.new_link(name, *role.split(','))}")
         with one_query_at_a_time():
             try:
                 yield opened

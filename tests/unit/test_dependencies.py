@@ -70,7 +70,8 @@ def test_no_import_against_the_direction(package: str, forbidden: set[str]):
 
 @functools.cache
 def _modules(package: str) -> dict[str, set[str]]:
-    """Module of a package -> modules of it that are imported there, also inside functions and for types alone."""
+    """Module of a package -> modules of it that are imported there, also inside functions, for types alone and by
+    `importlib` with a written name."""
     module_of = {f: module_name(f) for f in files(package)}
     known = set(module_of.values())
     found: dict[str, set[str]] = {}
@@ -84,6 +85,14 @@ def _modules(package: str) -> dict[str, set[str]]:
                 base = within.rsplit(".", node.level - 1)[0] if node.level else ""
                 base = ".".join(part for part in (base, node.module) if part)
                 targets |= {full if (full := f"{base}.{a.name}") in known else base for a in node.names}
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+                targets |= {a.value for a in node.args if isinstance(a, ast.Constant)}
+                ahead = [
+                    str(a.values[0].value)
+                    for a in node.args
+                    if isinstance(a, ast.JoinedStr) and isinstance(a.values[0], ast.Constant)
+                ]
+                targets |= {m for m in known for start in ahead if start.count(".") > 1 and m.startswith(start)}
         found[name] = (targets & known) - {name}
     return found
 

@@ -1,4 +1,4 @@
-"""The review page's own files: texts in both languages, scripts of others as published."""
+"""The review page's own files: texts in both languages, scripts of others as published, views at module level."""
 
 import ast
 import csv
@@ -214,3 +214,12 @@ def test_the_browsers_language():
     assert texts.language_of(None, "fr;q=0.9, en;q=0.5, de;q=0.1") == "en"
     assert texts.language_of("de", "en") == "de"
     assert texts.language_of("xx", ";;;q=x,,") == "en"
+
+
+def test_views_are_functions_and_classes_at_module_level():
+    """What is nested in a function, such as a maker of routes, is out of reach of other modules and of tests."""
+    kinds = (ast.FunctionDef, ast.AsyncFunctionDef)
+    tops = [n for f in WEB.rglob("*.py") for n in ast.parse(f.read_text()).body if isinstance(n, kinds)]
+    nested = [n.name for top in tops for n in ast.walk(top) if isinstance(n, kinds) and n is not top]
+    assert len(tops) > 100
+    assert len(nested) <= 5, nested

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from pymysql.converters import escape_string
 
+from pbl_pipeline.records import names
+from pbl_pipeline.results import Gdi
+
 from .. import fit, gait, gdi, kinetics, lab, qc, session, study, tracking, validation, video
 from ..datajoint_setup import dj
 from ..stored_files import file_ref, stored_file
@@ -28,14 +31,7 @@ _SESSION_COLUMNS = (
     "session_stance",
     "session_swing",
     "session_double_support",
-    "session_gdi",
-    "session_gdi_left",
-    "session_gdi_right",
-    "session_gdi_sd",
-    "session_gdi_minimal_change",
-    "session_gdi_unshrunk",
-    "session_gdi_unshrunk_sd",
-    "session_gdi_n",
+    *names(Gdi, "session_gdi", without=("status", "reason")),
 )
 
 
@@ -121,7 +117,7 @@ def force_frame(restriction: Any = True) -> pd.DataFrame:
     """One row per visit, chain of methods and measure of forces and joint moments (`force_measure`, with its unit), of
     the current sets: mean of both sides with its 90 % interval (`force_low`, `force_high`), both sides, asymmetry;
     null if unknown, with the reason in `force_missing`."""
-    from pbl_pipeline.kinetics.types import WIDTH_SD
+    from pbl_pipeline.results.forces import WIDTH_SD
 
     forces = kinetics.Kinetics.proj("forces_status", "forces_code", "forces_mass", "forces_aid", "forces_residual")
     found = frame_of(current_sets() * forces * kinetics.Kinetics.Measure & restriction)
@@ -217,9 +213,7 @@ def trial_summary(restriction: Any = True) -> pd.DataFrame:
     events = gait.GaitEvents.proj("events_status", "events_reason", "n_events")
     cycles = gait.GaitCycle.proj("n_cycles", "n_cycles_used")
     measures = gait.Spatiotemporal.proj("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
-    index = gdi.GDI.proj(
-        "gdi", "gdi_left", "gdi_right", "gdi_sd", "gdi_minimal_change", "gdi_unshrunk", "gdi_unshrunk_sd", "gdi_n"
-    )
+    index = gdi.GDI.proj(*names(Gdi, "gdi", without=("status", "reason")))
     joined = current_sets() * trials * events * cycles * measures * index
     return (joined & restriction).to_pandas(order_by="video_id").reset_index()
 

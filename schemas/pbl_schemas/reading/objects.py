@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.records import from_row, number
+from pbl_pipeline.results import Gdi, GdiCycle, KineticMeasure
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
@@ -126,9 +127,11 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     pooled = [t for t in trials if t.pooled]
     norm_name, model, params_hash = _index_of(row_key, rows)
     checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
-    index = lib.Gdi(
+    index = from_row(
+        Gdi,
+        row,
+        "session_gdi",
         status="PASS" if row["session_gdi"] is not None else "EMPTY",
-        **gdi.index_fields(row, "session_gdi"),
         n_left=sum(t.gdi.n_left for t in pooled),
         n_right=sum(t.gdi.n_right for t in pooled),
         norm=norm_name,
@@ -189,27 +192,19 @@ def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
     )
 
 
-def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> lib.Gdi:
+def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> Gdi:
     """The library's `Gdi` of one row of GDI."""
-    from pbl_pipeline import gait as lib
-
     row = row_of(gdi.GDI, key, rows)
     norm_name, model, params_hash = _index_of(row, rows)
     sides = {int(r["cycle_no"]): r["cycle_side"] for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
     cycles = tuple(
-        lib.GdiCycle(
-            trial=trial,
-            number=int(r["cycle_no"]),
-            side=sides[int(r["cycle_no"])],
-            gdi=float(r["cycle_gdi"]),
-            z=float(r["cycle_z"]),
-            explained=float(r["cycle_explained"]),
-        )
+        from_row(GdiCycle, r, trial=trial, number=int(r["cycle_no"]), side=sides[int(r["cycle_no"])])
         for r in rows(gdi.GDI.Cycle, key)
     )
-    return lib.Gdi(
-        status=row["gdi_status"],
-        **gdi.index_fields(row, "gdi"),
+    return from_row(
+        Gdi,
+        row,
+        "gdi",
         n_left=sum(c.side == "left" for c in cycles),
         n_right=sum(c.side == "right" for c in cycles),
         norm=norm_name,
@@ -238,8 +233,7 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
         if own["force_mean"] is None:
             reasons[name] = own["force_missing"]
             continue
-        values: dict[str, Any] = {k: number(own[column]) for column, k in kinetics.MEASURE_PARTS.items()}
-        measures[name] = lib.KineticMeasure(**values, n=int(own["force_n"]))
+        measures[name] = from_row(KineticMeasure, own, "force")
     return lib.Kinetics(
         status=row["forces_status"],
         code=row["forces_code"],

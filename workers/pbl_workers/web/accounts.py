@@ -9,7 +9,6 @@ slice, an analyst's account of the database never have them, and a database that
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import contextlib
 import dataclasses
@@ -18,8 +17,6 @@ import functools
 import hashlib
 import hmac
 import json
-import logging
-import math
 import os
 import re
 import secrets
@@ -29,25 +26,22 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from starlette.requests import Request
-from starlette.responses import RedirectResponse, Response
-
 from pbl_pipeline import settings
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import one_process
-from pbl_pipeline.names import whole_number
 from pbl_schemas.operations.folders import private_folder, write_json
 
-from .access import HOURS, RIGHTS, Cookie, Sessions, form_of, read_form
-from .address import OPEN, Address
+from .access import RIGHTS
 from .connections import customer
-from .pages import Pages
 
 #: Cost of scrypt: 2^17 blocks of 8 x 128 byte, one after the other. A guess takes 128 MiB and some tenths of a second
 #: (OWASP Password Storage Cheat Sheet). scrypt is the memory-hard hash of Python's own library.
 LOG_N, R, P = 17, 8, 1
 #: Fewest and most characters of a password (NIST SP 800-63B asks for 15 where it is the only factor).
 SHORTEST, LONGEST = 15, 256
+#: Passwords that are compared at a time (each takes 128 MiB). As many may wait for it as there are connections: a limit
+#: of those would let a flood of wrong ones refuse the right one.
+AT_ONCE = 2
 _NAME = re.compile(r"[\w.@-][\w.@ -]{0,62}[\w.@-]|[\w.@-]")
 #: A password as `hashed` stores it, with a cost of at most 2^19 blocks of memory.
 _HASH = re.compile(rf"scrypt\$([1-9]|1\d)\${R}\${P}\$[\w+/]{{22}}==\$[\w+/]{{43}}=", re.ASCII)
@@ -254,77 +248,3 @@ class Attempts:
         with contextlib.suppress(ValueError):
             address = customer(address)
         return ("account", hashlib.sha256(account.encode(errors="replace")).hexdigest()), ("address", address)
-
-
-log = logging.getLogger(__name__)
-
-#: Passwords that are compared at a time (each takes 128 MiB). As many may wait for it as there are connections: a limit
-#: of those would let a flood of wrong ones refuse the right one.
-AT_ONCE = 2
-
-
-@dataclasses.dataclass(frozen=True)
-class SignIn:
-    """Ways to sign in. accounts: None if links open the page."""
-
-    sessions: Sessions
-    cookie: Cookie
-    accounts: Accounts | None
-    attempts: Attempts
-
-
-def routes(pages: Pages, way: SignIn, used: Callable[[], None]) -> list[Address]:
-    """The addresses of this part. `used`: called after a link was used."""
-    turn = asyncio.Semaphore(AT_ONCE)
-
-    def opened(request: Request, value: str, to: str) -> Response:
-        # The browser never chooses its session, and the one that it had ends.
-        way.sessions.leave(way.cookie.of(request))
-        response = RedirectResponse(to, 303)
-        way.cookie.set(response, value, int(3600 * HOURS))
-        return response
-
-    async def by_link(request: Request) -> Response:
-        value = way.sessions.enter(request.query_params.get("key", ""))
-        if value is None:
-            return pages.refused(request, "session")
-        to = request.query_params.get("to", "")
-        response = opened(request, value, to if to.startswith("/visits/") and whole_number(to[8:]) else "/")
-        used()
-        return response
-
-    async def ask(request: Request) -> Response:
-        return pages.show(request, "sign_in.html", problem="", wait=0, name="")
-
-    async def sign_in(request: Request) -> Response:
-        assert way.accounts is not None
-        fields = await read_form(request)
-        name, password = fields.get("name", "").strip(), fields.get("password", "")
-        address = request.client.host if request.client else ""
-        wait = way.attempts.wait_s(name, address)
-        if wait > 0:
-            seconds = math.ceil(wait)
-            headers = {"retry-after": str(seconds)}
-            return pages.show(request, "sign_in.html", 429, headers, problem="sign_in.wait", wait=seconds, name=name)
-        way.attempts.failed(name, address)
-        async with turn:
-            account = await asyncio.to_thread(way.accounts.check, name, password)
-        if account is None:
-            # No name: people write their password into the wrong field.
-            log.warning("a failed sign-in from %s", address)
-            return pages.show(request, "sign_in.html", 401, problem="sign_in.wrong", wait=0, name=name)
-        way.attempts.succeeded(name, address)
-        return opened(request, way.sessions.open(account.name, account.roles, account.changed), "/")
-
-    async def leave(request: Request) -> Response:
-        await form_of(request)
-        way.sessions.leave(way.cookie.of(request))
-        response = RedirectResponse("/", 303)
-        way.cookie.forget(response)
-        return response
-
-    if way.accounts is None:
-        entries = [Address("/enter", by_link, OPEN)]
-    else:
-        entries = [Address("/enter", ask, OPEN), Address("/enter", sign_in, OPEN, methods=["POST"])]
-    return [*entries, Address("/leave", leave, "", methods=["POST"])]

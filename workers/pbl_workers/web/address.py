@@ -11,7 +11,9 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from pbl_pipeline.names import whole_number
+from pbl_schemas.intake.phone_recordings import phone_of
 
+from . import site
 from .access import Refused, Session
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Right of an address that is open without a session; the others are those of `access.RIGHTS`, and "" for any session.
 OPEN = "open"
-#: Right of an address that answers phones alone, which opened the link of a visit (`phone.Phones`).
+#: Right of an address that answers phones alone, which opened the link of a visit.
 FILM = "film"
 #: Ending of the address of a page as JSON.
 JSON = ".json"
@@ -43,12 +45,13 @@ class Address(Route):
         self.right, self.look = right, look
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request. Raises `Refused` for a sender without the right, `PblError` for a look without its row."""
+        """Answer a request. Raises `Refused` for a sender without the right; `PblError` for a look without its
+        row, PHONE_LINK for a phone whose link has ended."""
         request = Request(scope)
         session: Session | None = request.state.session
         if self.right == FILM:
-            phones = request.app.state.phones
-            request.state.phone = None if phones is None else await phones.find(request)
+            cookie = site.of(request).phone_cookie.of(request)
+            request.state.phone = await site.ask(request, phone_of, cookie) if cookie else None
             if request.state.phone is None:
                 raise Refused("session" if session is None else "right")
         elif self.right != OPEN:
@@ -56,7 +59,7 @@ class Address(Route):
                 raise Refused("session")
             if not session.may(self.right):
                 raise Refused("right")
-            looks = request.app.state.looks
+            looks = site.of(request).looks
             if self.look and looks is not None and scope["method"] in (self.methods or ()):
                 ((of, number),) = request.path_params.items()
                 await looks.record(session, of, number, self.look)

@@ -20,10 +20,9 @@ from pbl_pipeline.names import whole_number
 from pbl_pipeline.words import ANGLES, FOOT_ANGLES, PELVIS_ANGLES, number
 from pbl_schemas.reading import comparison
 
-from .address import Address, interval, page
-from .pages import Pages, as_json, plain, reader_language, visit_name
-from .source import Videos
-from .tables import Tables
+from . import pages, site
+from .address import interval, page
+from .pages import as_json, plain, reader_language, visit_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,48 +36,48 @@ class Chart:
     far: dict[str, list[int]]
 
 
-def routes(pages: Pages, tables: Tables, videos: Videos) -> list[Address]:
-    async def show(request: Request) -> Response:
-        from pbl_pipeline.gait import IMPORTANT_CHANGE
+async def show(request: Request) -> Response:
+    from pbl_pipeline.gait import IMPORTANT_CHANGE
 
-        chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
-        wanted = request.query_params.get("ref", "")
-        found = await tables.ask(comparison.compare, chosen, _read(wanted) if wanted else None)
-        language = "en" if as_json(request) else reader_language(request)
-        names = [_name(c, language) for c in found.compared]
-        cycles = [c.cycles for c in found.compared]
-        shown: dict[int, PblError | None] = {}
-        for video_id in {c.video_id for of_result in cycles for c in of_result}:
-            try:
-                await tables.ask(videos.path, video_id)
-                shown[video_id] = None
-            except PblError as error:
-                shown[video_id] = error
-        if as_json(request):  # loads arrays, which not every thread may
-            return pages.show(request, "", **await tables.ask(plain, {"found": found, "names": names}))
-        return pages.show(
-            request,
-            "compare.html",
-            found=found,
-            names=names,
-            keys=[charts.series_key(i) for i in range(len(names))],
-            measures=[n for n in _names(found) if any(_known(c, n) for c in found.compared)],
-            without=without(found),
-            of_cycles=[n for n in _names(found) if any(_interval(c, n) is not None for c in found.compared)],
-            charts=charts_of(found, names, language),
-            plot=charts.CYCLE_PLOT,
-            first_cycle=[_first_cycle(c, cycles) for c in cycles],
-            videos=shown,
-            as_reference=[_address(found, i) for i in range(len(names))],
-            interval=interval,
-            bounds=_bounds,
-            percent=lambda p: number(100.0 * min(p, 0.99), 0),
-            least_important=IMPORTANT_CHANGE,
-            now=datetime.datetime.now(datetime.UTC),
-            version=code_version(),
-        )
+    chosen = [_read(text) for text in request.query_params.getlist("v")[:100]]
+    wanted = request.query_params.get("ref", "")
+    found = await site.ask(request, comparison.compare, chosen, _read(wanted) if wanted else None)
+    language = "en" if as_json(request) else reader_language(request)
+    names = [_name(c, language) for c in found.compared]
+    cycles = [c.cycles for c in found.compared]
+    shown: dict[int, PblError | None] = {}
+    for video_id in {c.video_id for of_result in cycles for c in of_result}:
+        try:
+            await site.ask(request, site.of(request).source.video, video_id)
+            shown[video_id] = None
+        except PblError as error:
+            shown[video_id] = error
+    if as_json(request):  # loads arrays, which not every thread may
+        return pages.show(request, "", **await site.ask(request, plain, {"found": found, "names": names}))
+    return pages.show(
+        request,
+        "compare.html",
+        found=found,
+        names=names,
+        keys=[charts.series_key(i) for i in range(len(names))],
+        measures=[n for n in _names(found) if any(_known(c, n) for c in found.compared)],
+        without=without(found),
+        of_cycles=[n for n in _names(found) if any(_interval(c, n) is not None for c in found.compared)],
+        charts=charts_of(found, names, language),
+        plot=charts.CYCLE_PLOT,
+        first_cycle=[_first_cycle(c, cycles) for c in cycles],
+        videos=shown,
+        as_reference=[_address(found, i) for i in range(len(names))],
+        interval=interval,
+        bounds=_bounds,
+        percent=lambda p: number(100.0 * min(p, 0.99), 0),
+        least_important=IMPORTANT_CHANGE,
+        now=datetime.datetime.now(datetime.UTC),
+        version=code_version(),
+    )
 
-    return page("/compare", show, "look")
+
+ROUTES = page("/compare", show, "look")
 
 
 def charts_of(found: comparison.Comparison, names: Sequence[str], language: str = "en") -> list[Chart]:

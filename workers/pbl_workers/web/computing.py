@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -13,20 +12,16 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas import session
 from pbl_schemas.reading.visit_progress import Progress, visit_progress
 
-from ..process_queue import ProcessQueue, Task
+from ..process_queue import Task
+from . import pages, site
 from .access import Refused, form_of
 from .address import Address, number_of, own_address
-from .pages import Pages
-from .tables import Tables
 
 #: Seconds that a process is given to put its job back when the page ends.
 END_S = 15.0
 
-#: Function that the process runs, of session_id and whether errors are tried again.
-Target = Callable[[int, bool], None]
 
-
-def begin(computing: ProcessQueue, target: Target, session_id: int, again: bool) -> None:
+def begin(request: Request, session_id: int, again: bool) -> None:
     """Have a visit computed; `again`: including what failed.
 
     A job that a worker has taken is not taken twice, and a process that ends leaves no partial result: all it does
@@ -34,6 +29,7 @@ def begin(computing: ProcessQueue, target: Target, session_id: int, again: bool)
 
     Raises `PblError` USAGE where too many visits wait.
     """
+    computing, target = site.of(request).computing, site.of(request).options.target
     for key in ((session_id, False), (session_id, True)):
         computing.drop(key)
     task = Task(target, (session_id, again), functools.partial(_broken, session_id), end_s=END_S)
@@ -64,28 +60,29 @@ class Told:
 
 def told(request: Request, progress: Progress) -> Told:
     """Return how far a visit is, for a page."""
-    computing: ProcessQueue = request.app.state.computing
+    computing = site.of(request).computing
     works = [w for again in (False, True) if (w := computing.find((progress.session_id, again))) is not None]
     states, errors = [w.state for w in works], [w.error for w in works if w.error is not None]
     return Told(progress, next((s for s in ("running", "waiting") if s in states), ""), errors[0] if errors else None)
 
 
-def routes(pages: Pages, tables: Tables, computing: ProcessQueue, target: Target) -> list[Address]:
-    async def compute(request: Request) -> Response:
-        fields = await form_of(request)
-        number = number_of(request)
-        if fields.get("again") not in ("yes", "no"):
-            raise Refused("form")
-        await tables.ask(session.registered_visit, number)
-        begin(computing, target, number, fields["again"] == "yes")
-        return RedirectResponse(own_address(fields.get("back", f"/visits/{number}")), 303)
+async def compute(request: Request) -> Response:
+    fields = await form_of(request)
+    number = number_of(request)
+    if fields.get("again") not in ("yes", "no"):
+        raise Refused("form")
+    await site.ask(request, session.registered_visit, number)
+    begin(request, number, fields["again"] == "yes")
+    return RedirectResponse(own_address(fields.get("back", f"/visits/{number}")), 303)
 
-    async def progress(request: Request) -> Response:
-        number = number_of(request)
-        await tables.ask(session.registered_visit, number)
-        return pages.show(request, "progress.html", told=told(request, await tables.ask(visit_progress, number)))
 
-    return [
-        Address("/visits/{session_id:int}/compute", compute, "decide", methods=["POST"]),
-        Address("/visits/{session_id:int}/progress", progress, "look", look="progress"),
-    ]
+async def progress(request: Request) -> Response:
+    number = number_of(request)
+    await site.ask(request, session.registered_visit, number)
+    return pages.show(request, "progress.html", told=told(request, await site.ask(request, visit_progress, number)))
+
+
+ROUTES = [
+    Address("/visits/{session_id:int}/compute", compute, "decide", methods=["POST"]),
+    Address("/visits/{session_id:int}/progress", progress, "look", look="progress"),
+]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,72 +19,73 @@ from pbl_schemas import reading, video
 from pbl_schemas.decisions import candidates, review_decisions
 
 from ..refresh import queue_visit, queue_visit_of
+from . import site
 from .access import Refused, form_of, sender
 from .address import Address, number_of
-from .pages import Pages
-from .tables import Tables
 
 if TYPE_CHECKING:
     from pbl_pipeline.tracking import Tracking
 
 
-def routes(pages: Pages, tables: Tables) -> list[Address]:
-    async def person(request: Request) -> Response:
-        fields = await form_of(request)
-        number = number_of(request)
-        chosen = _number(fields.get("person", ""))
-        method, seen = fields.get("method", ""), fields.get("seen", "")
-        await tables.ask(review_decisions.decide_person, number, chosen, method, sender(request), seen)
-        await tables.ask(queue_visit_of, number)
-        return RedirectResponse(f"/recordings/{number}", 303)
+async def person(request: Request) -> Response:
+    fields = await form_of(request)
+    number = number_of(request)
+    chosen = _number(fields.get("person", ""))
+    method, seen = fields.get("method", ""), fields.get("seen", "")
+    await site.ask(request, review_decisions.decide_person, number, chosen, method, sender(request), seen)
+    await site.ask(request, queue_visit_of, number)
+    return RedirectResponse(f"/recordings/{number}", 303)
 
-    async def accept(request: Request) -> Response:
-        from pbl_schemas.reading.shown import shown_visit
 
-        fields = await form_of(request)
-        number, shown = number_of(request), _number(fields.get("result", ""))
+async def accept(request: Request) -> Response:
+    fields = await form_of(request)
+    number, shown = number_of(request), _number(fields.get("result", ""))
+    await site.ask(request, _accept, number, shown, fields, sender(request))
+    await site.ask(request, queue_visit, number)
+    return RedirectResponse(f"/visits/{number}?result={shown}", 303)
 
-        def write() -> None:
-            about = shown_visit(number, shown)
-            if not about.key or about.computed != fields.get("computed"):
-                raise PblError(
-                    "DECIDED_MEANWHILE",
-                    found="the checks were computed anew since this page was loaded",
-                    expected="the checks that the page showed; nothing of yours was written",
-                    next_step="load the page again and look at them",
-                    key=f"session_id={number}",
-                )
-            number_of_check = _number(fields.get("check", ""))
-            review_decisions.accept_check(about.key, number_of_check, sender(request), fields.get("reason", ""))
 
-        await tables.ask(write)
-        await tables.ask(queue_visit, number)
-        return RedirectResponse(f"/visits/{number}?result={shown}", 303)
+async def boxes(request: Request) -> Response:
+    number, which = number_of(request), whole_number(request.query_params.get("method", "0"))
+    tracked = await site.ask(request, lambda: reading.load_tracking(_candidates(number, which).key))
+    return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
 
-    async def boxes(request: Request) -> Response:
-        number, which = number_of(request), whole_number(request.query_params.get("method", "0"))
 
-        tracked = await tables.ask(lambda: reading.load_tracking(_candidates(number, which).key))
-        return Response(await asyncio.to_thread(boxes_json, tracked), media_type="application/json")
+async def people(request: Request) -> Response:
+    number, which = number_of(request), _number(request.query_params.get("method", "0"))
+    return Response(await site.ask(request, _picture, number, which), media_type="image/jpeg")
 
-    async def people(request: Request) -> Response:
-        """The picture of the numbered people. It is of the original: none if heads are to be hidden."""
-        number, which = number_of(request), _number(request.query_params.get("method", "0"))
 
-        def picture() -> bytes:
-            if settings.deidentify_how():
-                raise video.unknown_video(number)
-            with new_folder() as folder:
-                return candidates.write_sheet(_candidates(number, which), folder / "people.jpg").read_bytes()
+ROUTES = [
+    Address("/recordings/{video_id:int}/person", person, "decide", methods=["POST"]),
+    Address("/recordings/{video_id:int}/people", people, "look", look="people"),
+    Address("/recordings/{video_id:int}/boxes", boxes, "look", look="boxes"),
+    Address("/visits/{session_id:int}/accept", accept, "decide", methods=["POST"]),
+]
 
-        return Response(await tables.ask(picture), media_type="image/jpeg")
 
-    return [
-        Address("/recordings/{video_id:int}/person", person, "decide", methods=["POST"]),
-        Address("/recordings/{video_id:int}/people", people, "look", look="people"),
-        Address("/recordings/{video_id:int}/boxes", boxes, "look", look="boxes"),
-        Address("/visits/{session_id:int}/accept", accept, "decide", methods=["POST"]),
-    ]
+def _accept(number: int, shown: int, fields: Mapping[str, str], by: str) -> None:
+    """Accept the check of a visit that a form names. Raises `PblError` DECIDED_MEANWHILE for another computation."""
+    from pbl_schemas.reading.shown import shown_visit
+
+    about = shown_visit(number, shown)
+    if not about.key or about.computed != fields.get("computed"):
+        raise PblError(
+            "DECIDED_MEANWHILE",
+            found="the checks were computed anew since this page was loaded",
+            expected="the checks that the page showed; nothing of yours was written",
+            next_step="load the page again and look at them",
+            key=f"session_id={number}",
+        )
+    review_decisions.accept_check(about.key, _number(fields.get("check", "")), by, fields.get("reason", ""))
+
+
+def _picture(video_id: int, which: int) -> bytes:
+    """The picture of the numbered people. It is of the original: none if heads are to be hidden."""
+    if settings.deidentify_how():
+        raise video.unknown_video(video_id)
+    with new_folder() as folder:
+        return candidates.write_sheet(_candidates(video_id, which), folder / "people.jpg").read_bytes()
 
 
 def _candidates(video_id: int, which: int | None) -> candidates.Candidates:

@@ -13,28 +13,27 @@ from starlette.responses import FileResponse, Response
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.visit import Visit
 
+from . import site
 from .address import Address, number_of, shown_of
-from .source import Source
-from .tables import Asks
 
 #: Formats of the archive: those that need no further package.
 FORMATS = ("csv", "trc", "mot")
 
 
-def routes(asks: Asks, source: Source) -> list[Address]:
-    async def export(request: Request) -> Response:
-        number, result = number_of(request), shown_of(request)
-        visit = await asks.ask(lambda: source.to_export(number, result).loaded())
-        folder = new_folder()
-        try:
-            archive = await asyncio.to_thread(_archive, visit, folder.path)
-        except BaseException:
-            folder.cleanup()
-            raise
-        done = BackgroundTask(folder.cleanup)
-        return FileResponse(archive, media_type="application/zip", filename=f"visit_{number}.zip", background=done)
+async def export(request: Request) -> Response:
+    number, result = number_of(request), shown_of(request)
+    visit = await site.ask(request, lambda: site.of(request).source.to_export(number, result).loaded())
+    folder = new_folder()
+    try:
+        archive = await asyncio.to_thread(_archive, visit, folder.path)
+    except BaseException:
+        folder.cleanup()
+        raise
+    done = BackgroundTask(folder.cleanup)
+    return FileResponse(archive, media_type="application/zip", filename=f"visit_{number}.zip", background=done)
 
-    return [Address("/visits/{session_id:int}/export", export, "look", look="export")]
+
+ROUTES = [Address("/visits/{session_id:int}/export", export, "look", look="export")]
 
 
 def _archive(visit: Visit, folder: Path) -> Path:

@@ -20,11 +20,10 @@ from pbl_schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, vi
 from pbl_schemas.reading.visit_list import INCOMPLETE, Page, VisitRow
 from pbl_schemas.subject_codes import day_of
 
+from . import pages, site
 from .access import REPORT_POLICY
 from .address import Address, interval, number_of, page
-from .pages import Pages
 from .source import Source
-from .tables import Asks
 
 if TYPE_CHECKING:
     from pbl_pipeline.gait import Measure
@@ -207,35 +206,33 @@ class ResultsFolder(Source):
         )
 
 
-def routes(pages: Pages, files: Asks, folder: ResultsFolder) -> list[Address]:
-    """Return the addresses that a folder answers in its own way: the list, and files that are there already."""
+def _folder(request: Request) -> ResultsFolder:
+    found = site.of(request).source
+    assert isinstance(found, ResultsFolder)
+    return found
 
-    async def visits(request: Request) -> Response:
-        listed = await files.ask(folder.listed)
-        return pages.show(
-            request,
-            "visits.html",
-            page=listed,
-            choices={},
-            bad=False,
-            older="",
-            newest="",
-            is_first=True,
-            interval=interval,
-        )
 
-    async def report(request: Request) -> Response:
-        headers = {"content-security-policy": REPORT_POLICY}
-        return FileResponse(folder.report(number_of(request)), media_type="text/html; charset=utf-8", headers=headers)
+async def visits(request: Request) -> Response:
+    listed = await site.ask(request, _folder(request).listed)
+    more = {"bad": False, "older": "", "newest": "", "is_first": True, "interval": interval}
+    return pages.show(request, "visits.html", page=listed, choices={}, **more)
 
-    async def overlay(request: Request) -> Response:
-        return FileResponse(await files.ask(folder.overlay, number_of(request)), media_type="video/mp4")
 
-    return [
-        *page("/visits", visits, "look"),
-        Address("/visits/{session_id:int}/report", report, "look", look="report"),
-        Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
-    ]
+async def report(request: Request) -> Response:
+    path, headers = _folder(request).report(number_of(request)), {"content-security-policy": REPORT_POLICY}
+    return FileResponse(path, media_type="text/html; charset=utf-8", headers=headers)
+
+
+async def overlay(request: Request) -> Response:
+    return FileResponse(await site.ask(request, _folder(request).overlay, number_of(request)), media_type="video/mp4")
+
+
+#: Addresses that a folder answers in its own way: the list, and files that are there already.
+ROUTES = [
+    *page("/visits", visits, "look"),
+    Address("/visits/{session_id:int}/report", report, "look", look="report"),
+    Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
+]
 
 
 def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:

@@ -20,10 +20,9 @@ from pbl_schemas.reading.status import ErrorRow, pipeline_status, running, span
 from pbl_schemas.transactions import in_transaction
 
 from ..requeue import retry
+from . import pages, site
 from .access import Refused, form_of, sender
 from .address import Address
-from .pages import Pages
-from .tables import Tables
 
 #: Errors, jobs and waiting recordings that are listed, of each table.
 MOST = 100
@@ -36,35 +35,36 @@ class Group:
     errors: tuple[ErrorRow, ...]
 
 
-def routes(pages: Pages, tables: Tables) -> list[Address]:
-    async def show(request: Request) -> Response:
-        state, jobs, server = await tables.ask(lambda: (pipeline_status(most=MOST), running(MOST), database_status()))
-        return pages.show(
-            request,
-            "operate.html",
-            state=state,
-            jobs=jobs,
-            server=server,
-            groups=groups_of(state.errors),
-            n_errors=sum(t.error for t in state.tables),
-            retried=whole_number(request.query_params.get("retried", "")),
-            now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
-            span=span,
-            key_text=lambda key: json.dumps(key, default=str),
-        )
+async def show(request: Request) -> Response:
+    state, jobs, server = await site.ask(
+        request, lambda: (pipeline_status(most=MOST), running(MOST), database_status())
+    )
+    shown = {"state": state, "jobs": jobs, "server": server, "groups": groups_of(state.errors)}
+    return pages.show(
+        request,
+        "operate.html",
+        **shown,
+        n_errors=sum(t.error for t in state.tables),
+        retried=whole_number(request.query_params.get("retried", "")),
+        now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
+        span=span,
+        key_text=lambda key: json.dumps(key, default=str),
+    )
 
-    async def again(request: Request) -> Response:
-        fields = await form_of(request)
-        table, code, key = fields.get("table", ""), fields.get("code", ""), _key(fields.get("key", ""))
-        if not table or not code:
-            raise Refused("form")
-        n = await tables.ask(_retry, table, code, key, sender(request))
-        return RedirectResponse(f"/operate?retried={n}", 303)
 
-    return [
-        Address("/operate", show, "operate"),
-        Address("/operate/retry", again, "operate", methods=["POST"]),
-    ]
+async def again(request: Request) -> Response:
+    fields = await form_of(request)
+    table, code, key = fields.get("table", ""), fields.get("code", ""), _key(fields.get("key", ""))
+    if not table or not code:
+        raise Refused("form")
+    n = await site.ask(request, _retry, table, code, key, sender(request))
+    return RedirectResponse(f"/operate?retried={n}", 303)
+
+
+ROUTES = [
+    Address("/operate", show, "operate"),
+    Address("/operate/retry", again, "operate", methods=["POST"]),
+]
 
 
 def groups_of(errors: Sequence[ErrorRow]) -> list[Group]:

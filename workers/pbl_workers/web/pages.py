@@ -26,6 +26,7 @@ from pbl_schemas.intake.sheets import with_point
 from pbl_schemas.reading.shown import ShownVisit
 from pbl_schemas.session import UNLABELLED
 
+from . import site
 from .access import HEADERS, HOURS, Session
 from .address import JSON
 
@@ -105,89 +106,87 @@ def reader_language(request: Request) -> str:
     return texts.language_of(request.cookies.get("pbl_language"), request.headers.get("accept-language", ""))
 
 
-class Pages:
-    """Renders the templates of this folder: escaped, in the reader's language, a name that is missing is an error."""
+@functools.cache
+def _environment() -> jinja2.Environment:
+    """The templates of this folder: escaped, a name that is missing is an error."""
+    found = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.globals.update(
+        number=number,
+        has_text=lambda name: name in texts.catalogue(),
+        significant=significant,
+        check_words=check_words,
+        stage_words=STAGES,
+        codes=texts.codes,
+        measure_words=MEASURES | TASKS,
+        moment=moment,
+        angle_words=[title for title, _ in ANGLES.values()],
+    )
+    found.filters["capital"] = capital
+    return found
 
-    def __init__(self, sign_in: bool = False) -> None:
-        """sign_in: whether people sign in with a password; else a link opens the page."""
-        self._sign_in = sign_in
-        self._environment = jinja2.Environment(
-            loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
-            autoescape=True,
-            undefined=jinja2.StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        self._environment.globals.update(
-            number=number,
-            has_text=lambda name: name in texts.catalogue(),
-            significant=significant,
-            check_words=check_words,
-            stage_words=STAGES,
-            codes=texts.codes,
-            measure_words=MEASURES | TASKS,
-            moment=moment,
-            angle_words=[title for title, _ in ANGLES.values()],
-        )
-        self._environment.filters["capital"] = capital
 
-    def show(
-        self,
-        request: Request,
-        template: str,
-        status: int = 200,
-        headers: Mapping[str, str] | None = None,
-        **values: Any,
-    ) -> Response:
-        """Return a page, or its values as JSON if the address ends so. `values`: variables of its template."""
-        if as_json(request):
-            shown = {name: plain(value) for name, value in values.items() if not callable(value)}
-            return JSONResponse(shown, status, dict(headers or {}))
-        language = reader_language(request)
-        session: Session | None = getattr(request.state, "session", None)
-        own: dict[str, Any] = {
-            "t": functools.partial(texts.text, language),
-            "said": functools.partial(texts.on_page, language),
-            "coded": functools.partial(texts.coded, language),
-            "named": functools.partial(visit_name, language),
-            "language": language,
-            "other_language": next(name for name in texts.LANGUAGES if name != language),
-            "session": session,
-            "path": request.scope["path"],
-            "number": lambda *args: texts.decimals(language, number(*args)),
-            "significant": lambda *args: texts.decimals(language, significant(*args)),
-            "decimals": functools.partial(texts.decimals, language),
-        }
-        page = self._environment.get_template(template).render({**own, **values})
-        return HTMLResponse(page, status, dict(headers or {}))
+def show(
+    request: Request, template: str, status: int = 200, headers: Mapping[str, str] | None = None, **values: Any
+) -> Response:
+    """Return a page, or its values as JSON if the address ends so. `values`: variables of its template."""
+    if as_json(request):
+        shown = {name: plain(value) for name, value in values.items() if not callable(value)}
+        return JSONResponse(shown, status, dict(headers or {}))
+    language = reader_language(request)
+    session: Session | None = getattr(request.state, "session", None)
+    own: dict[str, Any] = {
+        "t": functools.partial(texts.text, language),
+        "said": functools.partial(texts.on_page, language),
+        "coded": functools.partial(texts.coded, language),
+        "named": functools.partial(visit_name, language),
+        "language": language,
+        "other_language": next(name for name in texts.LANGUAGES if name != language),
+        "session": session,
+        "path": request.scope["path"],
+        "number": lambda *args: texts.decimals(language, number(*args)),
+        "significant": lambda *args: texts.decimals(language, significant(*args)),
+        "decimals": functools.partial(texts.decimals, language),
+    }
+    page = _environment().get_template(template).render({**own, **values})
+    return HTMLResponse(page, status, dict(headers or {}))
 
-    def refused(self, request: Request, reason: str) -> Response:
-        """Return the answer to a request that may not pass."""
-        if reason == "address":
-            return self.missing(request, 404)
-        name = "enter.title" if reason == "session" else f"enter.{reason}_title"
-        text = "enter.text" if reason == "session" else f"enter.{reason}"
-        if as_json(request):
-            error = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
-            return self.error(request, error, _REFUSED[reason])
-        if reason == "session" and self._sign_in:
-            return self.show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0, name="")
-        return self.show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
-    def error(self, request: Request, error: PblError, status: int) -> Response:
-        return self.show(request, "error.html", status, error=error)
+def refused(request: Request, reason: str) -> Response:
+    """Return the answer to a request that may not pass."""
+    if reason == "address":
+        return missing(request, 404)
+    name = "enter.title" if reason == "session" else f"enter.{reason}_title"
+    text = "enter.text" if reason == "session" else f"enter.{reason}"
+    if as_json(request):
+        coded = _refusal(found=texts.text("en", name), next_step=texts.text("en", text))
+        return error(request, coded, _REFUSED[reason])
+    if reason == "session" and site.of(request).options.accounts is not None:
+        return show(request, "sign_in.html", _REFUSED[reason], problem="", wait=0, name="")
+    return show(request, "refused.html", _REFUSED[reason], title=name, text=text, hours=f"{HOURS:g}")
 
-    def missing(self, request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:
-        """Return the answer to an unknown address."""
-        if as_json(request):
-            return self.error(request, _not_there(), status)
-        return self.show(request, "missing.html", status, headers)
 
-    def unforeseen(self, request: Request) -> Response:
-        """Return the answer to a failure of the program; the traceback is in the terminal."""
-        if as_json(request):
-            return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
-        return self.show(request, "unforeseen.html", 500, HEADERS)
+def error(request: Request, error: PblError, status: int) -> Response:
+    return show(request, "error.html", status, error=error)
+
+
+def missing(request: Request, status: int, headers: Mapping[str, str] | None = None) -> Response:
+    """Return the answer to an unknown address."""
+    if as_json(request):
+        return error(request, _not_there(), status)
+    return show(request, "missing.html", status, headers)
+
+
+async def unforeseen(request: Request, error: Exception) -> Response:
+    """Return the answer to a failure of the program; the traceback is in the terminal."""
+    if as_json(request):
+        return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
+    return show(request, "unforeseen.html", 500, HEADERS)
 
 
 def visit_name(language: str, label: str) -> str:

@@ -36,14 +36,12 @@ from pbl_schemas.reading.usable import PENDING, Next, Usable, next_pass, usual_s
 from pbl_schemas.reading.visit_state import RESULTS, state_of
 
 from .. import phone_uploads
-from ..process_queue import ProcessQueue
-from . import certificates
-from .access import BODY_BYTES, Cookie, Refused, form_of, read_body, read_form, sender
+from . import certificates, pages, site
+from .access import BODY_BYTES, Refused, form_of, read_body, read_form, sender
 from .address import FILM, OPEN, Address, number_of
-from .computing import Target
 from .computing import begin as compute
-from .pages import Pages, reader_language
-from .tables import Tables, on_disk
+from .pages import reader_language
+from .tables import on_disk
 
 #: The phone's page may use its camera and sensors.
 _MAY = {
@@ -66,200 +64,195 @@ _OPENED_AT_ONCE = 4
 log = logging.getLogger(__name__)
 
 
+async def make(request: Request) -> Response:
+    fields = await form_of(request)
+    number, hours = number_of(request), fields.get("hours", "")
+    if hours not in HOURS:
+        raise Refused("form")
+    make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
+    link, key = await site.ask(request, make_link, number, sender(request), float(hours))
+    page = f"{request.url.scheme}://{request.headers['host']}/phone"
+    address, secure = f"{page}/open?key={key}", request.url.scheme == "https"
+    trust = qr_code(f"{page}/authority.crt") if certificates.authority().is_file() else ""
+    shown = {"number": number, "link": link, "address": address, "hours": hours, "secure": secure, "trust": trust}
+    return pages.show(request, "film.html", code=qr_code(address), **shown)
+
+
+async def end(request: Request) -> Response:
+    fields = await form_of(request)
+    number = number_of(request)
+    if (link := whole_number(fields.get("link", ""))) is None:
+        raise Refused("form")
+    await site.ask(request, phone_recordings.end_link, number, link)
+    return RedirectResponse(f"/visits/{number}#film", 303)
+
+
+async def ask(request: Request) -> Response:
+    """Ask whether this is the phone: what only looks at an address (a preview, HEAD) does not take the link."""
+    key = request.query_params.get("key", "")
+    if await site.ask(request, phone_recordings.is_open, key, site.of(request).phone_cookie.of(request)):
+        return RedirectResponse("/phone", 303)
+    return pages.show(request, "open.html", key=key)
+
+
+async def opened(request: Request) -> Response:
+    key, mine = (await read_form(request)).get("key", ""), site.of(request).phone_cookie.of(request)
+    cookie = await site.ask(request, phone_recordings.use_link, key, mine)
+    response = RedirectResponse("/phone", 303)
+    if cookie is not None:
+        site.of(request).phone_cookie.set(response, cookie, int(3600 * MOST_HOURS))
+    return response
+
+
+async def page(request: Request) -> Response:
+    from pbl_pipeline.gait import ACTIVITIES, PACES
+
+    every = texts.catalogue()
+    said = {
+        **{f"is_{name}": {k: capital(v) for k, v in every[f"library.{name}"].items()} for name in ACTIVITIES},
+        **{f"is_{name}": every[f"library.{name}"] for name in PACES},
+        **{name.removeprefix(_SAID): own for name, own in every.items() if name.startswith(_SAID)},
+    }
+    usual = usual_words(reader_language(request), await site.ask(request, usual_seconds))
+    values = {"phone": request.state.phone, "words": json.dumps(said), "usual": usual, "part_bytes": PART_BYTES}
+    return pages.show(request, "capture.html", 200, _MAY, **values)
+
+
+async def begin(request: Request) -> Response:
+    try:
+        stated = parse_json((await _body(request, "application/json", BODY_BYTES)).decode())
+    except ValueError:
+        raise Refused("form") from None
+    sent = await site.ask(request, phone_recordings.begin, request.state.phone, stated)
+    return await told(request, sent)
+
+
+async def part(request: Request) -> Response:
+    sent = await recording(request)
+    found = _RANGE.fullmatch(request.headers.get("content-range", ""))
+    if found is None:
+        raise Refused("form")
+    number = phone_uploads.check_part(sent, *(int(n) for n in found.groups()))
+    body = await _body(request, "application/octet-stream", PART_BYTES)
+    if len(body) != int(found[2]) - int(found[1]) + 1:
+        raise phone_recordings.upload_refused("a part of another length than it states")
+    sha256 = request.headers.get("x-sha256", "")
+    await _on_disk(phone_uploads.keep_part, request.state.phone, sent, number, body, sha256)
+    try:
+        sent = await recording(request)
+    except PblError as error:
+        await removed(request, sent, error)
+        raise
+    if sent.state != UPLOADING:  # it was finished while this part came again
+        await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+    return Response(status_code=204)
+
+
+async def recording(request: Request) -> Sent:
+    return await site.ask(request, phone_recordings.recording, request.state.phone, number_of(request))
+
+
+async def removed(request: Request, sent: Sent, error: PblError) -> None:
+    """Remove the parts of a recording whose visit was removed while they came."""
+    if error.code == "DB_NOT_FOUND":
+        await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+
+
+async def told(request: Request, sent: Sent) -> Response:
+    missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
+    if len(missing) == sent.n_parts:
+        begun = await site.ask(request, phone_recordings.begun_bytes, UNFINISHED_DAYS)
+        try:
+            await _on_disk(phone_uploads.check_promised, begun, _NEXT_STEP)
+        except PblError:
+            await site.ask(request, phone_recordings.not_begun, sent.number)
+            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
+            raise
+    return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
+
+
+async def worker(request: Request) -> Response:
+    """Serve a script of a separate thread below the page's address, so that it is also available offline."""
+    path = Path(__file__).parent / "static" / f"capture_{request.url.path.rpartition('/')[2]}"
+    return FileResponse(path, media_type="text/javascript", headers={"service-worker-allowed": "/phone"})
+
+
+async def authority(request: Request) -> Response:
+    if not certificates.authority().is_file():
+        raise HTTPException(404)
+    return FileResponse(certificates.authority(), media_type="application/x-x509-ca-cert", filename="laboratory.crt")
+
+
 class Phones:
-    """Finds the phone that sends a request, by its cookie."""
+    """Views that remember: what was said of the last visits, and which recordings are being finished."""
 
-    def __init__(self, tables: Tables, secure: bool) -> None:
-        self._tables = tables
-        self.cookie = Cookie(secure, "pbl_phone")
+    def __init__(self) -> None:
+        #: Answers by visit and language, and the gain of one more pass by visit, with the rows that they are of.
+        self._said: dict[tuple[int, str], tuple[dict[str, str], tuple[bytes, str]]] = {}
+        self._worth: dict[int, tuple[list[str | None], Next | None]] = {}
+        #: Of each visit one recording at a time is finished; of all, as many are opened at once.
+        self._finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
+        self._opening = asyncio.Semaphore(_OPENED_AT_ONCE)
 
-    async def find(self, request: Request) -> Phone | None:
-        """Return the phone; None for a browser that opened no link. Raises `PblError` PHONE_LINK for one whose link
-        has ended."""
-        cookie = self.cookie.of(request)
-        return await self._tables.ask(phone_recordings.phone_of, cookie) if cookie else None
-
-
-def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue, target: Target) -> list[Address]:
-    #: Of each visit one recording at a time is finished; of all, as many are opened at once.
-    finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
-    opening = asyncio.Semaphore(_OPENED_AT_ONCE)
-
-    async def make(request: Request) -> Response:
-        fields = await form_of(request)
-        number, hours = number_of(request), fields.get("hours", "")
-        if hours not in HOURS:
-            raise Refused("form")
-        make_link = functools.partial(phone_recordings.make_link, protocol=fields.get("protocol") or None)
-        link, key = await tables.ask(make_link, number, sender(request), float(hours))
-        page = f"{request.url.scheme}://{request.headers['host']}/phone"
-        address, trust = f"{page}/open?key={key}", f"{page}/authority.crt"
-        shown = {
-            "number": number,
-            "link": link,
-            "address": address,
-            "hours": hours,
-            "secure": request.url.scheme == "https",
-            "trust": qr_code(trust) if certificates.authority().is_file() else "",
-        }
-        return pages.show(request, "film.html", code=qr_code(address), **shown)
-
-    async def end(request: Request) -> Response:
-        fields = await form_of(request)
-        number = number_of(request)
-        if (link := whole_number(fields.get("link", ""))) is None:
-            raise Refused("form")
-        await tables.ask(phone_recordings.end_link, number, link)
-        return RedirectResponse(f"/visits/{number}#film", 303)
-
-    async def ask(request: Request) -> Response:
-        """Ask whether this is the phone: what only looks at an address (a preview, HEAD) does not take the link."""
-        key = request.query_params.get("key", "")
-        if await tables.ask(phone_recordings.is_open, key, phones.cookie.of(request)):
-            return RedirectResponse("/phone", 303)
-        return pages.show(request, "open.html", key=key)
-
-    async def opened(request: Request) -> Response:
-        key, mine = (await read_form(request)).get("key", ""), phones.cookie.of(request)
-        cookie = await tables.ask(phone_recordings.use_link, key, mine)
-        response = RedirectResponse("/phone", 303)
-        if cookie is not None:
-            phones.cookie.set(response, cookie, int(3600 * MOST_HOURS))
-        return response
-
-    async def page(request: Request) -> Response:
-        from pbl_pipeline.gait import ACTIVITIES, PACES
-
-        every = texts.catalogue()
-        said = {
-            **{f"is_{name}": {k: capital(v) for k, v in every[f"library.{name}"].items()} for name in ACTIVITIES},
-            **{f"is_{name}": every[f"library.{name}"] for name in PACES},
-            **{name.removeprefix(_SAID): own for name, own in every.items() if name.startswith(_SAID)},
-        }
-        usual = usual_words(reader_language(request), await tables.ask(usual_seconds))
-        values = {"phone": request.state.phone, "words": json.dumps(said), "usual": usual, "part_bytes": PART_BYTES}
-        return pages.show(request, "capture.html", 200, _MAY, **values)
-
-    async def state(request: Request) -> Response:
+    async def state(self, request: Request) -> Response:
         phone: Phone = request.state.phone
-        body, tag = await tables.ask(answer, phone.session_id, reader_language(request))
+        body, tag = await site.ask(request, self._answer, phone.session_id, reader_language(request))
         headers = {"etag": tag}
         if tag in request.headers.get("if-none-match", ""):  # a proxy may have called it weak
             return Response(status_code=304, headers=headers)
         return Response(body, media_type="application/json", headers=headers)
 
-    #: What was said of the last visits, by language, and the gain of one more pass, with the rows that they are of.
-    said: dict[tuple[int, str], tuple[dict[str, str], tuple[bytes, str]]] = {}
-    worth: dict[int, tuple[list[str | None], Next | None]] = {}
-
-    def answer(session_id: int, language: str) -> tuple[bytes, str]:
+    def _answer(self, session_id: int, language: str) -> tuple[bytes, str]:
         """Return what a phone is told of its visit, and the tag of that text."""
         rows = state_of(session_id)
-        if (kept := said.get((session_id, language))) is not None and kept[0] == rows:
+        if (kept := self._said.get((session_id, language))) is not None and kept[0] == rows:
             return kept[1]
-        if len(said) >= _KEPT:
-            said.clear()
-            worth.clear()
+        if len(self._said) >= _KEPT:
+            self._said.clear()
+            self._worth.clear()
         results = [rows.get(name) for name in RESULTS]
-        if session_id not in worth or worth[session_id][0] != results:
-            worth[session_id] = results, next_pass(session_id)
+        if session_id not in self._worth or self._worth[session_id][0] != results:
+            self._worth[session_id] = results, next_pass(session_id)
         sent = phone_recordings.recordings(session_id)
         told = {
             "visit": session_id,
             "recordings": [_shown(language, one, judged) for one, judged in sent],
             "checked": sum(judged is not None and judged.state == PENDING for _, judged in sent),
-            "next": next_words(language, worth[session_id][1]),
+            "next": next_words(language, self._worth[session_id][1]),
             "protocol": [dataclasses.asdict(step) for step in steps_of(session_id, sent)],
         }
         body = json.dumps(told).encode()
-        said[session_id, language] = rows, (body, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
-        return said[session_id, language][1]
+        self._said[session_id, language] = rows, (body, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+        return self._said[session_id, language][1]
 
-    async def begin(request: Request) -> Response:
-        try:
-            stated = parse_json((await _body(request, "application/json", BODY_BYTES)).decode())
-        except ValueError:
-            raise Refused("form") from None
-        sent = await tables.ask(phone_recordings.begin, request.state.phone, stated)
-        return await told(request, sent)
-
-    async def part(request: Request) -> Response:
-        sent = await recording(request)
-        found = _RANGE.fullmatch(request.headers.get("content-range", ""))
-        if found is None:
-            raise Refused("form")
-        number = phone_uploads.check_part(sent, *(int(n) for n in found.groups()))
-        body = await _body(request, "application/octet-stream", PART_BYTES)
-        if len(body) != int(found[2]) - int(found[1]) + 1:
-            raise phone_recordings.upload_refused("a part of another length than it states")
-        sha256 = request.headers.get("x-sha256", "")
-        await _on_disk(phone_uploads.keep_part, request.state.phone, sent, number, body, sha256)
-        try:
-            sent = await recording(request)
-        except PblError as error:
-            await removed(request, sent, error)
-            raise
-        if sent.state != UPLOADING:  # it was finished while this part came again
-            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
-        return Response(status_code=204)
-
-    async def finish(request: Request) -> Response:
+    async def finish(self, request: Request) -> Response:
         await _body(request, "application/json", BODY_BYTES)
         phone: Phone = request.state.phone
-        async with finishing.setdefault(phone.session_id, asyncio.Lock()):
+        async with self._finishing.setdefault(phone.session_id, asyncio.Lock()):
             sent = await recording(request)
             if sent.state == UPLOADING:
                 try:
-                    async with opening:
+                    async with self._opening:
                         copies = await _on_disk(phone_uploads.put_together, phone, sent)
-                    await tables.ask(phone_uploads.register, phone, sent, copies)
+                    await site.ask(request, phone_uploads.register, phone, sent, copies)
                 except PblError as error:
                     await asyncio.to_thread(phone_uploads.remove_joined, phone, sent)
                     if not error.final:
                         if error.code == "MACHINE_SHORT":
                             log.warning("recording %d of visit %d: %s", sent.number, phone.session_id, error.short())
-                            await tables.ask(phone_recordings.not_yet, sent.number, error)
+                            await site.ask(request, phone_recordings.not_yet, sent.number, error)
                         await removed(request, sent, error)
                         raise
-                    await tables.ask(phone_recordings.refused, sent.number, error)
+                    await site.ask(request, phone_recordings.refused, sent.number, error)
                     await asyncio.to_thread(phone_uploads.discard, phone, sent)
                 else:
                     with contextlib.suppress(PblError):  # others wait: its jobs are the first in the queue
-                        compute(computing, target, phone.session_id, False)
+                        compute(request, phone.session_id, False)
         return await told(request, await recording(request))
 
-    async def recording(request: Request) -> Sent:
-        return await tables.ask(phone_recordings.recording, request.state.phone, number_of(request))
 
-    async def removed(request: Request, sent: Sent, error: PblError) -> None:
-        """Remove the parts of a recording whose visit was removed while they came."""
-        if error.code == "DB_NOT_FOUND":
-            await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
-
-    async def told(request: Request, sent: Sent) -> Response:
-        missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
-        if len(missing) == sent.n_parts:
-            begun = await tables.ask(phone_recordings.begun_bytes, UNFINISHED_DAYS)
-            try:
-                await _on_disk(phone_uploads.check_promised, begun, _NEXT_STEP)
-            except PblError:
-                await tables.ask(phone_recordings.not_begun, sent.number)
-                await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
-                raise
-        return JSONResponse({**_shown(reader_language(request), sent, None), "missing": missing})
-
-    async def worker(request: Request) -> Response:
-        """Serve a script of a separate thread below the page's address, so that it is also available offline."""
-        path = Path(__file__).parent / "static" / f"capture_{request.url.path.rpartition('/')[2]}"
-        return FileResponse(path, media_type="text/javascript", headers={"service-worker-allowed": "/phone"})
-
-    async def authority(request: Request) -> Response:
-        if not certificates.authority().is_file():
-            raise HTTPException(404)
-        return FileResponse(
-            certificates.authority(), media_type="application/x-x509-ca-cert", filename="laboratory.crt"
-        )
-
+def routes() -> list[Address]:
+    phones = Phones()
     return [
         Address("/visits/{session_id:int}/film", make, "decide", methods=["POST"]),
         Address("/visits/{session_id:int}/film/end", end, "decide", methods=["POST"]),
@@ -269,10 +262,10 @@ def routes(pages: Pages, tables: Tables, phones: Phones, computing: ProcessQueue
         Address("/phone/offline.js", worker, OPEN),
         Address("/phone/store.js", worker, OPEN),
         Address("/phone/authority.crt", authority, OPEN),
-        Address("/phone/state.json", state, FILM),
+        Address("/phone/state.json", phones.state, FILM),
         Address("/phone/recordings.json", begin, FILM, methods=["POST"]),
         Address("/phone/recordings/{phone_recording:int}.json", part, FILM, methods=["PUT"]),
-        Address("/phone/finish/{phone_recording:int}.json", finish, FILM, methods=["POST"]),
+        Address("/phone/finish/{phone_recording:int}.json", phones.finish, FILM, methods=["POST"]),
     ]
 
 

@@ -21,12 +21,13 @@ from .. import browser_uploads
 from ..browser_uploads import Arriving, Outcome, Place
 from ..incoming import VIDEO_ENDINGS, Copy, check_room
 from ..refresh import queue_visit
+from . import pages, site
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
 from .connections import MORE_TIME
 from .multipart import Part, is_multipart, parts
-from .pages import NOTHING, Pages, in_field, reader_language
-from .tables import Tables, on_disk
+from .pages import NOTHING, in_field, reader_language
+from .tables import on_disk
 
 #: Bytes that are written at a time; seconds in which registration waits for an import of the drop folder.
 _BLOCK, _WAIT_S = 2**20, 60.0
@@ -44,132 +45,118 @@ _no_file = functools.partial(
 )
 
 
-def routes(pages: Pages, tables: Tables) -> list[Address]:
-    async def new(request: Request) -> Response:
-        today = f"{datetime.datetime.now():%Y-%m-%d}"  # the day where the clinic is
-        return await new_page(request, {"visit": today})
+async def new(
+    request: Request, values: Mapping[str, str] | None = None, errors: Mapping[str, PblError] = NOTHING
+) -> Response:
+    values = {"visit": f"{datetime.datetime.now():%Y-%m-%d}"} if values is None else values  # today where the clinic is
+    known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
+    longest = {**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]}
+    more = {"usual_roles": visit_forms.USUAL_ROLES, "populations": await site.ask(request, _populations)}
+    return pages.show(request, "new_visit.html", values=known, errors=errors, longest=longest, **more)
 
-    async def new_page(
-        request: Request, values: Mapping[str, str], errors: Mapping[str, PblError] = NOTHING
-    ) -> Response:
-        known = {name: values.get(name, "") for name in (*visit_forms.NEW, "height_m", visit_forms.DISTINCT)}
-        return pages.show(
-            request,
-            "new_visit.html",
-            values=known,
-            errors=errors,
-            longest={**visit_forms.NEW, "height_m": visit_forms.FACTS["height_m"]},
-            usual_roles=visit_forms.USUAL_ROLES,
-            populations=await tables.ask(_populations),
+
+async def register(request: Request) -> Response:
+    fields = await form_of(request)
+    number, errors = await site.ask(request, visit_forms.register_visit, fields, sender(request))
+    if errors:
+        return await new(request, fields, errors)
+    if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
+        await site.ask(request, _queue_visits_of_person, number)
+    return RedirectResponse(f"/visits/{number}", 303)
+
+
+async def facts(
+    request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
+) -> Response:
+    from pbl_pipeline.gait import ACTIVITIES, PACES
+
+    stored, language = await site.ask(request, visit_forms.facts_form, number_of(request)), reader_language(request)
+    numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
+    words = {n: texts.coded(language, n, stored.values[n]) for n in ("population", "orthosis")}
+    values = {**stored.values, **numbers, **words, **values}
+    more = {"longest": visit_forms.FACTS, "choices": {"activity": ACTIVITIES, "pace": PACES}}
+    more["populations"] = await site.ask(request, _populations)
+    return pages.show(request, "facts.html", facts=stored, values=values, errors=errors, **more)
+
+
+async def correct(request: Request) -> Response:
+    fields = dict(await form_of(request))
+    number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
+    changed, errors = await site.ask(request, visit_forms.correct_facts, number, fields, sender(request), seen, reason)
+    if errors:
+        return await facts(request, fields, errors)
+    if changed:
+        await site.ask(request, _queue_visits_of_person if "height_m" in changed else queue_visit, number)
+    return RedirectResponse(f"/visits/{number}", 303)
+
+
+async def upload(request: Request) -> Response:
+    return upload_page(request, await site.ask(request, browser_uploads.place, number_of(request)), {}, [])
+
+
+def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
+    from pbl_pipeline.gait import ACTIVITIES, PACES
+
+    values = {"activity": "walking", "pace": "", **values}
+    more = {"choices": {"activity": ACTIVITIES, "pace": PACES}, "accepted": ", ".join(VIDEO_ENDINGS)}
+    return pages.show(request, "upload.html", to=to, values=values, outcomes=outcomes, **more)
+
+
+async def send(request: Request) -> Response:
+    if not is_multipart(request):
+        await form_of(request)
+        raise Refused("form")
+    to = await site.ask(request, browser_uploads.place, number_of(request))
+    request.scope.get(MORE_TIME, lambda: None)()
+    await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
+    arriving: list[Arriving] = []
+    try:
+        fields, outcomes, whole = await _receive(request, to, arriving)
+        stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
+        good = []
+        videos = {Path(one.name).stem for one, _ in whole if not one.is_log}
+        for one, copy in whole:
+            # A log alone is refused as such.
+            alone = one.is_log and Path(one.name).stem not in videos
+            error = None if alone else await _on_disk(browser_uploads.check, one)
+            if error is None:
+                good.append((one, copy))
+            else:
+                outcomes.append(Outcome(one.name, "refused", error=error))
+        if not whole and not outcomes:
+            outcomes.append(Outcome("", "refused", error=_no_file()))
+        outcomes += await taken_in(request, to, good, stated)
+    finally:
+        for one in arriving:
+            await asyncio.to_thread(one.discard)
+    if any(one.video_id is not None for one in outcomes):
+        await site.ask(request, queue_visit, to.session_id)
+    if all(one.status == "registered" for one in outcomes):
+        return RedirectResponse(f"/visits/{to.session_id}", 303)
+    return upload_page(request, to, stated, outcomes)
+
+
+async def taken_in(
+    request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
+) -> list[Outcome]:
+    for _ in range(int(_WAIT_S) if good else 0):
+        done = await site.ask(
+            request, browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
         )
+        if done is not None:
+            return done
+        await asyncio.sleep(1.0)
+    return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
 
-    async def register(request: Request) -> Response:
-        fields = await form_of(request)
-        number, errors = await tables.ask(visit_forms.register_visit, fields, sender(request))
-        if errors:
-            return await new_page(request, fields, errors)
-        if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
-            await tables.ask(_queue_visits_of_person, number)
-        return RedirectResponse(f"/visits/{number}", 303)
 
-    async def facts(
-        request: Request, values: Mapping[str, str] = NOTHING, errors: Mapping[str, PblError] = NOTHING
-    ) -> Response:
-        from pbl_pipeline.gait import ACTIVITIES, PACES
-
-        stored, language = await tables.ask(visit_forms.facts_form, number_of(request)), reader_language(request)
-        numbers = {n: in_field(language, stored.values[n]) for n in ("height_m", "mass_kg")}
-        words = {n: texts.coded(language, n, stored.values[n]) for n in ("population", "orthosis")}
-        return pages.show(
-            request,
-            "facts.html",
-            facts=stored,
-            values={**stored.values, **numbers, **words, **values},
-            errors=errors,
-            longest=visit_forms.FACTS,
-            choices={"activity": ACTIVITIES, "pace": PACES},
-            populations=await tables.ask(_populations),
-        )
-
-    async def correct(request: Request) -> Response:
-        fields = dict(await form_of(request))
-        number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-        changed, errors = await tables.ask(visit_forms.correct_facts, number, fields, sender(request), seen, reason)
-        if errors:
-            return await facts(request, fields, errors)
-        if changed:
-            await tables.ask(_queue_visits_of_person if "height_m" in changed else queue_visit, number)
-        return RedirectResponse(f"/visits/{number}", 303)
-
-    async def upload(request: Request) -> Response:
-        return upload_page(request, await tables.ask(browser_uploads.place, number_of(request)), {}, [])
-
-    def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
-        from pbl_pipeline.gait import ACTIVITIES, PACES
-
-        return pages.show(
-            request,
-            "upload.html",
-            to=to,
-            values={"activity": "walking", "pace": "", **values},
-            outcomes=outcomes,
-            choices={"activity": ACTIVITIES, "pace": PACES},
-            accepted=", ".join(VIDEO_ENDINGS),
-        )
-
-    async def send(request: Request) -> Response:
-        if not is_multipart(request):
-            await form_of(request)
-            raise Refused("form")
-        to = await tables.ask(browser_uploads.place, number_of(request))
-        request.scope.get(MORE_TIME, lambda: None)()
-        await _on_disk(check_room, int(request.headers.get("content-length", "0")), _NEXT_STEP)
-        arriving: list[Arriving] = []
-        try:
-            fields, outcomes, whole = await _receive(request, to, arriving)
-            stated = {name: fields.get(name, "")[:100] for name in ("activity", "pace")}
-            good = []
-            videos = {Path(one.name).stem for one, _ in whole if not one.is_log}
-            for one, copy in whole:
-                # A log alone is refused as such.
-                alone = one.is_log and Path(one.name).stem not in videos
-                error = None if alone else await _on_disk(browser_uploads.check, one)
-                if error is None:
-                    good.append((one, copy))
-                else:
-                    outcomes.append(Outcome(one.name, "refused", error=error))
-            if not whole and not outcomes:
-                outcomes.append(Outcome("", "refused", error=_no_file()))
-            outcomes += await taken_in(request, to, good, stated)
-        finally:
-            for one in arriving:
-                await asyncio.to_thread(one.discard)
-        if any(one.video_id is not None for one in outcomes):
-            await tables.ask(queue_visit, to.session_id)
-        if all(one.status == "registered" for one in outcomes):
-            return RedirectResponse(f"/visits/{to.session_id}", 303)
-        return upload_page(request, to, stated, outcomes)
-
-    async def taken_in(
-        request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
-    ) -> list[Outcome]:
-        for _ in range(int(_WAIT_S) if good else 0):
-            done = await tables.ask(
-                browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
-            )
-            if done is not None:
-                return done
-            await asyncio.sleep(1.0)
-        return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
-
-    return [
-        *page("/visits/new", new, "decide"),
-        Address("/visits/new", register, "decide", methods=["POST"]),
-        *page("/visits/{session_id:int}/facts", facts, "look"),
-        Address("/visits/{session_id:int}/facts", correct, "decide", methods=["POST"]),
-        *page("/visits/{session_id:int}/upload", upload, "decide"),
-        Address("/visits/{session_id:int}/upload", send, "decide", methods=["POST"]),
-    ]
+ROUTES = [
+    *page("/visits/new", new, "decide"),
+    Address("/visits/new", register, "decide", methods=["POST"]),
+    *page("/visits/{session_id:int}/facts", facts, "look"),
+    Address("/visits/{session_id:int}/facts", correct, "decide", methods=["POST"]),
+    *page("/visits/{session_id:int}/upload", upload, "decide"),
+    Address("/visits/{session_id:int}/upload", send, "decide", methods=["POST"]),
+]
 
 
 async def _receive(

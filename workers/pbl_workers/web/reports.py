@@ -17,64 +17,69 @@ from pbl_schemas.reading import shown as reading
 from pbl_schemas.reading.visit_state import results_state
 
 from .. import on_request
-from ..process_queue import ProcessQueue, Task, Work
+from ..process_queue import Task, Work
+from . import pages, site
 from .access import REPORT_POLICY
 from .address import Address, number_of, shown_of
-from .pages import Pages, reader_language
-from .tables import Tables
+from .pages import reader_language
 
 #: Time (s) and memory (byte) that one file may take: a minute of 4K video is drawn in a few minutes.
 SECONDS, N_BYTES = 3600.0, 8 * 2**30
 
 
-def routes(pages: Pages, tables: Tables, making: ProcessQueue) -> list[Address]:
-    async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: Any) -> Work:
-        """The work that a request is about, begun where it was not. Raises what stopped it, once."""
-        wanted = await tables.ask(key, *args)
-        work = making.find(wanted)
-        if work is None:
-            work = making.begin(wanted, await tables.ask(load, *args))
-        if work.error is not None:
-            making.drop(wanted)
-            raise work.error
-        return work
+async def work_of(request: Request, key: Callable[..., Any], load: Callable[..., Task], *args: Any) -> Work:
+    """The work that a request is about, begun where it was not. Raises what stopped it, once."""
+    making, wanted = site.of(request).making, await site.ask(request, key, *args)
+    work = making.find(wanted)
+    if work is None:
+        work = making.begin(wanted, await site.ask(request, load, *args))
+    if work.error is not None:
+        making.drop(wanted)
+        raise work.error
+    return work
 
-    async def overlay(request: Request) -> Response:
-        number = number_of(request)
-        about = await tables.ask(reading.shown_recording, number)
-        work = await work_of(request, overlay_key, load_overlay, number)
-        return pages.show(request, "overlay.html", about=about, work=work)
 
-    async def overlay_file(request: Request) -> Response:
-        number = number_of(request)
-        work = making.find(await tables.ask(overlay_key, number))
-        if work is None or work.path is None:
-            return RedirectResponse(f"/recordings/{number}/overlay", 303)
-        return FileResponse(work.path, media_type="video/mp4", filename=f"recording_{number}_overlay.mp4",
-                            content_disposition_type="inline")  # fmt: skip
+async def overlay(request: Request) -> Response:
+    number = number_of(request)
+    about = await site.ask(request, reading.shown_recording, number)
+    work = await work_of(request, overlay_key, load_overlay, number)
+    return pages.show(request, "overlay.html", about=about, work=work)
 
-    async def report(request: Request) -> Response:
-        number, shown = number_of(request), shown_of(request)
-        work = await work_of(request, report_key, load_report, number, shown, reader_language(request))
-        if work.path is None:
-            return pages.show(request, "report_made.html", number=number, shown=shown, work=work)
-        headers = {"content-security-policy": REPORT_POLICY}
-        return FileResponse(work.path, media_type="text/html; charset=utf-8", headers=headers)
 
-    async def overlay_state(request: Request) -> Response:
-        return state(making.find(await tables.ask(overlay_key, number_of(request))))
+async def overlay_file(request: Request) -> Response:
+    number = number_of(request)
+    work = site.of(request).making.find(await site.ask(request, overlay_key, number))
+    if work is None or work.path is None:
+        return RedirectResponse(f"/recordings/{number}/overlay", 303)
+    return FileResponse(work.path, media_type="video/mp4", filename=f"recording_{number}_overlay.mp4",
+                        content_disposition_type="inline")  # fmt: skip
 
-    async def report_state(request: Request) -> Response:
-        key = await tables.ask(report_key, number_of(request), shown_of(request), reader_language(request))
-        return state(making.find(key))
 
-    return [
-        Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
-        Address("/recordings/{video_id:int}/overlay/file", overlay_file, "look", look="overlay"),
-        Address("/recordings/{video_id:int}/overlay/state", overlay_state, "look", look="overlay"),
-        Address("/visits/{session_id:int}/report", report, "look", look="report"),
-        Address("/visits/{session_id:int}/report/state", report_state, "look", look="report"),
-    ]
+async def report(request: Request) -> Response:
+    number, shown = number_of(request), shown_of(request)
+    work = await work_of(request, report_key, load_report, number, shown, reader_language(request))
+    if work.path is None:
+        return pages.show(request, "report_made.html", number=number, shown=shown, work=work)
+    headers = {"content-security-policy": REPORT_POLICY}
+    return FileResponse(work.path, media_type="text/html; charset=utf-8", headers=headers)
+
+
+async def overlay_state(request: Request) -> Response:
+    return state(site.of(request).making.find(await site.ask(request, overlay_key, number_of(request))))
+
+
+async def report_state(request: Request) -> Response:
+    key = await site.ask(request, report_key, number_of(request), shown_of(request), reader_language(request))
+    return state(site.of(request).making.find(key))
+
+
+ROUTES = [
+    Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
+    Address("/recordings/{video_id:int}/overlay/file", overlay_file, "look", look="overlay"),
+    Address("/recordings/{video_id:int}/overlay/state", overlay_state, "look", look="overlay"),
+    Address("/visits/{session_id:int}/report", report, "look", look="report"),
+    Address("/visits/{session_id:int}/report/state", report_state, "look", look="report"),
+]
 
 
 def state(work: Work | None) -> Response:

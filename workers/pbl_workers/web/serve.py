@@ -22,9 +22,10 @@ from pbl_pipeline.names import check_label
 
 from .access import Sessions, host_name
 from .accounts import Accounts
-from .app import Options, create_app
+from .app import create_app
 from .connections import Connection
 from .folder import ResultsFolder
+from .site import Options
 
 #: Addresses of this machine alone, and those that mean all of its addresses.
 LOOPBACK, EVERYWHERE = ("127.0.0.1", "::1", "localhost"), ("0.0.0.0", "::", "")  # noqa: S104
@@ -219,17 +220,14 @@ def config(app: object, where: Where) -> uvicorn.Config:
 def _opened_by_links(where: Where, port: int, options: Options, visit: int | None) -> object:
     shown = f"[{where.host}]" if ":" in where.host else where.host
     to = f"&to=/visits/{visit}" if visit is not None else ""
-
-    def say(key: str) -> None:
-        click.echo(f"open once: http://{shown}:{port}/enter?key={key}{to}")
+    link = f"open once: http://{shown}:{port}/enter?key="
 
     def used(key: str) -> None:
-        click.echo("The link was used. For another browser:")
-        say(key)
+        click.echo(f"The link was used. For another browser:\n{link}{key}{to}")
 
     sessions = Sessions()
     app = create_app(dataclasses.replace(options, on_entry=used), sessions)
-    say(sessions.new_link(options.name, *options.roles))
+    click.echo(f"{link}{sessions.new_link(options.name, *options.roles)}{to}")
     return app
 
 

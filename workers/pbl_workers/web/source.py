@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import threading
 from collections.abc import Hashable, Sequence
 from pathlib import Path
@@ -11,17 +12,35 @@ from typing import Any, Protocol
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import Visit
-from pbl_schemas import privacy, video
-from pbl_schemas.decisions import candidates, review_decisions
+from pbl_pipeline.words import UNUSABLE
+from pbl_schemas import fit, privacy, video
+from pbl_schemas.decisions import candidates, event_corrections, not_usable, review_decisions
 from pbl_schemas.intake import phone_recordings, protocols
 from pbl_schemas.reading import shown
 from pbl_schemas.reading.usable import usual_seconds
 from pbl_schemas.reading.visit_progress import Progress, visit_progress
 
-from .corrections import Judged, judged
-
 #: De-identified copies out of a remote store that are kept on this disk at a time.
 _KEPT = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """Decisions about a recording, and the state in which the page shows it. views: videos of its trial, which are
+    marked together; events: those that count, None if none were searched."""
+
+    mark: not_usable.Unusable | None
+    usable_state: str
+    views: int
+    events: event_corrections.ShownEvents | None
+    reasons: tuple[str, ...] = tuple(UNUSABLE)
+
+
+def judged(video_id: int) -> Judged:
+    """Return the decisions about a registered recording. Reads tables."""
+    views = fit.videos_of(fit.trial_of(video_id))
+    mark = not_usable.unusable([video_id]).get(video_id)
+    return Judged(mark, review_decisions.usable_state(video_id), len(views), event_corrections.shown_events(video_id))
 
 
 class Videos:
@@ -103,12 +122,15 @@ class Source(Protocol):
         """Return the surroundings of a visit on its page: decisions, accepted checks, entered scores."""
         return {"decisions": None, "accepted": {}, "entry": None, "film": None}
 
+    def close(self) -> None:
+        """Remove what was fetched for it."""
+
 
 class TablesSource:
     """The visits of the tables."""
 
-    def __init__(self, videos: Videos) -> None:
-        self._videos = videos
+    def __init__(self) -> None:
+        self._videos = Videos()
 
     visit = staticmethod(shown.shown_visit)
     recording = staticmethod(shown.shown_recording)
@@ -123,6 +145,9 @@ class TablesSource:
         about = shown.computed_visit(number, result)
         assert about.visit is not None
         return about.visit
+
+    def close(self) -> None:
+        self._videos.close()
 
     def people(self, about: shown.ShownRecording) -> tuple[Sequence[candidates.Candidates], list[str]]:
         """Return as `Source.people`; nothing before people are searched."""

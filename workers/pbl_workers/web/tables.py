@@ -21,8 +21,11 @@ class Asks(Protocol):
         """The answer of a function that reads or writes."""
         ...
 
+    def close(self) -> None:
+        """Accept no further questions."""
 
-class Files:
+
+class Files(Asks):
     """Asks questions of files, several at a time."""
 
     async def ask(self, question: Callable[..., T], *args: Any) -> T:

@@ -12,36 +12,36 @@ from pbl_pipeline import charts, texts
 from pbl_pipeline.words import MEASURES, TASKS, capital
 from pbl_schemas.reading.trend import INDEX, Point, trend_of
 
-from .address import Address, number_of, page
-from .pages import Pages, as_json, plain, reader_language
-from .tables import Tables
+from . import pages, site
+from .address import number_of, page
+from .pages import as_json, plain, reader_language
 
 
-def routes(pages: Pages, tables: Tables) -> list[Address]:
-    async def trend(request: Request) -> Response:
-        found = await tables.ask(trend_of, number_of(request), request.query_params.get("measure", INDEX))
-        if as_json(request):
-            return pages.show(request, "", found=plain(found))
-        language = reader_language(request)
-        activity, _, name = found.measure.rpartition(".")
-        words, unit, decimals = ("", "", 1) if found.measure == INDEX else (MEASURES | TASKS)[name]
-        title = ": ".join(capital(texts.library_words(language, w)) for w in (activity, words) if w)
-        title = title or texts.text(language, "visit.gdi")
-        label = texts.text(language, "trend.chart", name=title, n=len(found.points))
-        picture = _chart(label, found.points, found.measure == INDEX)
-        return pages.show(
-            request,
-            "trend.html",
-            here=number_of(request),
-            found=found,
-            title=title,
-            unit=unit,
-            decimals=decimals,
-            picture=picture and texts.in_chart(language, picture),
-            index=INDEX,
-        )
+async def trend(request: Request) -> Response:
+    found = await site.ask(request, trend_of, number_of(request), request.query_params.get("measure", INDEX))
+    if as_json(request):
+        return pages.show(request, "", found=plain(found))
+    language = reader_language(request)
+    activity, _, name = found.measure.rpartition(".")
+    words, unit, decimals = ("", "", 1) if found.measure == INDEX else (MEASURES | TASKS)[name]
+    title = ": ".join(capital(texts.library_words(language, w)) for w in (activity, words) if w)
+    title = title or texts.text(language, "visit.gdi")
+    label = texts.text(language, "trend.chart", name=title, n=len(found.points))
+    picture = _chart(label, found.points, found.measure == INDEX)
+    return pages.show(
+        request,
+        "trend.html",
+        here=number_of(request),
+        found=found,
+        title=title,
+        unit=unit,
+        decimals=decimals,
+        picture=picture and texts.in_chart(language, picture),
+        index=INDEX,
+    )
 
-    return page("/visits/{session_id:int}/trend", trend, "look", look="trend")
+
+ROUTES = page("/visits/{session_id:int}/trend", trend, "look", look="trend")
 
 
 def _chart(label: str, points: Sequence[Point], is_index: bool) -> Markup | None:

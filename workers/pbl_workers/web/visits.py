@@ -38,13 +38,12 @@ from pbl_schemas.reading import visit_list
 from pbl_schemas.reading.shown import ShownVisit
 from pbl_schemas.subject_codes import day_of
 
+from . import pages, site
 from .access import Session, form_of
 from .address import Address, interval, number_of, page, shown_of
 from .computing import told as told_of
-from .pages import Pages, as_json, plain, reader_language
+from .pages import as_json, plain, reader_language
 from .phone import usual_words, verdict
-from .source import Source
-from .tables import Asks, Tables
 
 #: Angles of the first screen: those of the index of three angles, and the ankle.
 SHOWN = ("hip_flexion", "hip_adduction", "knee_flexion", "ankle_dorsiflexion")
@@ -115,32 +114,32 @@ def norm_people(norm: str) -> int | None:
 _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
-def routes(pages: Pages, asks: Asks, source: Source) -> list[Address]:
-    """Return the addresses of a visit and of its letter for the record, which tables and folder have."""
+async def visit(request: Request) -> Response:
+    about = await site.ask(request, site.of(request).source.visit, number_of(request), shown_of(request))
+    told = told_of(request, await site.ask(request, site.of(request).source.progress, about.row.session_id))
+    values = {"about": about, "told": told, **await site.ask(request, site.of(request).source.around, about)}
+    values |= await site.ask(request, _drawn, about, reader_language(request))
+    if as_json(request):  # loads arrays, which not every thread may
+        values = await site.ask(request, plain, values)
+    shown = {"interval": interval, "sided": SIDED, "verdict": verdict, "usual_words": usual_words}
+    return pages.show(request, "visit.html", **shown, **values)
 
-    async def visit(request: Request) -> Response:
-        about = await asks.ask(source.visit, number_of(request), shown_of(request))
-        told = told_of(request, await asks.ask(source.progress, about.row.session_id))
-        values = {"about": about, "told": told, **await asks.ask(source.around, about)}
-        values |= await asks.ask(_drawn, about, reader_language(request))
-        if as_json(request):  # loads arrays, which not every thread may
-            values = await asks.ask(plain, values)
-        shown = {"interval": interval, "sided": SIDED, "verdict": verdict, "usual_words": usual_words}
-        return pages.show(request, "visit.html", **shown, **values)
 
-    async def letter(request: Request) -> Response:
-        about = await asks.ask(source.visit, number_of(request), shown_of(request))
-        values = {"about": about, **await asks.ask(source.around, about)}
-        values |= await asks.ask(_drawn, about, reader_language(request))
-        values["pictures"] = [] if about.visit is None else await asks.ask(overview, about.visit)
-        more = {"interval": interval, "sided": SIDED, "version": code_version(), "head": settings.letter_head()}
-        more["now"] = datetime.datetime.now(datetime.UTC)
-        return pages.show(request, "letter.html", **values, **more)
+async def letter(request: Request) -> Response:
+    about = await site.ask(request, site.of(request).source.visit, number_of(request), shown_of(request))
+    values = {"about": about, **await site.ask(request, site.of(request).source.around, about)}
+    values |= await site.ask(request, _drawn, about, reader_language(request))
+    values["pictures"] = [] if about.visit is None else await site.ask(request, overview, about.visit)
+    more = {"interval": interval, "sided": SIDED, "version": code_version(), "head": settings.letter_head()}
+    more["now"] = datetime.datetime.now(datetime.UTC)
+    return pages.show(request, "letter.html", **values, **more)
 
-    return [
-        *page("/visits/{session_id:int}", visit, "look"),
-        Address("/visits/{session_id:int}/letter", letter, "look", look="letter"),
-    ]
+
+#: Of a visit and of its letter for the record, which tables and folder have.
+ROUTES = [
+    *page("/visits/{session_id:int}", visit, "look"),
+    Address("/visits/{session_id:int}/letter", letter, "look", look="letter"),
+]
 
 
 def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
@@ -156,35 +155,27 @@ def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
     return {"curves": found, "no_curves": None, "norm_people": norm_people(norm), "forces": forces}
 
 
-def list_routes(pages: Pages, tables: Tables) -> list[Address]:
-    async def visits(request: Request) -> Response:
-        session: Session = request.state.session
-        asked = dict(request.query_params)
-        wanted, bad = _filter(asked, session)
-        choices = await tables.ask(visit_list.choices)
-        for name in ("cohort", "role"):
-            bad = bad or (bool(getattr(wanted, name)) and getattr(wanted, name) not in choices[name])
-        after = _after(asked.get("after", ""))
-        listed = await tables.ask(visit_list.visit_page, wanted, after)
-        kept = {k: asked[k] for k in ("q", *_FIELDS) if asked.get(k)}
-        older = urlencode({**kept, "after": f"{listed.after[0]}~{listed.after[1]}"}) if listed.after else ""
-        return pages.show(
-            request,
-            "visits.html",
-            page=listed,
-            wanted=wanted,
-            choices={**choices, "quality": visit_list.OUTCOMES, "state": visit_list.STATES},
-            bad=bad,
-            older=older,
-            newest=urlencode(kept),
-            is_first=after is None,
-            interval=interval,
-        )
+async def visits(request: Request) -> Response:
+    session: Session = request.state.session
+    asked = dict(request.query_params)
+    wanted, bad = _filter(asked, session)
+    choices = await site.ask(request, visit_list.choices)
+    for name in ("cohort", "role"):
+        bad = bad or (bool(getattr(wanted, name)) and getattr(wanted, name) not in choices[name])
+    after = _after(asked.get("after", ""))
+    listed = await site.ask(request, visit_list.visit_page, wanted, after)
+    kept = {k: asked[k] for k in ("q", *_FIELDS) if asked.get(k)}
+    older = urlencode({**kept, "after": f"{listed.after[0]}~{listed.after[1]}"}) if listed.after else ""
+    choices |= {"quality": visit_list.OUTCOMES, "state": visit_list.STATES}
+    more = {"older": older, "newest": urlencode(kept), "is_first": after is None, "interval": interval}
+    return pages.show(request, "visits.html", page=listed, wanted=wanted, choices=choices, bad=bad, **more)
 
-    async def search(request: Request) -> Response:
-        return RedirectResponse(_address(request.state.session, await form_of(request)), 303)
 
-    return [*page("/visits", visits, "look"), Address("/visits", search, "look", methods=["POST"])]
+async def search(request: Request) -> Response:
+    return RedirectResponse(_address(request.state.session, await form_of(request)), 303)
+
+
+LIST_ROUTES = [*page("/visits", visits, "look"), Address("/visits", search, "look", methods=["POST"])]
 
 
 def _address(session: Session, fields: Mapping[str, str]) -> str:

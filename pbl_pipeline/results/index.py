@@ -1,0 +1,176 @@
+"""Index of a trial or a visit, and its Movement Analysis Profile."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Annotated
+
+from pbl_pipeline.qc import Check
+from pbl_pipeline.records import Column
+
+from .events import RIGHT, SIDES
+from .measures import Z90
+
+#: The paper's index, and the original one (Schwartz & Rozumalski 2008).
+GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
+#: The index of three angles by the paper's own recipe: the mean of the indices of all steps of a session, nothing taken
+#: back. Its components are those of norm and patients together in a set of `norm_from_cycles(pooled=...)`.
+PAPER_INDEX = "paper-2025"
+_NAMES = {
+    GDI_MODEL: "GDI of three angles",
+    PAPER_INDEX: "GDI of three angles, the paper's recipe",
+    GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)",
+}
+#: Numbers of an index: fields of `Gdi`, statistics of files.
+NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
+
+
+@dataclasses.dataclass(frozen=True)
+class VariableScore:
+    """Gait Variable Score (deg) of an angle, None for a side without cycles."""
+
+    angle: Annotated[str, Column("{}_angle", "varchar(32)", "name", key=True)]
+    left: Annotated[
+        float | None,
+        Column("{}_score_left", "float64", "(deg) root mean square distance from the normative mean curve", null=True),
+    ]
+    right: Annotated[float | None, Column("{}_score_right", "float64", "(deg)", null=True)]
+
+
+@dataclasses.dataclass(frozen=True)
+class MovementProfile:
+    """Gait Variable Scores (deg) per side and angle: together the Movement Analysis Profile.
+
+    A score is the root mean square, over the cycle, of the distance from the normative mean curve; of several cycles
+    their mean. `gps_left`, `gps_right` are the Gait Profile Scores of a side and `gps` that of the person, None unless
+    the norm has all nine angles (`NINE_ANGLES`). Empty sides have no scores.
+    """
+
+    left: dict[str, float]
+    right: dict[str, float]
+    gps_left: Annotated[float | None, Column("{}_gps_left", "float64", "(deg)", null=True)]
+    gps_right: Annotated[float | None, Column("{}_gps_right", "float64", "(deg)", null=True)]
+    gps: Annotated[
+        float | None,
+        Column(
+            "{}_gps",
+            "float64",
+            "(deg) Gait Profile Score of the person; null unless the norm has nine angles",
+            null=True,
+            before="gps_left",
+        ),
+    ]
+
+    def of_side(self, side: str) -> dict[str, float]:
+        """The scores of "left" or "right"."""
+        return self.right if side == RIGHT else self.left
+
+    def to_dict(self) -> dict:
+        """`profile_deg` of metrics.json."""
+        own = dataclasses.asdict(self)
+        sides = {side: {angle: _rounded(v) for angle, v in own.pop(side).items()} for side in SIDES}
+        return sides | {k: _rounded(v) for k, v in own.items()}
+
+    @property
+    def scores(self) -> tuple[VariableScore, ...]:
+        """The scores by angle."""
+        return tuple(VariableScore(k, self.left.get(k), self.right.get(k)) for k in {**self.left, **self.right})
+
+
+@dataclasses.dataclass(frozen=True)
+class GdiCycle:
+    """The index of one cycle. `z` is the standardised log distance; `explained` the fraction (0..1) of the squared
+    deviation from the normative mean that lies in the normative components; the rest does not count."""
+
+    trial: str
+    number: int
+    side: str
+    gdi: Annotated[float, Column("cycle_gdi", "float64", "(-)")]
+    z: Annotated[float, Column("cycle_z", "float64", "(-) standardised log distance to the normative mean")]
+    explained: Annotated[
+        float, Column("cycle_explained", "float64", "(0..1) share of the deviation that the index sees")
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gdi:
+    """The index of one trial or session, of its `n` used cycles; None if these are too few (`reason`).
+
+    `left`, `right` and `mean` are of the mean curves of each side and the mean of the two, or means over the cycles of
+    a side and over all (`GdiParams.average`). Status PASS or EMPTY. `profile`: deviation of each angle, None without an
+    index. `sd`: standard deviation of the error of `mean`, None if the angles' is not known; `minimal_change`: minimal
+    detectable change (90 %) between two visits filmed alike. `unshrunk`: the index without people's distribution as
+    prior knowledge of this person, for correlations and means over people; `mean` where that knows nothing of them
+    either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
+    """
+
+    status: Annotated[str, Column("{}_status", "enum('PASS', 'EMPTY')")]
+    reason: Annotated[str, Column("{}_reason", "varchar(1000)", "why there is no index")]
+    left: Annotated[float | None, Column("{}_left", "float64", "(-)", null=True)]
+    right: Annotated[float | None, Column("{}_right", "float64", "(-)", null=True)]
+    mean: Annotated[float | None, Column("{}", "float64", "(-) mean over all used cycles", null=True, before="left")]
+    n: Annotated[int, Column("{}_n", "int16", "cycles with an index", before="(end)")]
+    n_left: int
+    n_right: int
+    norm: str
+    model: str
+    params_hash: str
+    cycles: tuple[GdiCycle, ...]
+    qc: tuple[Check, ...]
+    profile: MovementProfile | None = None
+    sd: Annotated[float | None, Column("{}_sd", "float64", "(-) standard deviation of the error of {}", null=True)] = (
+        None
+    )
+    minimal_change: Annotated[
+        float | None,
+        Column(
+            "{}_minimal_change",
+            "float64",
+            "(-) minimal detectable change (90 percent) between two such visits",
+            null=True,
+        ),
+    ] = None
+    unshrunk: Annotated[
+        float | None,
+        Column(
+            "{}_unshrunk",
+            "float64",
+            "(-) not drawn towards the mean of people: for correlations and means over people",
+            null=True,
+        ),
+    ] = None
+    unshrunk_sd: Annotated[
+        float | None,
+        Column("{}_unshrunk_sd", "float64", "(-) standard deviation of the error of {}_unshrunk", null=True),
+    ] = None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """90 % interval of the true index; None if `sd` is not known."""
+        return interval_90(self.mean, self.sd)
+
+    @property
+    def title(self) -> str:
+        """Display name of the index."""
+        return _NAMES.get(self.model, self.model)
+
+    def to_dict(self) -> dict:
+        """`gdi` of metrics.json."""
+        rounded = {k: _rounded(getattr(self, k)) for k in NUMBERS}
+        interval = interval_90(rounded["mean"], rounded["sd"])  # as a reader of the file computes it
+        counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
+        cycles = [dataclasses.asdict(c) for c in self.cycles]
+        of_mean = None if interval is None else [_rounded(v) for v in interval]
+        return {**rounded, "interval": of_mean, **counted, "params_hash": self.params_hash, "cycles": cycles}
+
+
+def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
+    """The 90 % interval of an index whose error has the standard deviation `sd`; None if one is not known."""
+    if mean is None or sd is None or not math.isfinite(sd):
+        return None
+    return mean - Z90 * sd, mean + Z90 * sd
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
