@@ -6,9 +6,22 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import VIEW, Difference, Filming, differences
-from pbl_pipeline.qc import CADENCE
+from pbl_pipeline.qc import CADENCE, PASS
+from pbl_pipeline.texts import text
+
+if TYPE_CHECKING:
+    from pbl_pipeline.gait import Measure
+    from pbl_pipeline.visit import Visit
+
+#: Name of the index among the measures.
+INDEX = "gdi"
+#: Difference of two stated body heights (m) from which on two visits without codes are taken for two people.
+OTHER_HEIGHT_M = 0.1
 
 #: Checks that put a result in doubt as a whole until a person accepted them: with steps counted twice or missed, times
 #: and index are others.
@@ -61,6 +74,17 @@ class Change:
     real: float | None = None
     important: float | None = None
 
+    def row(self, measure: str) -> dict[str, Any]:
+        """Return the change as a row of a table, rounded; its verdict in the words of the pages."""
+        verdict = "unsure" if self.sure is None else "more" if self.sure else "chance"
+        numbers = {"change": self.by, "least": self.least, "real": self.real, "important": self.important}
+        return {
+            "measure": measure,
+            **{name: None if value is None else round(value, 3) for name, value in numbers.items()},
+            "verdict": text("en", f"compare.{verdict}"),
+            "not_comparable": "" if self.sure is not None else "; ".join(map(str, self.differs)),
+        }
+
 
 def change_since(result: Result, before: Result) -> Change | None:
     """The change of the index from one result to another; None if one of them has no index.
@@ -74,6 +98,18 @@ def change_since(result: Result, before: Result) -> Change | None:
         return None
     errors = [(r.sd, r.minimal_change) for r in (result, before)]
     return judged(result.index - before.index, errors, not_alike(result, before), IMPORTANT_CHANGE)
+
+
+def measure_changes(
+    now: Mapping[str, Measure | None], before: Mapping[str, Measure | None], differs: tuple[Difference, ...]
+) -> dict[str, Change]:
+    """Return the changes of the measures that two results both have. `differs`: as in `judged`."""
+    pairs = {name: (mine, before.get(name)) for name, mine in now.items()}
+    return {
+        name: judged(mine.mean - old.mean, [(m.error_sd, m.minimal_change) for m in (mine, old)], differs)
+        for name, (mine, old) in pairs.items()
+        if mine is not None and old is not None
+    }
 
 
 def judged(
@@ -121,3 +157,73 @@ def usual_chain(results: Mapping[int, Sequence[Result]]) -> tuple[str, ...] | No
     """Return `Result.chain` of most of the results, the first of several; None without any."""
     counts = Counter(r.chain for found in results.values() for r in found)
     return max(counts, key=lambda chain: counts[chain], default=None)
+
+
+def result_of(visit: Visit) -> Result | None:
+    """Return the result of a visit of files, without its filming; None if it has no measures."""
+    measures = visit.judged
+    if measures is None:
+        return None
+    index, outcome = measures.gdi, measures.outcome
+    events = measures.trials[0].events.method if measures.trials else ""
+    return Result(
+        kind=visit.kind,
+        methods=(visit.methods.get("Fit", ""), events, index.model, index.norm),
+        status=measures.status,
+        reason=measures.reason or index.reason,
+        index=index.mean,
+        sd=index.sd,
+        minimal_change=index.minimal_change,
+        outcome=outcome,
+        worst=tuple(c.check for c in measures.checks if c.outcome == outcome != PASS),
+        corrected=any(c.check == "events_by_hand" for c in measures.checks),
+    )
+
+
+def earlier_visit(path: Path, out: Path, subject: str = "-", height_m: float | None = None) -> Visit:
+    """Return the earlier visit of a person, to compare a visit with that is written to `out`.
+
+    `path`: the folder of its results, or the session.json in it. `subject`, `height_m`: of the person now, "-" and None
+    if they are not stated. Raises `PblError` FILE_MISSING, FILE_FORMAT if it is not such a folder, USAGE if it is `out`
+    or another person's.
+    """
+    from pbl_pipeline.visit import SESSION, load_visit
+
+    folder = path.parent if path.name == SESSION else path
+    if path.exists() and not folder.is_dir():
+        raise _not_earlier("FILE_FORMAT", f"the file {path.name}", path)
+    if folder.resolve() == out.resolve():
+        raise _not_earlier("USAGE", "the folder that the results are written to", path)
+    visit = load_visit(folder)
+    if visit.measures is None:
+        raise _not_earlier("FILE_FORMAT", "; ".join(visit.lacks), path)
+    if "-" not in (subject, visit.subject):
+        if subject != visit.subject:
+            raise _not_earlier("USAGE", f"visits of {visit.subject} and of {subject}", path)
+        return visit
+    if height_m and visit.height_m and abs(height_m - visit.height_m) > OTHER_HEIGHT_M:
+        found = f"a person of {visit.height_m:.2f} m, now one of {height_m:.2f} m"
+        raise _not_earlier("USAGE", found, path, "if it is one person who has grown, state --subject in both runs")
+    return visit
+
+
+def visit_changes(visit: Visit, before: Visit) -> list[dict[str, Any]]:
+    """Return the rows (`Change.row`) of index and measures that both visits of files have. Raises `PblError` USAGE if
+    other methods made them."""
+    now, then = (result_of(v) for v in (visit, before))
+    assert now is not None
+    assert then is not None
+    if now.chain != then.chain:
+        pairs = (f"{b or 'unknown'} (earlier), {n}" for n, b in zip(now.chain, then.chain, strict=True) if n != b)
+        again = "compute the recordings of the earlier visit again by these methods"
+        raise _not_earlier("USAGE", f"other methods: {'; '.join(pairs)}", before.title, again)
+    now, then = (dataclasses.replace(r, filming=v.filming) for r, v in ((now, visit), (then, before)))
+    measures, old = (v.measures.spatiotemporal.measures for v in (visit, before) if v.measures is not None)
+    index = change_since(now, then)
+    changes = {} if index is None else {INDEX: index}
+    return [c.row(name) for name, c in (changes | measure_changes(measures, old, not_alike(now, then))).items()]
+
+
+def _not_earlier(code: str, found: str, key: object, next_step: str = "name the folder of an earlier run") -> PblError:
+    expected = "the results of an earlier visit of the same person by the same methods, in a folder of `pbl run`"
+    return PblError(code, found=found, expected=expected, next_step=next_step, key=key or None)

@@ -9,7 +9,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from .options import MASS
+from .options import COMPARE, MASS, show_changes
 
 METHOD_HELP = "Event method, such as phase-transformer, zeni-2008 or oconnor-2007."
 PERSON_HELP = "Person to measure of C3D files with several: the prefix of the points, the subject of the events."
@@ -44,6 +44,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl gait --help`")
     is_flag=True,
     help="Also measure recordings whose cadence is over 150 steps/min: you counted the steps.",
 )
+@COMPARE
 @MASS
 def gait(
     files: tuple[Path, ...],
@@ -54,6 +55,7 @@ def gait(
     event_files: tuple[Path, ...],
     person: str | None,
     accept_cadence: bool,
+    earlier: Path | None,
     mass_kg: float | None,
 ) -> None:
     """Events, cycles, spatiotemporal measures and GDI of one session.
@@ -65,6 +67,7 @@ def gait(
     their events.csv and cycles.npz and the kinetics, which belong to it.
     """
     from pbl_pipeline import progress
+    from pbl_pipeline.change import earlier_visit
     from pbl_pipeline.files import check_out_file
     from pbl_pipeline.gait import (
         EVENT_METHODS,
@@ -91,8 +94,11 @@ def gait(
         raise _usage(found, "C3D files or motions, and one --events for each")
     if person is not None and kind != "C3D files":
         raise _usage(f"--person for {kind}", "C3D files")
+    if earlier is not None and kind != "fits":
+        raise _usage(f"--compare for {kind}", "fits")
     if index is None and kind == "C3D files":
         index = GILLETTE_MODEL
+    visit = before = None
     params = GaitParams(events=EVENT_METHODS.find(method).paramset, gdi=GDI_METHODS.find(index).params)
     if kind != "fits":
         given = event_files or (None,) * len(files)
@@ -101,6 +107,7 @@ def gait(
         metrics = gait_metrics([read(path, events, method) for path, events in pairs], norm, params, model=index)
     else:
         visit = visit_of_fits(files, measures=False)
+        before = None if earlier is None else earlier_visit(earlier, out.parent, visit.subject, visit.height_m)
         fits = [r.fit for r in visit.fitted if r.fit is not None]
         of_fit = visit.fit_checks
         metrics = gait_metrics(fits, norm, params, of_fit, model=index, accept_cadence=accept_cadence)
@@ -113,6 +120,8 @@ def gait(
     metrics.save(out)
     click.echo(metrics.table())
     click.echo(f"written: {out}")
+    if visit is not None and before is not None:
+        show_changes(visit.with_measures(metrics), before, out)
 
 
 def is_c3d(path: Path) -> bool:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.keypoints import KeypointParams
     from pbl_pipeline.methods import Method
     from pbl_pipeline.tracking import TrackingParams
+    from pbl_pipeline.visit import Visit
 
 
 #: Motions of the camera, for commands that fit.
@@ -27,6 +30,13 @@ HEIGHT = click.option(
 )
 MASS = click.option(
     "--mass-kg", type=float, help="Measured body mass, such as 68.5: forces can then be shown in newtons."
+)
+COMPARE = click.option(
+    "--compare",
+    "earlier",
+    metavar="EARLIER",
+    type=click.Path(path_type=Path),
+    help="Folder (or session.json) of an earlier run of the same person: also states which measures changed.",
 )
 LANGUAGE = click.option(
     "--language", type=click.Choice(LANGUAGES), default=LANGUAGES[0], show_default=True, help="Of the report."
@@ -43,6 +53,24 @@ DEVICE = click.option(
 PEOPLE = click.option(
     "--people", metavar="NAME", help="Tracking method, such as blazepose-tiles, or a detector of `pbl models list`."
 )
+
+
+def show_changes(visit: Visit, before: Visit, metrics: Path) -> None:
+    """Print the changes of a visit since an earlier one, and add them to its metrics.json (docs/files.md).
+
+    Raises `PblError` USAGE if other methods made it.
+    """
+    from pbl_pipeline.bounded import read_json
+    from pbl_pipeline.change import visit_changes
+
+    rows = visit_changes(visit, before)
+    content = {**read_json(metrics), "changes": {"since": before.title, "measures": rows}}
+    metrics.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    click.echo(f"changes since {before.title or 'the earlier visit'}")
+    cells = [list(rows[0]), *([("" if v is None else str(v)) for v in row.values()] for row in rows)] if rows else []
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
 def tracking_method(name: str | None) -> Method[TrackingParams]:

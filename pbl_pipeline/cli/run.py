@@ -11,6 +11,7 @@ import click
 from .options import (
     CAMERA_MOTION_HELP,
     CAMERA_MOTIONS,
+    COMPARE,
     DEVICE,
     HEIGHT,
     KEYPOINTS,
@@ -20,6 +21,7 @@ from .options import (
     Person,
     fit_paramset,
     keypoint_method,
+    show_changes,
     tracking_method,
 )
 
@@ -52,6 +54,7 @@ from .options import (
 @MASS
 @click.option("--activity", help="Activity in all VIDEOS: tug, sit_to_stand, squat (default: walking).")
 @click.option("--subject", default="-", help="Code of the subject on the report; never a name.")
+@COMPARE
 @LANGUAGE
 def run(
     videos: tuple[Path, ...],
@@ -70,6 +73,7 @@ def run(
     mass_kg: float | None,
     activity: str | None,
     subject: str,
+    earlier: Path | None,
     language: str,
 ) -> None:
     """Process VIDEOS, the trials of one session, with the whole chain.
@@ -78,9 +82,11 @@ def run(
     events, the forces and a video with the body drawn over it. A video that cannot be used is reported and left out;
     the others are processed, and the exit code is 1.
     """
+    from pbl_pipeline.change import earlier_visit
     from pbl_pipeline.errors import PblError
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.pipeline import run_visit, write_results
+    from pbl_pipeline.visit import METRICS
 
     # Wrong arguments are found before minutes of work.
     if person is not None and len(videos) > 1:
@@ -98,6 +104,7 @@ def run(
             expected="none, or one for each video, in the same order",
             next_step="name a log for each video; run videos without a log in another call",
         )
+    before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
@@ -126,5 +133,7 @@ def run(
     for name, error in problems.items():
         click.echo(f"left out {name}\n{error.text()}", err=True)
     click.echo("\n".join(str(p) for p in paths))
+    if before is not None:
+        show_changes(visit, before, out / METRICS)
     if problems:
         raise click.exceptions.Exit(1)

@@ -157,6 +157,12 @@ class Visit:
             return self.measures.before
         return (*stage_checks(self.recordings), *self.fit_checks)
 
+    @property
+    def height_m(self) -> float | None:
+        """Stated body height (m), None if none was stated. Raises as `Recording.fit`."""
+        stated = (r.fit.height_m for r in self.fitted if r.fit is not None)
+        return next((float(h) for h in stated if np.isfinite(h)), None)
+
     def loaded(self) -> Visit:
         """Return the visit with the arrays of its recordings in memory."""
         return dataclasses.replace(self, recordings=tuple(r.loaded() for r in self.recordings))

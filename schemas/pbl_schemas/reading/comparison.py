@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.change import Change, change_since, judged, not_alike, usual_chain
+from pbl_pipeline.change import Change, change_since, measure_changes, not_alike, usual_chain
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import MEASURES
@@ -192,11 +192,8 @@ def _compared(
     if about is not first:
         if about.result is not None and first.result is not None:
             change, differs = change_since(about.result, first.result), not_alike(about.result, first.result)
-        for name, (other, _) in first.all_measures.items():
-            mine, _ = about.all_measures.get(name, (None, ""))
-            if mine is not None and other is not None:
-                errors = [(m.error_sd, m.minimal_change) for m in (mine, other)]
-                changes[name] = judged(mine.mean - other.mean, errors, differs)
+        mine, old = ({n: m for n, (m, _) in v.all_measures.items()} for v in (about, first))
+        changes = measure_changes(mine, old, differs)
     before = scores[first.row.session_id] if about is not first else {}
     return Side(
         about=about,

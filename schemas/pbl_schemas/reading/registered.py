@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.change import change_since, judged, not_alike
+from pbl_pipeline.change import INDEX, Change, change_since, measure_changes, not_alike
 from pbl_pipeline.errors import PblError
 
 from .. import fit, gait, gdi, keypoints, lab, review, session, video
@@ -57,28 +57,14 @@ def changes(restriction: Any = True) -> pd.DataFrame:
                 same = [r for r in results[before["session_id"]] if r.chain == result.chain]
                 if not same:
                     continue
-                differs, other = not_alike(result, same[0]), measures.get((before["session_id"], *result.chain), {})
-                judgements = {"gdi": change_since(result, same[0])}
-                for name, mine in measures.get((now["session_id"], *result.chain), {}).items():
-                    if (old := other.get(name)) is not None:
-                        errors = [(m.error_sd, m.minimal_change) for m in (mine, old)]
-                        judgements[name] = judged(mine.mean - old.mean, errors, differs)
+                changes = {INDEX: change_since(result, same[0])}
+                mine, old = (measures.get((v["session_id"], *result.chain), {}) for v in (now, before))
+                changes |= measure_changes(mine, old, not_alike(result, same[0]))
                 about = {"subject": now["subject"], "visit": now["session_label"], "before": before["session_label"]}
                 out += [
-                    {
-                        **about,
-                        "measure": name,
-                        "change": round(c.by, 3),
-                        "least": None if c.least is None else round(c.least, 3),
-                        "real": None if c.real is None else round(c.real, 3),
-                        "important": None if c.important is None else round(c.important, 3),
-                        "not_comparable": "" if c.sure is not None else "; ".join(map(str, c.differs)),
-                        "fit": result.methods[0],
-                    }
-                    for name, c in judgements.items()
-                    if c is not None
+                    {**about, **c.row(name), "fit": result.methods[0]} for name, c in changes.items() if c is not None
                 ]
-    columns = ["subject", "visit", "before", "measure", "change", "least", "real", "important", "not_comparable", "fit"]
+    columns = ["subject", "visit", "before", *Change(0.0, None).row(""), "fit"]
     return pd.DataFrame(out, columns=columns)
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import dataclasses
 import datetime
 
-from pbl_pipeline.change import Change, Result, change_since, judged, not_alike, usual_chain
+from pbl_pipeline.change import INDEX, Change, Result, change_since, judged, not_alike, usual_chain
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.words import MEASURES
 
 from .. import session, video
 from .shown import shown_visit
 from .visit_list import results_of, visits_of
-
-#: Name of the index among the measures.
-INDEX = "gdi"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,9 +12,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from pbl_pipeline import settings
-from pbl_pipeline.change import Result
+from pbl_pipeline.change import result_of
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.qc import PASS
 from pbl_pipeline.visit import FIT, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
 from pbl_schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
@@ -201,7 +200,7 @@ class ResultsFolder(Source):
             videos=len(place.recordings) if visit is None else len(visit.recordings),
             state=state,
             problem=problem,
-            result=None if visit is None else _result(visit),
+            result=None if visit is None else result_of(visit),
             more=0,
             trend=None,
         )
@@ -234,26 +233,6 @@ ROUTES = [
     Address("/visits/{session_id:int}/report", report, "look", look="report"),
     Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
 ]
-
-
-def _result(visit: Visit) -> Result | None:
-    """Return the result of a visit in one line; None before its measures are computed."""
-    measures = visit.judged
-    if measures is None:
-        return None
-    index, outcome = measures.gdi, measures.outcome
-    events = measures.trials[0].events.method if measures.trials else ""
-    return Result(
-        kind=visit.kind,
-        methods=(visit.methods.get("Fit", ""), events, index.model, index.norm),
-        status=measures.status,
-        reason=measures.reason or index.reason,
-        index=index.mean,
-        sd=index.sd,
-        minimal_change=index.minimal_change,
-        outcome=outcome,
-        worst=tuple(c.check for c in measures.checks if c.outcome == outcome != PASS),
-    )
 
 
 def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:
