@@ -1,12 +1,13 @@
 """Errors a person can act on: a code, what was expected and found, and the next step.
 
-`CODES` is the whole list; `docs/errors.md` explains each, and a test fails when the two differ.
+`CODES` are the library's; packages above it and laboratories `register` theirs. `docs/errors.md` explains each of ours,
+and a test fails when the two differ.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import PurePath
 from typing import NamedTuple
 from unicodedata import category
@@ -37,11 +38,6 @@ CODES: dict[str, Code] = {
     "VIDEO_PIXELS": Code(INPUT, "the pixels of the video are not square, or its pictures are interlaced"),
     "VIDEO_UPSIDE_DOWN": Code(INPUT, "the people in the video are upside down"),
     "VIDEO_CHANGED": Code(INPUT, "the file's bytes are no longer those that were registered"),
-    "VIDEO_DUPLICATE": Code(
-        INPUT, "the same bytes are registered for another person, or, from a phone, in another visit"
-    ),
-    "UPLOAD_REFUSED": Code(CALL, "what was uploaded is not a recording that may be taken over"),
-    "PHONE_LINK": Code(CALL, "a link for filming is unknown, ended, or belongs to another phone"),
     "TRACK_NO_PERSON": Code(INPUT, "no person was found in the video"),
     "TRACK_TOO_SHORT": Code(INPUT, "the person is in view for less than the shortest time that can be fitted"),
     "SUBJECT_NEEDS_CHOICE": Code(CALL, "several people, none clearly the subject: a person has to choose"),
@@ -87,33 +83,22 @@ CODES: dict[str, Code] = {
     ),
     "STUDY_INVALID": Code(INPUT, "the parts of a study contradict each other, or one lacks what it must have"),
     "SHEET_FORMAT": Code(INPUT, "a sheet has columns or cells that cannot be read"),
-    "SHEET_CONFLICT": Code(INPUT, "rows of a sheet contradict each other, or what is registered"),
-    "SCORE_RANGE": Code(INPUT, "a clinical score has a value that its instrument cannot have"),
-    "DB_NOT_RUNNING": Code(MACHINE, "the database does not answer"),
-    "DB_UNAVAILABLE": Code(MACHINE, "no database server can be obtained on this machine"),
-    "DB_REFUSED": Code(MACHINE, "the database answers but refuses the login or the operation"),
-    "DB_NOT_FOUND": Code(CALL, "a row that was named does not exist"),
-    "DB_MIGRATION": Code(MACHINE, "the tables on the server are not as this version of the code declares them"),
-    "INPUT_CHANGED": Code(MACHINE, "rows that a computation reads are gone, or changed each time it ran"),
-    "STORE_UNAVAILABLE": Code(MACHINE, "the object store of the arrays cannot be reached, or refuses"),
-    "STORE_FULL": Code(MACHINE, "the store of the arrays has no room left"),
-    "BACKUP_INVALID": Code(INPUT, "a backup is incomplete or was changed"),
-    "TIME_LIMIT": Code(MACHINE, "a job took longer than a worker gives it and was ended"),
-    "WORKER_CRASH": Code(MACHINE, "a job took its worker's process down more than once"),
     "MACHINE_SHORT": Code(
         MACHINE, "this machine was short of time or memory, or a process was ended: nothing is said about the file"
     ),
-    "DECIDED_MEANWHILE": Code(CALL, "another person decided, or it was computed again, since the page was loaded"),
-    "WEB_NOT_MADE": Code(MACHINE, "a file that the review page was making was not finished"),
-    "WEB_REFUSED": Code(
-        CALL, "a request to the review page may not be answered: no session, no right, or a form of another page"
-    ),
-    "WEB_PORT": Code(MACHINE, "the review page cannot listen on that port"),
-    "WEB_TLS": Code(MACHINE, "the review page would be reached without encryption, or its certificate cannot be used"),
-    "WEB_ACCOUNT": Code(CALL, "an account of the review page is not there, or cannot be as it was asked for"),
     "USAGE": Code(CALL, "the command was called in a way that cannot work"),
     "INTERNAL": Code(MACHINE, "an unforeseen error: please report it with the whole text"),
 }
+
+
+def register(codes: Mapping[str, Code]) -> None:
+    """Add the codes of another package, such as `{"PLATE_SATURATED": Code(INPUT, "a force plate was overloaded")}`.
+
+    Raises ValueError for a code that has another meaning already.
+    """
+    if taken := [name for name, code in codes.items() if CODES.get(name, code) != code]:
+        raise ValueError(f"error codes with another meaning: {', '.join(taken)}")
+    CODES.update(codes)
 
 
 class PblError(Exception):
@@ -137,7 +122,7 @@ class PblError(Exception):
 
     def __init__(self, code: str, found: str, expected: str, next_step: str, key: object = None) -> None:
         if code not in CODES:
-            raise ValueError(f"unknown error code {code!r}: add it to pbl_pipeline.errors.CODES")
+            raise ValueError(f"unknown error code {code!r}: `pbl_pipeline.errors.register` adds it")
         self.code, self.found, self.expected, self.next_step = code, found, expected, next_step
         self.key = str(key) if isinstance(key, PurePath) else key
         super().__init__(self.text())

@@ -28,7 +28,7 @@ _POINT = re.compile(r"(?<=\d)\.(?=\d)")
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
 #: The code of an error before what was found: of use to engineers, not on a page.
-_CODED = re.compile(rf"\b(?:{'|'.join(CODES)}): ")
+_CODED = re.compile(r"\b([A-Z][A-Z0-9_]+): ")
 #: Tags of a page, and its parts that are not read or are marked as names.
 _TAGS = re.compile(r'(?s)(<style>.*?</style>|<b translate="no">.*?</b>|<[^>]+>)')
 _LABELS = re.compile(r'(?<= (?:aria-label|data-label)=")[^"]+(?=")|(?<= alt=")[^"]+(?=")')
@@ -206,7 +206,7 @@ def library(language: str, english: str) -> str:
 def on_page(language: str, english: str) -> Markup:
     """Return a text as `library` does, without codes of errors and without the sentences that name a command: a page
     says what to click."""
-    english = _CODED.sub("", english)
+    english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], english)
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown

@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 
 import docs_site
 import pbl_pipeline
+import pbl_workers  # noqa: F401  registers its codes
 from docs_site import _notebook, api, commands
 from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
