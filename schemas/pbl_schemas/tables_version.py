@@ -26,6 +26,8 @@ from .operations import catalog
 
 #: A line of a definition that makes a column of the table's own: its name.
 _OWN = re.compile(r"^\s*([a-z]\w*)\s*[:=]", re.MULTILINE)
+#: Where the migrations lie.
+FOLDERS = [str(Path(__file__).with_name("migrations"))]
 _NAME = re.compile(r"(\d{4})_(\w+)")
 #: Name of the table that records migrations, in the schema `lab`.
 _RECORD = "~migrations"
@@ -56,9 +58,7 @@ def title(number: int, name: str) -> str:
 def numbered() -> list[tuple[int, str]]:
     """Return number and name of every migration of this version, in the order of their numbers. Raises ValueError for a
     number that is missing or used twice, a mistake in the code."""
-    names = (
-        _NAME.fullmatch(module.name) for module in pkgutil.iter_modules([str(Path(__file__).parent / "migrations")])
-    )
+    names = (_NAME.fullmatch(module.name) for module in pkgutil.iter_modules(FOLDERS))
     found = sorted((int(match[1]), match[2]) for match in names if match)
     if [number for number, _ in found] != list(range(1, len(found) + 1)):
         raise ValueError(f"migrations must be numbered 1, 2, 3 ...: {[number for number, _ in found]}")

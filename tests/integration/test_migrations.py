@@ -28,6 +28,7 @@ from pbl_schemas import (
     session,
     stages,
     study,
+    tables_version,
     validation,
     video,
 )
@@ -260,6 +261,7 @@ def add(
     """A call that writes a migration where the runner finds it."""
     folder = tmp_path_factory.mktemp("migrations")
     monkeypatch.setattr(migrations, "__path__", [*migrations.__path__, str(folder)])
+    monkeypatch.setattr(tables_version, "FOLDERS", [*tables_version.FOLDERS, str(folder)])
     names = []
 
     def write(name: str, text: str) -> None:
