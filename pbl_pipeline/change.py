@@ -80,7 +80,7 @@ class Change:
         numbers = {"change": self.by, "least": self.least, "real": self.real, "important": self.important}
         return {
             "measure": measure,
-            **{name: None if value is None else round(value, 3) for name, value in numbers.items()},
+            **{name: None if value is None else round(value, 3) + 0.0 for name, value in numbers.items()},
             "verdict": text("en", f"compare.{verdict}"),
             "not_comparable": "" if self.sure is not None else "; ".join(map(str, self.differs)),
         }

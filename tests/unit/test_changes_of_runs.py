@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from pbl_pipeline import pipeline
-from pbl_pipeline.change import earlier_visit, visit_changes
+from pbl_pipeline.change import Change, earlier_visit, visit_changes
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit
@@ -103,3 +103,7 @@ def test_what_is_no_earlier_visit_is_refused(folders, visit, tmp_path):
     other = dataclasses.replace(visit, methods={"Fit": "f-v2"})
     with pytest.raises(PblError, match=r"other methods: f-v1 \(earlier\), f-v2"):
         visit_changes(other, visit)
+
+
+def test_a_change_of_nothing_has_no_sign():
+    assert str(Change(-1e-5, False, 2.0).row("speed_m_per_s")["change"]) == "0.0"
