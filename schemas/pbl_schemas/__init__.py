@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from . import errors
+from . import errors as _errors  # registers the codes
 from ._activate import activate
 from .stages import STAGES
 

@@ -1,1 +1,1 @@
-from . import errors
+from . import errors as _errors  # registers the codes
