@@ -78,7 +78,8 @@ class Program:
             # Factors rounded to ten bits (TensorFloat-32) are a third faster here, but points then differ by 4 px of
             # 256 in poor pictures, so that results would depend on the device.
             with jax.default_matmul_precision("highest"):
-                found = dict(zip(model.output_sizes, model(weights, images.astype(np.float32) * scale + offset)))
+                values = model(weights, images.astype(np.float32) * scale + offset)
+                found = dict(zip(model.output_sizes, values, strict=True))
                 found = jax.vmap(lambda one: spec.decoded(one, jax.numpy))(found)
                 return jax.numpy.concatenate([found[size] for size in self.sizes], axis=1)
 

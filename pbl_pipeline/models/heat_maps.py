@@ -21,7 +21,7 @@ _STEPS = 3
 _LEAST = 1e-6
 
 
-def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> tuple[Any, Any]:
+def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> Any:
     """Move points to the means of their peaks (mean shift with a Gaussian window), by the fraction that the height of
     the peak is of 1.
 
@@ -38,17 +38,17 @@ def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> tuple[An
 
     Returns
     -------
-    (J, 2), (J,)
-        The refined points in px, and the heights of their peaks, 0 to 1.
+    (J, 2)
+        In px.
     """
     start = points / CELL_PX
     half = int(_REACH + 0.5)
     first = xp.clip(xp.round(start).astype(int) - half, 0, SIDE - 2 * half - 1)
     cells = first[:, :, None] + np.arange(2 * half + 1)  # (J, 2, K)
-    x, y = cells[:, 0], cells[:, 1]
+    x, y, cells = cells[:, 0], cells[:, 1], cells.astype(points.dtype)
     near = xp.maximum(1.0 - ((cells - start[:, :, None]) / _REACH) ** 2, 0.0)
-    values = 1.0 / (1.0 + xp.exp(-logits[y[:, :, None], x[:, None, :], np.arange(len(points))[:, None, None]]))
-    values = values * near[:, 1, :, None] * near[:, 0, None, :]
+    found = logits[y[:, :, None], x[:, None, :], np.arange(len(points))[:, None, None]]
+    values = (0.5 + 0.5 * xp.tanh(0.5 * found)) * near[:, 1, :, None] * near[:, 0, None, :]
     at = start
     for _ in range(_STEPS):
         off = cells - at[:, :, None]
@@ -58,14 +58,14 @@ def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> tuple[An
         at = at + xp.stack([sums[:, 0, 1], sums[:, 1, 0]], axis=1) / (sums[:, :1, 0] + _LEAST)
     window = xp.exp(-0.5 * ((cells - at[:, :, None]) / sd_cells) ** 2)
     height = (values * window[:, 1, :, None] * window[:, 0, None, :]).max((1, 2))
-    return CELL_PX * (start + height[:, None] * (at - start)), height
+    return CELL_PX * (start + height[:, None] * (at - start))
 
 
 def decoded(outputs: Mapping[int, Any], sd_cells: float, xp: Any = np) -> dict[int, Any]:
     """Refine the points among the outputs of a network for one picture, keyed by their number of elements: rows of five
-    values, of which the first two are x and y. The maps are replaced by the heights of the peaks."""
+    values, of which the first two are x and y. The maps are left out."""
     n = max(outputs) // SIDE**2
     rows = outputs[5 * n].reshape(n, 5)
-    points, height = refined(rows[:, :2], outputs[n * SIDE**2].reshape(SIDE, SIDE, n), sd_cells, xp)
+    points = refined(rows[:, :2], outputs[n * SIDE**2].reshape(SIDE, SIDE, n), sd_cells, xp)
     rows = xp.concatenate([points.astype(rows.dtype), rows[:, 2:]], axis=1)
-    return {size: v for size, v in outputs.items() if size != n * SIDE**2} | {5 * n: rows.reshape(-1), n: height}
+    return {size: v for size, v in outputs.items() if size != n * SIDE**2} | {5 * n: rows.reshape(-1)}
