@@ -12,10 +12,10 @@ points are detected once and kept in the temporary folder (`--fresh` detects ane
 intrinsics are a guess, as they are for most users. Prints one table per clip: mean and median absolute error in degrees
 per angle and side (the paper's figures are medians), and the same for what two published systems made of the clip (they
 see the same pixels). `--true-points` puts the mocap's positions of 16 joints, in the picture and in 3D, in the place of
-the detected ones: what remains is the fit's. Both clips were in sight when the weights of `blazepose` were chosen: they are tuned on, not held
-out, for ours; whether the two systems were trained or tuned on them is not known to us. "in 90 %" is the
-share of the samples in our 90 % intervals, the mean over the angles. Exit code 1 where the first paramset misses a
-bar: 8.0 deg, knee correlation 0.93, 75 % in the intervals, each on each clip.
+the detected ones: what remains is the fit's. Both clips were in sight when the weights of `blazepose` were chosen: they
+are tuned on, not held out, for ours; whether the two systems were trained or tuned on them is not known to us. "in 90
+%" is the share of the samples in our 90 % intervals, the mean over the angles. Exit code 1 where the first paramset
+misses a bar: 8.0 deg, knee correlation 0.93, 75 % in the intervals, each on each clip.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def changed(method: Method[Any], changes: tuple[str, ...]) -> Method[Any]:
 @click.option("--clip", "clips", multiple=True, type=click.Choice(CLIPS), default=CLIPS, show_default=True)
 @click.option("--keypoints", "detector", help="Keypoint method; default: the project's.")
 @click.option("--fresh", is_flag=True, help="Detect the key points anew.")
-@click.option("--true-points", is_flag=True, help="Put the mocap's positions of 16 joints in the place of the detected.")
+@click.option("--true-points", is_flag=True, help="The mocap's positions of 16 joints instead of detected.")
 @click.option("--save", type=click.Path(path_type=Path, file_okay=False), help="Folder for the fits.")
 @click.option("--plots", type=click.Path(path_type=Path, file_okay=False), help="Folder for pages with the curves.")
 def main(
