@@ -9,7 +9,7 @@ import pytest
 
 import pbl_pipeline.video
 from pbl_schemas import connection, fit, gait, keypoints, tracking, video
-from pbl_schemas.job_errors import error_code, error_found
+from pbl_schemas.job_errors import stored_error
 from pbl_schemas.jobs import jobs_of
 from pbl_workers import queue, requeue, run_job
 from tests.rows import register
@@ -27,8 +27,8 @@ def claimed(table: Any) -> queue.Claim:
 
 def error(table: Any) -> tuple[str, str]:
     """Code and finding of the only error row of a table."""
-    message = jobs_of(table).errors.fetch1("error_message")
-    return error_code(message), error_found(message)
+    stored = stored_error(jobs_of(table).errors.fetch1("error_message"))
+    return stored.code, stored.found
 
 
 def test_a_file_whose_name_is_a_word_of_datajoint_is_one_error(tables: None, tmp_path: Path):
