@@ -25,13 +25,17 @@ _GROUPS = {
 }
 #: Meanings of columns by their ending, which the top of the page states for all.
 _SAID = {
-    "_created": ("when registered", "when planned"),
+    "_created": ("when registered", "when planned", "when decided", "when"),
+    "_by": ("name of who decided", "name of who corrected", "name of who decided, as the page knows it"),
+    "_at": ("when",),
     "_sha256": ("of its bytes", "of the copy's bytes", "of the file's bytes", "of the bytes of the copy"),
     "_size": ("(byte) length", "(byte) length of the file", "(byte) length of the copy"),
     "_reason": ("why EMPTY",),
     "_missing": ("why it is null",),
     "_file": ("the file",),
 }
+#: Types that a reader asks the server for.
+_PLAIN = re.compile(r"float64|(var)?char\(\d+\)|int\d+|datetime(\(3\))?|date")
 #: So many consecutive columns have to be alike to be described by those of another table.
 _LEAST_ALIKE = 4
 #: Longer names of columns do not widen the others'.
@@ -40,18 +44,18 @@ _WIDEST = 40
 _START = """\
 # Tables
 
-Each section is a schema of the server, `pbl_<section>`, in the order of computing. `pbl populate` fills *computed* tables, people and
-`pbl ingest` those without a word; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
-has the key of its table.
+Each section is a schema of the server, `pbl_<section>`, in the order of computing. `pbl populate` fills *computed* tables, people and `pbl ingest`
+those without a word; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
+has the key of its table. *as in* a table: the same columns without `session_`.
 
-A column without a type is text, or float64 where its unit stands in brackets (*its unit*: that in the name of the row). `datetime` is in UTC.
-`<object@arrays>` is a file of the store ([formats](files.md)). `T.heading` of a table T prints all types, with the lengths of texts. *as in* a
-table: the same columns without `session_`. Unless stated, `_created` is when the row was made, `_sha256` that of the file, `_size` its length
-(byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with a prefix:
+`T.heading` of a table T prints all types; below are those of terms, bool, json and files (`<object@arrays>`: [formats](files.md)). A column with a unit in
+brackets is float64 (*its unit*: that in the name of the row). Times are in UTC. Unless stated, `_created` is when the row was made, `_by` who decided,
+by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with
+a prefix:
 
 - *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
-- *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` int16 counts up when parameters change;
-  `_params` json; `_method_sha`, hash of all these
+- *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
+  `_method_sha`, hash of all these
 - *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
   `_check_threshold` (its unit); `_check_advice`: what to do about it
 
@@ -160,7 +164,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
 
 
 def _type(text: str) -> str:
-    return "" if text == "float64" or re.fullmatch(r"(var)?char\(\d+\)", text) else text.replace("', '", "','")
+    return "" if _PLAIN.fullmatch(text) else text.replace("', '", "','")
 
 
 def _meaning(column: str, type_: str, text: str, key: str) -> str:
@@ -174,7 +178,7 @@ def _meaning(column: str, type_: str, text: str, key: str) -> str:
 
 def _line(row: tuple[str, str, str], wide: int) -> list[str]:
     """A column with its type and meaning, broken below its name."""
-    text = f"{row[0]:<{wide}}  {row[1]:<14}  {row[2]}".rstrip()
+    text = f"{row[0]:<{wide}}  {'  '.join(filter(None, row[1:]))}".rstrip()
     below = " " * (2 + wide * (len(row[0]) <= wide))
     return textwrap.wrap(text, 130, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 
