@@ -322,12 +322,12 @@ async def _body(request: Request, kind: str, most: int) -> bytes:
 
 
 def _shown(language: str, sent: Sent, judged: Usable | None) -> dict[str, Any]:
-    why = texts.library_words(language, sent.error.partition(": ")[2])
+    why = texts.library_words(language, sent.error.found) if sent.error else ""
     return {
         "number": sent.number,
         "sha256": sent.sha256,
         "state": sent.state,
-        "error": sent.error,
+        "error": sent.error.short() if sent.error else "",
         "about": sent.about,
         "verdict": texts.text(language, "capture.refused", why=why) if why else verdict(language, judged),
     }
