@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .errors import PblError
+from .errors import PblError, said
 from .qc import WARN, Check
 from .sampling import interval_of
 
@@ -47,9 +47,9 @@ def check_size(size: float, refuse: Refusal) -> None:
         return
     names = ((own, read) for own in UNITS for read in ("metres", "centimetres", "millimetres"))
     own, read = min(names, key=lambda n: abs(np.log(size * UNITS[n[0]] / UNITS[n[1]])))
-    times = f"{size:.3g} times" if size > 1 else f"1/{1 / size:.3g} of"
+    times = said("{x:.3g} times", x=size) if size > 1 else said("1/{x:.3g} of", x=1 / size)
     raise refuse(
-        f"a body {times} that of an adult, such as {own} read as {read}",
+        said("a body {times} that of an adult, such as {own} read as {read}", times=times, own=own, read=read),
         f"{SIZES[0]:g} to {SIZES[1]:g} times an adult's size",
         "correct the unit: of a .trc or .c3d that of its header; metres in all other files",
     )
@@ -62,7 +62,7 @@ def check_steps(time_s: np.ndarray, refuse: Refusal) -> None:
         return
     guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"
     raise refuse(
-        f"{step:.3g} s from frame to frame, such as {guess} read as seconds",
+        said("{step:.3g} s from frame to frame, such as {guess} read as seconds", step=step, guess=guess),
         f"{STEPS_S[0]:g} to {STEPS_S[1]:g} s",
         "write the time of each frame in seconds",
     )
@@ -84,7 +84,7 @@ def check_strides(apart_m: np.ndarray, time_s: np.ndarray, refuse: Refusal) -> N
     stride = 2 * float(np.median(np.diff(change)))
     if not STRIDES_S[0] <= stride <= STRIDES_S[1]:
         raise refuse(
-            f"strides of {stride:.2g} s",
+            said("strides of {s:.2g} s", s=stride),
             f"{STRIDES_S[0]:g} to {STRIDES_S[1]:g} s",
             "correct the times of the frames, in seconds (the rate of the recording)",
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unicodedata import category
 
 #: Where the cause of an error lies: in what was given, which the same bytes will always meet (final); in this machine,
@@ -101,6 +101,44 @@ def register(codes: Mapping[str, Code]) -> None:
     CODES.update(codes)
 
 
+class Said(str):
+    """An English text made by `said`, with its template and the values in it, by which it is said in a language."""
+
+    template: str
+    values: dict[str, Any]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _said, (self.template, self.values)
+
+    def data(self) -> dict[str, Any]:
+        """Return template and values for JSON, which `said_of` reads."""
+        return {"says": self.template, "of": {k: _data(v) for k, v in self.values.items()}}
+
+
+def said(template: str, /, **values: Any) -> Said:
+    """Fill the places of a text, such as "{seconds:.1f} s": numbers and words, which may be texts of `said`."""
+    plain = {k: v.item() if hasattr(v, "item") else v for k, v in values.items()}
+    number = int, float, Said
+    return _said(template, {k: v if isinstance(v, number) else harmless(str(v), lines=False) for k, v in plain.items()})
+
+
+def _said(template: str, values: dict[str, Any], text: str | None = None) -> Said:
+    made = Said(template.format(**values) if text is None else text)
+    made.template, made.values = template, values
+    return made
+
+
+def said_of(data: Any) -> str:
+    """Return the text that `Said.data` or a text became in JSON."""
+    if not isinstance(data, dict):
+        return str(data)
+    return _said(data["says"], {k: said_of(v) if isinstance(v, dict) else v for k, v in data["of"].items()})
+
+
+def _data(value: Any) -> Any:
+    return value.data() if isinstance(value, Said) else value
+
+
 class PblError(Exception):
     """A coded error.
 
@@ -109,7 +147,7 @@ class PblError(Exception):
     code
         One of `CODES`.
     found
-        The facts, concretely ("the file holds 0 bytes").
+        The facts, concretely ("the file holds 0 bytes"); with values in it a text of `said`, for pages in any language.
     expected
         The valid input ("an MP4, MOV or WebM video").
     next_step
@@ -142,8 +180,15 @@ class PblError(Exception):
         return "\n".join(lines)
 
     def short(self) -> str:
-        """Return code and `found` on one line, as the reason that a result is missing."""
-        return f"{self.code}: {harmless(self.found, lines=False)}"
+        """Return code and `found` on one line, as the reason that a result is missing; a page leaves the code out."""
+        text = f"{self.code}: {harmless(self.found, lines=False)}"
+        return _said(self.found.template, self.found.values, text) if isinstance(self.found, Said) else text
+
+    def data(self) -> dict[str, Any]:
+        """Return the parts for JSON, each a text or `Said.data`; `said_of` reads one."""
+        parts = {"found": self.found, "expected": self.expected, "next_step": self.next_step}
+        data = {name: _data(text if isinstance(text, Said) else harmless(text)) for name, text in parts.items()}
+        return data if self.key is None else data | {"key": harmless(str(self.key), lines=False)}
 
     def about(self, key: object) -> PblError:
         """Return this error, about `key` unless it already has a key: a reader of several files names the one."""

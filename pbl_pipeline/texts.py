@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import html
 import re
+import string
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup, escape
 
-from pbl_pipeline.errors import CODES
+from pbl_pipeline.errors import CODES, Said
 from pbl_pipeline.words import capital
 
 #: The first is the default.
@@ -29,6 +30,8 @@ _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
 #: The code of an error before what was found: of use to engineers, not on a page.
 _CODED = re.compile(r"\b([A-Z][A-Z0-9_]+): ")
+#: How a place of a text shows its value.
+_SPEC = re.compile(r":[^{}]*(?=\})")
 #: Tags of a page, and its parts that are not read or are marked as names.
 _TAGS = re.compile(r'(?s)(<style>.*?</style>|<b translate="no">.*?</b>|<[^>]+>)')
 _LABELS = re.compile(r'(?<= (?:aria-label|data-label)=")[^"]+(?=")|(?<= alt=")[^"]+(?=")')
@@ -39,7 +42,8 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z0-9])")
 def catalogue() -> dict[str, dict[str, str]]:
     """Every text by "group.name": language to text. The English of the library is its own words where none is given."""
     groups = tomllib.loads((Path(__file__).parent / "texts.toml").read_text("utf-8"))
-    groups["library"] = {name: {"en": name, **said} for name, said in groups["library"].items()}
+    for of_code in ("library", "said"):
+        groups[of_code] = {name: {"en": name, **own} for name, own in groups[of_code].items()}
     return {f"{group}.{name}": text for group, names in groups.items() for name, text in names.items()}
 
 
@@ -87,8 +91,32 @@ def coded(language: str, kind: str, code: str) -> str:
 
 def library_words(language: str, english: str) -> str:
     """Return an English text of the library in a language, unchanged if it is not in the catalogue."""
-    found = _library_words(language, english)
+    found = _own_words(language, english)
     return english if found is None else found
+
+
+def _own_words(language: str, english: str) -> str | None:
+    """`_library_words`; a text of `errors.said` by its template, whose values need not be told from the text."""
+    if isinstance(english, Said):
+        name = bare(english.template)
+        own = catalogue().get(f"said.{name}") or catalogue().get(f"library.{name}")
+        if own is not None:
+            return own[language].format(**{name: _value(language, english, name) for name in english.values})
+    return _library_words(language, str(english))
+
+
+def bare(template: str) -> str:
+    """Return a text with its places as the catalogue names it: "{s:.2f} s" as "{s} s"."""
+    return _SPEC.sub("", template)
+
+
+def _value(language: str, text: Said, name: str) -> str:
+    """Return a value of a text as the text shows it, in a language."""
+    value = text.values[name]
+    if isinstance(value, str):
+        return _in_place(language, value)
+    spec = next((spec for _, field, spec, _ in string.Formatter().parse(text.template) if field == name), "")
+    return decimals(language, format(value, spec or ""))
 
 
 @functools.lru_cache(4096)
@@ -128,16 +156,19 @@ def _library_words(language: str, english: str) -> str | None:
 
 
 def _filled(language: str, places: re.Match[str], own: str) -> str:
-    """Return a text with its places filled in; in a list whose words are all known, each is in the language."""
-    filled = {}
-    for name, value in places.groupdict().items():
-        parts = _LIST.split(value)
-        words = [_library_words(language, part) for part in parts[::2]]
-        filled[name] = library_words(language, value)
-        if filled[name] == value and None not in words:
-            parts[::2] = words
-            filled[name] = "".join(map(str, parts))
-    return own.format(**filled)
+    """Return a text with its places filled in."""
+    return own.format(**{name: _in_place(language, value) for name, value in places.groupdict().items()})
+
+
+def _in_place(language: str, value: str) -> str:
+    """Return what fills a place; of a list whose words are all known, each in the language."""
+    whole = library_words(language, value)
+    parts = _LIST.split(value)
+    words = [_library_words(language, part) for part in parts[::2]] if whole == value else [None]
+    if None in words:
+        return whole
+    parts[::2] = words
+    return "".join(map(str, parts))
 
 
 @functools.cache
@@ -197,16 +228,17 @@ def _sentence(language: str, text: str) -> str | None:
 
 def library(language: str, english: str) -> str:
     """Return an English text of the library in the language of a page: HTML, marked as English if it stays so."""
-    own = _library_words(language, english)
+    own = _own_words(language, english)
     if own is not None or language == "en":
-        return escape(own or english)
+        return escape(own or str(english))
     return Markup('<span lang="en">{}</span>').format(english)
 
 
 def on_page(language: str, english: str) -> Markup:
     """Return a text as `library` does, without codes of errors and without the sentences that name a command: a page
     says what to click."""
-    english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], english)
+    if not isinstance(english, Said):
+        english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], english)
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from pbl_pipeline import progress
 from pbl_pipeline.body import Body, marker_positions, mjx_frames, scale_multipliers
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 
 from .initial_pose import median_orientation, median_pose, paper_pose
 from .objective import OF_SINGLE_FRAMES, total
@@ -120,7 +120,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         if not np.isfinite(loss):
             raise PblError(
                 "FIT_DIVERGED",
-                found=f"loss {loss} after {chunk * CHUNK + kept} steps",
+                found=said("loss {loss} after {n} steps", loss=loss, n=chunk * CHUNK + kept),
                 expected="a finite loss",
                 next_step="check the keypoints and the camera matrix; report the keypoints file if both are sound",
             )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import MARKER_SETS, Body, MarkerSet, load_body, marker_set
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.keypoints import (
     SEEN_SHARE,
     Keypoints,
@@ -148,7 +148,12 @@ def check_trial(trial: Trial, name: str, view: ViewParams, markers: MarkerSet | 
     if len(trial.time_s) < 2 or not np.all(np.isfinite(trial.time_s)) or np.any(step <= 0):
         bad = int(np.sum(~(step > 0)))
         raise _input_error(
-            f"trial {name}: {len(trial.time_s)} time stamps, {bad} of the steps not positive",
+            said(
+                "trial {name}: {n} time stamps, {bad} of the steps not positive",
+                name=name,
+                n=len(trial.time_s),
+                bad=bad,
+            ),
             "at least two, finite and strictly increasing",
             name,
         )
@@ -185,8 +190,8 @@ def _long_enough(used: np.ndarray, time_s: np.ndarray, name: str, view: ViewPara
     longest = longest_run_s(used, time_s)
     if longest < view.min_in_view_s:
         raise _input_error(
-            f"trial {name}: the whole person is in view for {longest:.2f} s at a stretch",
-            f"at least {view.min_in_view_s:.1f} s",
+            said("trial {name}: the whole person is in view for {s:.2f} s at a stretch", name=name, s=longest),
+            said("at least {s:.1f} s", s=view.min_in_view_s),
             name,
             "film so that head and feet stay in the picture for a few steps, or pick another person with --person",
         )
@@ -207,7 +212,9 @@ def has_3d(trial: Keypoints) -> bool:
 
 def _check_finite(name: str, confidence: np.ndarray, points: np.ndarray) -> None:
     if not np.isfinite(points).all() and np.any((confidence > 0) & ~_finite(points)):
-        raise _input_error(f"trial {name}: NaN or infinite points with confidence above 0", "confidence 0 there", name)
+        raise _input_error(
+            said("trial {name}: NaN or infinite points with confidence above 0", name=name), "confidence 0 there", name
+        )
 
 
 def _finite(points: np.ndarray) -> np.ndarray:
@@ -300,8 +307,17 @@ def _check_phone(trial: Keypoints, name: str, used: np.ndarray) -> None:
     if covered < PHONE_COVERAGE * (last - first) - CLOCK_RANGE_S:
         raise PblError(
             "PHONE_LOG",
-            found=f"trial {name}: orientation from {trial.phone_time_s[0]:.2f} to {trial.phone_time_s[-1]:.2f} s",
-            expected=f"the time in which the person is in view, {first:.2f} to {last:.2f} s of the video",
+            found=said(
+                "trial {name}: orientation from {start:.2f} to {end:.2f} s",
+                name=name,
+                start=trial.phone_time_s[0],
+                end=trial.phone_time_s[-1],
+            ),
+            expected=said(
+                "the time in which the person is in view, {start:.2f} to {end:.2f} s of the video",
+                start=first,
+                end=last,
+            ),
             next_step="pass the log of this video, on its clock (docs/phone_capture.md), or leave it out",
             key=name,
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from pbl_pipeline.assumptions import SIZES, UNITS, check_size, check_steps, check_strides
 from pbl_pipeline.body import MarkerSet, load_body
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.keypoints import MOST_MISS_M, SEEN_SHARE, Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.keypoints.multi_view import meeting_points
 from pbl_pipeline.video import CameraPose
@@ -63,8 +63,13 @@ def in_upright_world(trial: World, name: str, markers: MarkerSet) -> Turned[Worl
         near, label = float(np.degrees(np.arccos(axis @ up))), "-+"[int(axis[number] > 0)] + "xyz"[number]
         if near > NEAR_DEG or steady < STEADY:
             raise refuse(
-                f"the body's head lies {off:.0f} deg off z, seen from its feet, and along no axis "
-                f"(nearest {label}: {near:.0f} deg)",
+                said(
+                    "the body's head lies {off:.0f} deg off z, seen from its feet, and along no axis (nearest "
+                    "{axis}: {near:.0f} deg)",
+                    off=off,
+                    axis=label,
+                    near=near,
+                ),
                 "a person whose head is above the feet along z, the vertical",
                 "pass --up y or --up z for a .trc; else turn the markers, or the calibration, so that z is up",
             )
@@ -107,7 +112,7 @@ def check_picture(trial: Keypoints, name: str, markers: MarkerSet) -> None:
     if size < _LEAST_PX:
         raise _error(
             name,
-            f"a body of {size:.3g} px",
+            said("a body of {size:.3g} px", size=size),
             f"pixels of the picture, at least {_LEAST_PX:g} for a body",
             "write pixels, not fractions of the picture (OpenPose: --keypoint_scale 0)",
         )
@@ -131,8 +136,16 @@ def check_picture(trial: Keypoints, name: str, markers: MarkerSet) -> None:
         low, high = known.min(axis=0), known.max(axis=0)
         raise _error(
             name,
-            f"{outside:.0%} of the points outside the picture of {picture} px: x {low[0]:.0f} to {high[0]:.0f}, "
-            f"y {low[1]:.0f} to {high[1]:.0f}",
+            said(
+                "{share:.0%} of the points outside the picture of {picture} px: x {x0:.0f} to {x1:.0f}, y {y0:.0f} to "
+                "{y1:.0f}",
+                share=outside,
+                picture=picture,
+                x0=low[0],
+                x1=high[0],
+                y0=low[1],
+                y1=high[1],
+            ),
             "pixels of the upright picture, from its upper left corner",
             "pass the size of the picture in which the keypoints were found",
         )
@@ -167,8 +180,12 @@ def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | Non
         ]
         return PblError(
             "VIEWS_DISAGREE",
-            found=f"trial {name}: {', '.join(wrong)}: read so, the cameras agree within "
-            f"{100 * np.nanmax(miss) * UNITS[unit]:.0f} cm",
+            found=said(
+                "trial {name}: {wrong}: read so, the cameras agree within {cm:.0f} cm",
+                name=name,
+                wrong=", ".join(wrong),
+                cm=100 * np.nanmax(miss) * UNITS[unit],
+            ),
             expected="x_camera = R x_world + t with y down and z forward, t in metres",
             next_step="convert rotation and translation in the calibration (docs/files.md, section Several cameras)",
             key=name,
@@ -212,4 +229,10 @@ def _turned(trial: World, turn: np.ndarray) -> World:
 
 
 def _error(name: str, found: str, expected: str, next_step: str) -> PblError:
-    return PblError("FIT_INPUT", found=f"trial {name}: {found}", expected=expected, next_step=next_step, key=name)
+    return PblError(
+        "FIT_INPUT",
+        found=said("trial {name}: {found}", name=name, found=found),
+        expected=expected,
+        next_step=next_step,
+        key=name,
+    )

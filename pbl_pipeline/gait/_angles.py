@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results.cycles import BODY_ANGLES
 from pbl_pipeline.results.events import LEFT, RIGHT, SIDES
 
@@ -144,7 +144,13 @@ def check_ranges(series: AngleSeries, name: str) -> None:
             if low < least or high > most or (angle == "knee_flexion" and -low > max(high, _BEYOND_DEG)):
                 raise PblError(
                     "GAIT_INPUT",
-                    found=f"{angle.replace('_', ' ')} of the {side} side from {low:.0f} to {high:.0f} deg",
+                    found=said(
+                        "{angle} of the {side} side from {low:.0f} to {high:.0f} deg",
+                        angle=angle.replace("_", " "),
+                        side=side,
+                        low=low,
+                        high=high,
+                    ),
                     expected=f"{least:.0f} to {most:.0f} deg ({ANGLE_NAMES[angle]})",
                     next_step="correct sign and zero of this angle in the program that wrote it, and export again",
                     key=name,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.qc import CADENCE, Check, failed
 from pbl_pipeline.results.cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
 from pbl_pipeline.results.events import FOOT_DOWN, FOOT_UP, LEFT, RIGHT, GaitEvent, GaitEvents
@@ -281,7 +281,11 @@ def check_sides(cycles: Sequence[GaitCycle], name: str) -> None:
     if mean[0] < mean[1] - _LESS_DEG:
         raise PblError(
             "GAIT_INPUT",
-            found=f"knees bent by {mean[0]:.0f} deg in what the events call swing, by {mean[1]:.0f} deg in stance",
+            found=said(
+                "knees bent by {swing:.0f} deg in what the events call swing, by {stance:.0f} deg in stance",
+                swing=mean[0],
+                stance=mean[1],
+            ),
             expected="events and angles of the same leg under the same side",
             next_step="exchange left and right of the events, or of the angles, in the program that wrote them",
             key=name,

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.resources import cores
@@ -58,7 +58,7 @@ def detect_keypoints(
     if track is None:
         raise PblError(
             "SUBJECT_UNKNOWN_PERSON",
-            found=f"person {person_id}",
+            found=said("person {n}", n=person_id),
             expected=f"one of {', '.join(str(p.person_id) for p in tracking.persons) or 'no one: no person was found'}",
             next_step="choose one of the numbers that tracking returned",
             key=str(video_path),
@@ -68,9 +68,9 @@ def detect_keypoints(
         lasts = float(tracking.time_s[-1] - tracking.time_s[0]) if len(tracking.time_s) else 0.0
         raise PblError(
             "TRACK_TOO_SHORT",
-            found=f"the whole video lasts {lasts:.2f} s"
+            found=said("the whole video lasts {s:.2f} s", s=lasts)
             if lasts < params.min_time_s
-            else f"person {person_id} is in view for {in_view:.2f} s",
+            else said("person {n} is in view for {s:.2f} s", n=person_id, s=in_view),
             expected=f"{params.min_time_s:g} s or more; a gait cycle takes about 1.1 s and three or more are wanted",
             next_step="film again so that the whole body stays in the picture for several steps, or choose another "
             "person",
@@ -130,7 +130,7 @@ def _detect_all(
     if n_seen != len(regions.rows):
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{n_seen} of the {len(regions.rows)} frames in which the person was tracked",
+            found=said("{n} of the {all} frames in which the person was tracked", n=n_seen, all=len(regions.rows)),
             expected="the video that was tracked",
             next_step="track the people again in this file",
             key=str(video_path),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.video import CameraPose, load_camera, load_camera_poses, undistort_px
 
 from .types import Keypoints
@@ -94,11 +94,11 @@ def check_same_times(times_s: Sequence[np.ndarray], key: object = None) -> None:
     first = np.asarray(times_s[0])
     for number, other in enumerate(times_s[1:], 2):
         if len(other) != len(first):
-            found = f"{len(other)} frames in view {number}, {len(first)} in the first"
+            found = said("{n} frames in view {view}, {first} in the first", n=len(other), view=number, first=len(first))
             raise _view_error(found, "the same frames in all", key=key)
         apart = float(np.max(np.abs(np.asarray(other) - first), initial=0.0))
         if not apart <= SAME_TIME_S:
-            found = f"time stamps of view {number} up to {1000 * apart:.3g} ms from the first's"
+            found = said("time stamps of view {view} up to {ms:.3g} ms from the first's", view=number, ms=1000 * apart)
             raise _view_error(found, f"at most {1000 * SAME_TIME_S:g} ms: cameras that were started together", key=key)
 
 
@@ -195,7 +195,11 @@ def check_views_agree(trial: MultiView, name: str) -> float:
         cells = ", ".join(f"{n} {100 * m:.0f} cm" for n, m in zip(names, miss, strict=True) if np.isfinite(m))
         raise PblError(
             "VIEWS_DISAGREE",
-            found=f"trial {name}: rays of the cameras to the person's points miss each other ({cells})",
+            found=said(
+                "trial {name}: rays of the cameras to the person's points miss each other ({cells})",
+                name=name,
+                cells=cells,
+            ),
             expected=f"at most {100 * MOST_MISS_M:.0f} cm: one person, cameras that stand where the calibration says",
             next_step="look at the numbered people of each view (`pbl choose VIDEO_ID --sheet FILE`) and choose the "
             "same person in all; where they are the same, check the order of the cameras and calibrate again",

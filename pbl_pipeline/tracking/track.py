@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.methods import Method
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
@@ -78,7 +78,7 @@ def _check_upright(persons: Sequence[PersonTrack], video_path: str | Path) -> No
     if share > UPSIDE_DOWN_SHARE:
         raise PblError(
             "VIDEO_UPSIDE_DOWN",
-            found=f"people whose heads are below their feet, in {share:.0%} of the sightings",
+            found=said("people whose heads are below their feet, in {share:.0%} of the sightings", share=share),
             expected="people with their heads up",
             next_step="turn the video by half a turn in the phone's editor and send it again",
             key=str(video_path),
@@ -117,8 +117,8 @@ def _follow(video_path: str | Path, params: TrackingParams, detector: PersonDete
     if n_frames != info.n_frames:
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{n_frames} frames",
-            expected=f"the {info.n_frames} frames that were probed",
+            found=said("{n} frames", n=n_frames),
+            expected=said("the {n} frames that were probed", n=info.n_frames),
             next_step="probe the video again",
             key=str(video_path),
         )

@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from pbl_pipeline.errors import said
+
 #: Boxes that may be the first of an MP4 or MOV file.
 _FIRST_BOXES = {b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot", b"styp"}
 #: Most boxes that are read of a file: an hour in fragments of one picture has some hundred thousand.
@@ -95,7 +97,9 @@ def _mp4(file: BinaryIO, size: int) -> str | None:
         boxes.add(name)
         # Only boxes that hold pictures or their index: some writers end with an odd, harmless metadata box.
         if at + length > size and name in (b"mdat", b"moov", b"moof"):
-            return f"the '{name.decode()}' box ends at byte {at + length}, the file at {size}"
+            return said(
+                "the '{box}' box ends at byte {end}, the file at {size}", box=name.decode(), end=at + length, size=size
+            )
     if b"moov" not in boxes:
         return "the index of the recording (the 'moov' box) is not in the file"
     return None

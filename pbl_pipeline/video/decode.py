@@ -18,7 +18,7 @@ import av
 from av.container import InputContainer
 from av.error import FFmpegError
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.resources import cores, keep_large_blocks
 
 from .coded_units import is_damaged
@@ -72,7 +72,7 @@ def check_file(path: str | Path) -> Path:
     except OSError as error:
         raise PblError(
             "VIDEO_MISSING",
-            found=f"the file cannot be read ({_words(error)})",
+            found=said("the file cannot be read ({why})", why=_words(error)),
             expected="a file that this account may read",
             next_step="change the file's permissions or copy it to one of your folders",
             key=path,
@@ -209,7 +209,14 @@ class Decoder:
             (w, h), n = self._size, self.n_frames
             raise PblError(
                 "VIDEO_DAMAGED",
-                found=f"the picture is {w}x{h} px, but {size[0]}x{size[1]} px from frame {n} on",
+                found=said(
+                    "the picture is {w}x{h} px, but {w2}x{h2} px from frame {n} on",
+                    w=w,
+                    h=h,
+                    w2=size[0],
+                    h2=size[1],
+                    n=n,
+                ),
                 expected="one picture size for the whole recording",
                 next_step="cut the recording where the size changes and process the pieces as separate videos",
                 key=self.path,
@@ -228,7 +235,12 @@ class Decoder:
         if lost is not None:
             raise PblError(
                 "VIDEO_TRUNCATED",
-                found=f"{self.n_frames} frames ({self._seconds(self._last_pts):.2f} s) decode, but {lost}",
+                found=said(
+                    "{n} frames ({s:.2f} s) decode, but {lost}",
+                    n=self.n_frames,
+                    s=self._seconds(self._last_pts),
+                    lost=lost,
+                ),
                 expected="a recording that is whole to its end",
                 next_step=_COPY_AGAIN + "; if the original is cut too, save the part that plays as a new file "
                 '("ffmpeg -i cut.mp4 -c:v libx264 part.mp4") and process that',
@@ -237,7 +249,7 @@ class Decoder:
         if self.n_frames == 0:
             raise PblError(
                 "VIDEO_NO_FRAMES",
-                found=f"0 frames of {self._n_packets} packets decode",
+                found=said("0 frames of {n} packets decode", n=self._n_packets),
                 expected="at least one frame that decodes",
                 next_step=_COPY_AGAIN + "; if it does not play elsewhere either, it has to be recorded again",
                 key=self.path,
@@ -245,14 +257,20 @@ class Decoder:
         if self._n_damaged:
             raise PblError(
                 "VIDEO_DAMAGED",
-                found=f"{self._n_damaged} pictures inside the recording do not decode cleanly ({self.n_frames} do)",
+                found=said(
+                    "{n} pictures inside the recording do not decode cleanly ({all} do)",
+                    n=self._n_damaged,
+                    all=self.n_frames,
+                ),
                 expected="a recording without damaged pictures (those after one are drawn from it)",
                 next_step=_COPY_AGAIN + "; if the original is damaged too, cut out an undamaged part",
                 key=self.path,
             )
         if self._n_unordered > _MAX_UNORDERED * self.n_frames:
             n_all = self.n_frames + self._n_unordered
-            raise self._time_stamp_error(f"{self._n_unordered} of {n_all} frames repeat a stamp or run backwards")
+            raise self._time_stamp_error(
+                said("{n} of {all} frames repeat a stamp or run backwards", n=self._n_unordered, all=n_all)
+            )
         self._note()
 
     def _seconds(self, pts: int | None) -> float:
@@ -264,23 +282,27 @@ class Decoder:
         if lost is not None:
             return lost
         if self._demux_error is not None:
-            return f"reading stops there: {self._demux_error}"
+            return said("reading stops there: {why}", why=self._demux_error)
         if self._last_packet_corrupt:
             return "the last packet of the file is incomplete"
         if self._last_frame_corrupt:
             return "the last picture is incomplete"
         beyond_s = self._seconds(self._max_packet_pts) - self._seconds(self._last_pts)
         if self._max_packet_pts is not None and beyond_s > 0:
-            return f"the pictures of the last {beyond_s:.2f} s do not decode"
+            return said("the pictures of the last {s:.2f} s do not decode", s=beyond_s)
         if self._n_packets < self.n_announced:
             # An edit list also leaves out packets beyond its end; without it every packet of the file comes.
             try:
                 n_stored = _count_packets(self.path, self.stream.index)
             except FFMPEG_ERRORS as error:
                 check_memory(error, self.path)
-                return f"the container announces {self.n_announced} frames and cannot be read for them: {_words(error)}"
+                return said(
+                    "the container announces {n} frames and cannot be read for them: {why}",
+                    n=self.n_announced,
+                    why=_words(error),
+                )
             if n_stored < self.n_announced:
-                return f"the container announces {self.n_announced} frames and holds {n_stored}"
+                return said("the container announces {n} frames and holds {all}", n=self.n_announced, all=n_stored)
             self._n_hidden = n_stored - self.n_frames
         if not self.n_announced and self.container.duration is not None:
             # Only without an announced count: the length may be rounded, or that of another stream.
@@ -334,7 +356,7 @@ class Decoder:
             "VIDEO_NOT_A_VIDEO",
             found="a video stream that no decoder here reads"
             if unknown
-            else f"a file with {', '.join(kinds) or 'no'} streams and no video",
+            else said("a file with {kinds} streams and no video", kinds=", ".join(kinds) or "no"),
             expected=_EXPECTED,
             next_step="choose the file that holds the pictures; convert it to MP4 (H.264) if its codec is unusual",
             key=self.path,
@@ -348,7 +370,12 @@ class Decoder:
         self.container.close()
         raise PblError(
             "VIDEO_TOO_LARGE",
-            found=f"pictures of {stream.codec_context.width}x{stream.codec_context.height} px ({size >> 20} MiB each)",
+            found=said(
+                "pictures of {w}x{h} px ({size} MiB each)",
+                w=stream.codec_context.width,
+                h=stream.codec_context.height,
+                size=size >> 20,
+            ),
             expected=f"at most {_MAX_PICTURE >> 20} MiB each: 4K in 10 bits, 5.3K in 8",
             next_step='make it smaller ("ffmpeg -i large.mp4 -vf scale=3840:-2 small.mp4")',
             key=self.path,
@@ -386,7 +413,7 @@ def _open(path: Path) -> InputContainer:
     if photo is not None:
         raise PblError(
             "VIDEO_NOT_A_VIDEO",
-            found=f"a photo ({photo})",
+            found=said("a photo ({kind})", kind=photo),
             expected=_EXPECTED,
             next_step="film the person walking; of a Live Photo, share the video",
             key=path,
@@ -399,14 +426,16 @@ def _open(path: Path) -> InputContainer:
         if lost is None:
             raise PblError(
                 "VIDEO_NOT_A_VIDEO",
-                found=f"no decoder recognises the file's {path.stat().st_size} bytes ({_words(error)})",
+                found=said(
+                    "no decoder recognises the file's {n} bytes ({why})", n=path.stat().st_size, why=_words(error)
+                ),
                 expected=_EXPECTED,
                 next_step="check that it is the video itself, not a link, a preview or a text, and copy it again",
                 key=path,
             ) from error
         raise PblError(
             "VIDEO_TRUNCATED",
-            found=f"{lost}, so nothing of it can be read",
+            found=said("{lost}, so nothing of it can be read", lost=lost),
             expected="a recording that is whole to its end",
             next_step=_COPY_AGAIN + "; a recording that the phone itself could not finish (battery, storage) has to be "
             "repaired with a tool for that or recorded again",

@@ -21,7 +21,7 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.names import is_plain
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check
@@ -278,7 +278,11 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         if n_interlaced > 0.5 * len(stamps):
             raise PblError(
                 "VIDEO_PIXELS",
-                found=f"{n_interlaced} of {len(stamps)} pictures are interlaced: each shows two moments, line by line",
+                found=said(
+                    "{n} of {all} pictures are interlaced: each shows two moments, line by line",
+                    n=n_interlaced,
+                    all=len(stamps),
+                ),
                 expected="pictures of one moment each",
                 next_step='film progressively, or separate the moments ("ffmpeg -i in.mp4 -vf bwdif out.mp4")',
                 key=path,
@@ -288,10 +292,13 @@ def probe(path: str | Path, *, threads: int | None = None) -> VideoInfo:
         if widths is not None or n_lines:
             raise PblError(
                 "VIDEO_SCREEN",
-                found=f"{n_lines} exactly straight lines around what moves, as of a screen's windows and bars"
+                found=said("{n} exactly straight lines around what moves, as of a screen's windows and bars", n=n_lines)
                 if widths is None
-                else f"borders of {widths[0]:.0%} and {widths[1]:.0%} of the picture at two opposite sides, which "
-                "never change",
+                else said(
+                    "borders of {one:.0%} and {other:.0%} of the picture at two opposite sides, which never change",
+                    one=widths[0],
+                    other=widths[1],
+                ),
                 expected="the whole picture of a camera",
                 next_step="send the recording itself, not one of a screen on which it is played, nor an edited copy",
                 key=path,
@@ -407,7 +414,7 @@ def _check_square(path: Path, pixel_aspect: Fraction | None) -> None:
     if pixel_aspect and abs(float(pixel_aspect) - 1) > _SQUARE_WITHIN:
         raise PblError(
             "VIDEO_PIXELS",
-            found=f"pixels of {pixel_aspect.numerator}:{pixel_aspect.denominator}, as the file states",
+            found=said("pixels of {w}:{h}, as the file states", w=pixel_aspect.numerator, h=pixel_aspect.denominator),
             expected="square pixels",
             next_step='resample the pictures ("ffmpeg -i in.mp4 -vf scale=iw*sar:ih,setsar=1 out.mp4")',
             key=path,

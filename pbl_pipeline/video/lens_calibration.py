@@ -27,7 +27,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from pbl_pipeline.bounded import read_json
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results.video_facts import FirstPicture, VideoInfo
 
 from .camera import guess_camera, load_camera, scaled_matrix
@@ -256,7 +256,9 @@ def _check_same_phone(content: Mapping[str, Any], video: FirstPicture) -> None:
         if not same:
             raise PblError(
                 "CAMERA_INVALID",
-                found=f"a calibration of {theirs}{what}, and a video of {ours}{what}",
+                found=said(
+                    "a calibration of {theirs}, and a video of {ours}", theirs=f"{theirs}{what}", ours=f"{ours}{what}"
+                ),
                 expected="the calibration of the lens that recorded the video",
                 next_step="pass the calibration of that lens with --camera, or none",
                 key=video.path,

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import errno
+import json
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pymysql
+from datajoint.jobs import ERROR_MESSAGE_LENGTH
 
-from pbl_pipeline.errors import CODERS, CODES, PblError, causes
+from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said_of
 
 from .datajoint_setup import AWAY, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
 
@@ -17,7 +19,7 @@ from .datajoint_setup import AWAY, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnecti
 _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")
 #: A code at the beginning of a message, behind the name of the exception where DataJoint writes one.
 _CODE = re.compile(r"(?:\w+: )?([A-Z_0-9]+):")
-#: Longest texts that keep a whole coded error within the 2047 characters of a job's error_message.
+#: Longest parts that keep a coded error whole in a job's error_message, as DataJoint's own populate writes it.
 _LIMITS = {"found": 600, "expected": 350, "next_step": 600, "key": 250}
 _REPORT = "report this with the error stack that `pbl status --json` prints"
 
@@ -100,10 +102,26 @@ def _cut(text: str, limit: int) -> str:
     return text if len(text) <= limit else text[: limit - 4] + " ..."
 
 
+def of_job(error: BaseException, table: str, key: Mapping[str, Any]) -> PblError:
+    """Return the coded error of a job that failed, about its key where it names nothing itself."""
+    return fitted(error, key) if isinstance(error, PblError) else internal(error, table, key)
+
+
 def error_message(error: BaseException, table: str, key: Mapping[str, Any]) -> str:
-    """Return the message of an error row, always with a code."""
-    coded = fitted(error, key) if isinstance(error, PblError) else internal(error, table, key)
-    return f"PblError: {coded}"
+    """Return the message of an error row: a code, always, and the parts of the error as JSON."""
+    return as_text(of_job(error, table, key), ERROR_MESSAGE_LENGTH)
+
+
+def as_text(error: PblError, longest: int) -> str:
+    """Return an error for a column of so many characters, which `stored_error` reads; the longest parts are cut."""
+    data = error.data()
+    while len(text := f"{error.code}: {json.dumps(data, ensure_ascii=False)}") > longest:
+        part = max(data, key=lambda name: len(json.dumps(data[name], ensure_ascii=False)))
+        if isinstance(data[part], dict):
+            data[part] = str(said_of(data[part]))
+        else:
+            data[part] = _cut(data[part], int(0.9 * len(data[part])))
+    return text
 
 
 def error_code(message: str) -> str:
@@ -112,17 +130,24 @@ def error_code(message: str) -> str:
     return found[1] if found and found[1] in CODES else "INTERNAL"
 
 
-def error_next_step(message: str) -> str:
-    """The next step an error row's message states, or how to report it. The last one: names stand before it, and the
-    name of a file may hold a line that looks like one."""
-    return _stated("next:", reversed(message.splitlines()), _REPORT)
-
-
-def error_found(message: str) -> str:
-    """Return what an error row's message states as found; the message itself when it is not a coded one."""
-    return _stated("found:", message.splitlines(), message.strip())
+def stored_error(message: str) -> PblError:
+    """Return the error that a row's message holds: as `as_text` writes it, or the text of one, as earlier versions and
+    DataJoint's own populate write it. INTERNAL, the whole message as found, for one that is not coded."""
+    code, start = error_code(message), _CODE.match(message)
+    said = message[start.end() :].strip() if start else ""
+    try:
+        data = json.loads(said) if said.startswith("{") else None
+    except ValueError:
+        data = None
+    if isinstance(data, dict) and start and start[1] == code:
+        found, expected, next_step = (said_of(data.get(name, "")) for name in ("found", "expected", "next_step"))
+        return PblError(code, found, expected, next_step, data.get("key"))
+    lines = [line.strip() for line in message.splitlines()]
+    of_one_line = said if start and start[1] == code and len(lines) == 1 else message.strip()
+    # The last next step: names stand before it, and the name of a file may hold a line that looks like one.
+    next_step = _stated("next:", reversed(lines), _REPORT)
+    return PblError(code, _stated("found:", lines, of_one_line), _stated("expected:", lines, ""), next_step)
 
 
 def _stated(word: str, lines: Iterable[str], otherwise: str) -> str:
-    stated = (line.strip().removeprefix(word).strip() for line in lines if line.strip().startswith(word))
-    return next(stated, otherwise)
+    return next((line.removeprefix(word).strip() for line in lines if line.startswith(word)), otherwise)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.records import definition, from_row, number, to_row
 from pbl_pipeline.results.video_facts import OF_FILE
@@ -286,7 +286,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
     if found != sha256:
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{path} has SHA-256 {found}",
+            found=said("{path} has SHA-256 {sum}", path=path, sum=found),
             expected=f"SHA-256 {sha256}, as registered",
             next_step="restore the original file, then `pbl populate --retry-errors`; "
             "or `pbl ingest` the changed file as a separate video",
@@ -298,7 +298,7 @@ def registered_file(path: str, sha256: str, key: dict) -> Path:
 def _missing(path: str | Path, key: Mapping[str, Any]) -> PblError:
     return PblError(
         "VIDEO_MISSING",
-        found=f"no file at {path}",
+        found=said("no file at {path}", path=path),
         expected="the file that was registered",
         next_step="bring the file or its disk back, then `pbl populate --retry-errors`; "
         "if it lies elsewhere now, `pbl ingest` the new path and the row takes it over",

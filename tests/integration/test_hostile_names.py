@@ -19,7 +19,7 @@ from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.intake.calibrations import camera_row
 from pbl_schemas.intake.references import add_reference
-from pbl_schemas.job_errors import error_next_step
+from pbl_schemas.job_errors import stored_error
 from pbl_schemas.reading.visits import write_visit
 from pbl_workers.populate import populate
 from research.benchmarks import mutated_files as files
@@ -71,7 +71,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
         said = str(result.error)
         said.encode()  # no lone surrogate
         assert "\x1b" not in said
-        assert error_next_step(said) == "rename the file or folder"
+        assert stored_error(said).next_step == "rename the file or folder"
         assert len(said.splitlines()) == 5
     run = populate([t.__name__ for t in pbl_schemas.computed_tables() if t.__name__ not in ON_REQUEST])
     assert not {t.table: t.errors for t in run.tables if t.errors}

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.video
+from pbl_pipeline.errors import PblError, said
 from pbl_schemas import connection, fit, gait, keypoints, tracking, video
-from pbl_schemas.job_errors import error_code, error_found
+from pbl_schemas.job_errors import error_message, stored_error
 from pbl_schemas.jobs import jobs_of
+from pbl_schemas.reading.why import why
 from pbl_workers import queue, requeue, run_job
 from tests.rows import register
 
-from .jobs import queued, work
+from . import web
+from .jobs import first_job, queued, work
 
 
 def claimed(table: Any) -> queue.Claim:
@@ -27,8 +30,8 @@ def claimed(table: Any) -> queue.Claim:
 
 def error(table: Any) -> tuple[str, str]:
     """Code and finding of the only error row of a table."""
-    message = jobs_of(table).errors.fetch1("error_message")
-    return error_code(message), error_found(message)
+    stored = stored_error(jobs_of(table).errors.fetch1("error_message"))
+    return stored.code, stored.found
 
 
 def test_a_file_whose_name_is_a_word_of_datajoint_is_one_error(tables: None, tmp_path: Path):
@@ -168,3 +171,16 @@ def test_plain_populate_reports_a_missing_row_with_its_code(tables: None, tmp_pa
         assert len(queue.errors_of(fit.SessionFit, "FILE_FORMAT")) == 0
     finally:
         fit.BodyModel.insert(body)
+
+
+def test_an_error_of_a_job_is_german_and_whole_on_pages(tables: None, tmp_path: Path):
+    job = first_job(tmp_path, "gang")
+    found = said("trial {name}: {found}", name="gang", found=said("strides of {s:.2g} s", s=0.125))
+    step = "correct the times of the frames, in seconds (the rate of the recording)"
+    queue.fail(job, error_message(PblError("FIT_INPUT", found, "0.6 to 4 s", step), "VideoInfo", job.key))
+    browser = web.client(role="reviewer,operator")
+    browser.headers["accept-language"] = "de"
+    for path in ("/visits/1", "/recordings/1", "/operate"):
+        assert "Aufnahme gang: Doppelschritte von 0,12 s" in browser.get(path).text, path
+    assert "erichtigen Sie die Zeiten der Bilder" in browser.get("/visits/1").text
+    assert why(1).verdict.startswith("reading of the video failed (FIT_INPUT: trial gang: strides of 0.12 s)")

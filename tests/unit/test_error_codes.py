@@ -15,7 +15,7 @@ BEFORE_IMPORTS = {"PYTHON_UNSUPPORTED"}
 def _declared(package: str) -> set[str]:
     source = PACKAGES[package] / package / "errors.py"
     tables = [node for node in nodes(source) if isinstance(node, ast.Dict)]
-    return {str(k.value) for t in tables for k in t.keys if isinstance(k, ast.Constant)}
+    return {str(k.value) for t in tables for k in t.keys if isinstance(k, ast.Constant) and str(k.value).isupper()}
 
 
 def _written(*packages: str) -> set[str]:

@@ -20,7 +20,7 @@ _PAGES = [*WEB.glob("templates/*.html"), *WEB.glob("*.py"), Path(texts.__file__)
 
 def own() -> dict[str, dict[str, str]]:
     """The page's own texts by name; those of the library have its English as name."""
-    return {name: t for name, t in texts.catalogue().items() if not name.startswith("library.")}
+    return {name: t for name, t in texts.catalogue().items() if not name.startswith(("library.", "said."))}
 
 
 def test_every_text_is_in_both_languages_with_the_same_places():
@@ -74,7 +74,7 @@ def test_what_the_library_says_is_in_every_language():
     names |= {w for measure in words.MEASURES.values() for w in measure[:2]} | {
         w for a in words.ANGLES.values() for w in a
     }
-    ours = {name.removeprefix("library."): t for name, t in texts.catalogue().items() if name not in own()}
+    ours = {name.removeprefix("library."): t for name, t in texts.catalogue().items() if "library." in name[:8]}
     assert len(checks) > 30
     assert names - {""} <= set(ours)
     assert all(set(t) | {"en"} == set(texts.LANGUAGES) for t in ours.values())
@@ -121,6 +121,7 @@ def test_what_the_library_says_is_in_every_language():
         and e not in report
         and not any(p.fullmatch(e) for p in placed if len(p.pattern) > 40)
         and not (parts[e] and all(part in pool for part in parts[e]))
+        and f"; {e}" not in pool
     ]
     assert not dead, "\n".join(dead)
 

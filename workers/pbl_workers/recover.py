@@ -8,7 +8,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_schemas import worker
 from pbl_schemas.job_errors import error_message
 from pbl_schemas.jobs import jobs_of
@@ -63,7 +63,7 @@ def crashed(job: Claim, reason: str) -> bool:
 def _crash(job: Claim, n: int, reason: str) -> str:
     error = PblError(
         "WORKER_CRASH",
-        found=f"the worker's process died {n} times over this job, last: {reason}",
+        found=said("the worker's process died {n} times over this job, last: {why}", n=n, why=reason),
         expected="a result or a coded error",
         next_step="check memory (exit by SIGKILL) and the recording; then `pbl retry`, or report it",
         key=str(job),
@@ -75,7 +75,7 @@ def overdue(job: Claim, limit_s: float) -> bool:
     """Make a job the error row TIME_LIMIT. Returns whether it was still that process's."""
     error = PblError(
         "TIME_LIMIT",
-        found=f"no result within the time limit of {limit_s:g} s",
+        found=said("no result within the time limit of {s:g} s", s=limit_s),
         expected="a result in that time",
         next_step="look at the recording; `pbl worker --limit-factor 4` allows more, then `pbl retry`",
         key=str(job),

@@ -18,7 +18,7 @@ from pbl_pipeline.errors import PblError, causes
 from pbl_schemas import connection
 from pbl_schemas.connection import DuplicateError, IntegrityError, LostConnectionError, inserting
 from pbl_schemas.datajoint_setup import AWAY, FULL, REPEAT
-from pbl_schemas.job_errors import error_code, error_message
+from pbl_schemas.job_errors import error_message, of_job
 from pbl_schemas.jobs import keys_of
 from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import remove_left_over
@@ -168,8 +168,8 @@ def _is_wanted(job: Claim) -> bool:
 
 
 def _outcome(job: Claim, what: str, error: BaseException) -> Outcome:
-    text = error_message(error, job.table.__name__, job.key)
-    return Outcome(job, what, code=error_code(text), text=text)
+    coded = of_job(error, job.table.__name__, job.key)
+    return Outcome(job, what, code=coded.code, text=coded.text())
 
 
 def _settle(job: Claim, error: Exception) -> Outcome:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from pbl_pipeline.bounded import MAX_SECONDS, span_s
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.gait.motion import FootTrajectories
 from pbl_pipeline.results.events import SIDES
 from pbl_pipeline.sampling import interval_of
@@ -54,11 +54,11 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
         return None, f"the person is in view for less than {least_s:g} s", "film at least three steps"
     step_s = interval_of(time)
     if span_s(time) > MAX_SECONDS:
-        said = f"{span_s(time):.3g} s from the first to the last time stamp"
-        raise input_error(said, f"at most {MAX_SECONDS:g} s of one recording: are the time stamps in seconds?")
+        lasts = said("{s:.3g} s from the first to the last time stamp", s=span_s(time))
+        raise input_error(lasts, f"at most {MAX_SECONDS:g} s of one recording: are the time stamps in seconds?")
     if step_s > MAX_GAP_S:
-        said = f"frames {step_s:.3g} s apart: gait events cannot be seen in these"
-        return None, said, "check that the time stamps are in seconds"
+        why = f"frames {step_s:.3g} s apart: gait events cannot be seen in these"
+        return None, why, "check that the time stamps are in seconds"
     grid = on_grid(time, feet.legs_m, feet.up)
     hips = grid.known[:, 0].all(axis=1)
     if np.count_nonzero(hips) < least_s * GRID_HZ or not math.isfinite(grid.leg_m):
@@ -70,11 +70,11 @@ def _grid(feet: FootTrajectories, least_s: float) -> tuple[Grid | None, str, str
             return grid, f"the {side} foot is never seen", "film from where both legs are in view"
     height = check_upright(grid)
     if height < MIN_HIP_HEIGHT:
-        said = f"the hips are {height:.2f} leg lengths above the feet: no one is standing"
-        return grid, said, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
+        why = f"the hips are {height:.2f} leg lengths above the feet: no one is standing"
+        return grid, why, "nothing to do where the person lies or sits; else the vertical axis (z up) is another one"
     if np.mean(seated(grid)[hips]) > SEATED_SHARE:
-        said = "the person sits: the hips are hardly ever as high above the lower foot as a standing person's"
-        return grid, said, "feet that push a wheelchair or a stool along have no gait events"
+        why = "the person sits: the hips are hardly ever as high above the lower foot as a standing person's"
+        return grid, why, "feet that push a wheelchair or a stool along have no gait events"
     return grid, "", ""
 
 

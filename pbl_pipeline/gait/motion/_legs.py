@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import Body
@@ -63,7 +63,7 @@ def trial_poses(fit: TrialFit) -> BodyPoses:
     if widest > 2 * np.pi:
         raise PblError(
             "GAIT_INPUT",
-            found=f"a joint at {widest:.3g} rad",
+            found=said("a joint at {widest:.3g} rad", widest=widest),
             expected="qpos in radians, no joint beyond a full turn",
             next_step="write qpos in radians, as `pbl fit` does; the angles.csv beside it is in degrees",
             key=fit.name,

@@ -16,6 +16,7 @@ from pbl_pipeline.names import check_label
 
 from .. import session
 from ..capture import RECEIVED, REFUSED, UPLOADING, PhoneLink, PhoneRecording, Protocol
+from ..job_errors import as_text, stored_error
 from ..reading.usable import Usable, verdicts
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id
@@ -39,7 +40,9 @@ _refused = functools.partial(
 
 
 _TAKEN = "a link that another phone has opened"
-_TRIED = re.compile(r"(\d+) x ")
+_TRIED = re.compile(r"^(\d+) x ")
+#: Characters of an error, which how often it was tried stands before.
+_LONGEST = 980
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Phone:
 
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """A recording that a phone sends. `about`: statements of the phone; `error`: reason of a refusal, or empty."""
+    """A recording that a phone sends. `about`: statements of the phone; `error`: why it was refused."""
 
     number: int
     session_id: int
@@ -64,7 +67,7 @@ class Sent:
     log_bytes: int
     about: Mapping[str, Any]
     state: str
-    error: str
+    error: PblError | None
     video_id: int | None
 
     @property
@@ -272,7 +275,7 @@ def received(number: int, video_id: int) -> None:
 
 def refused(number: int, error: PblError) -> None:
     """Note that a recording cannot be taken, and why."""
-    row = {"phone_recording": number, "phone_state": REFUSED, "phone_error": error.short()[:1000]}
+    row = {"phone_recording": number, "phone_state": REFUSED, "phone_error": as_text(error, _LONGEST)}
     PhoneRecording.update1(row)
 
 
@@ -280,7 +283,7 @@ def not_yet(number: int, error: PblError) -> None:
     """Note that a recording could not be taken this time, for a cause outside of it, and how often."""
     before = (PhoneRecording & {"phone_recording": number}).fetch1("phone_error")
     tried = int(found[1]) + 1 if (found := _TRIED.match(before)) else 1
-    PhoneRecording.update1({"phone_recording": number, "phone_error": f"{tried} x {error.short()}"[:1000]})
+    PhoneRecording.update1({"phone_recording": number, "phone_error": f"{tried} x {as_text(error, _LONGEST)}"})
 
 
 def upload_refused(found: str, next_step: str = "film again; if it happens again, report it") -> PblError:
@@ -301,6 +304,6 @@ def _sent(row: Mapping[str, Any]) -> Sent:
         log_bytes=int(row["phone_log_size"]),
         about=row["phone_about"],
         state=row["phone_state"],
-        error=row["phone_error"],
+        error=stored_error(_TRIED.sub("", row["phone_error"], count=1)) if row["phone_error"] else None,
         video_id=None if row["video_id"] is None else int(row["video_id"]),
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 from .. import computed_tables, connection, keypoints, tracking, video, worker
 from ..decisions import not_usable
-from ..job_errors import error_code, error_found, error_next_step
+from ..job_errors import error_code, stored_error
 from ..jobs import jobs_of
 from ..operations.archive import disks
 from ..operations.catalog import quote
@@ -396,15 +396,15 @@ def _errors(table: Any, most: int) -> list[ErrorRow]:
     out = []
     for row in jobs_of(table).errors.to_dicts(limit=most):
         key = {k: row[k] for k in jobs_of(table).primary_key}
-        message = row["error_message"]
+        error = stored_error(row["error_message"])
         out.append(
             ErrorRow(
                 table=table.__name__,
                 key=key,
                 about=_file_of(key),
-                code=error_code(message),
-                found=error_found(message),
-                next_step=error_next_step(message),
+                code=error.code,
+                found=error.found,
+                next_step=error.next_step,
                 stack=str(row["error_stack"] or ""),
             )
         )

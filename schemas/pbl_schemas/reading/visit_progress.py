@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from .. import computed_tables, fit, video
-from ..job_errors import error_code, error_found, error_next_step
+from ..job_errors import stored_error
 from ..operations.catalog import quote
 from ..video import Video
 from .status import queue_counts, queue_name
@@ -81,6 +81,6 @@ def visit_progress(session_id: int) -> Progress:
             if status == "reserved":
                 running.append((table.__name__, str(host)))
             elif status == "error":
-                said = str(message)
-                failed.append(Failed(table.__name__, error_code(said), error_found(said), error_next_step(said)))
+                error = stored_error(str(message))
+                failed.append(Failed(table.__name__, error.code, error.found, error.next_step))
     return Progress(int(session_id), queued, tuple(running), tuple(failed))

@@ -18,7 +18,7 @@ from .. import fit, gait, gdi, keypoints, privacy, session, tracking, video
 from ..chain import before
 from ..decisions.not_usable import unusable
 from ..gait import load_cycles
-from ..job_errors import error_code, error_found
+from ..job_errors import stored_error
 from ..jobs import jobs_of
 from ..method_names import with_keys
 from ..operations.archive import plain_name
@@ -313,8 +313,7 @@ def _problem(video_id: int, choice: SubjectChoice | None) -> str:
         return f"not usable: {mark[video_id].text}"
     for table in before(fit.SessionFit):
         for row in (jobs_of(table).errors & {"video_id": video_id}).to_dicts():
-            message = row["error_message"]
-            return f"{error_code(message)}: {error_found(message)}"
+            return stored_error(row["error_message"]).short()
     if choice is not None and choice.status not in tracking.CHOSEN:
         return choice.reason
     return "not computed yet"

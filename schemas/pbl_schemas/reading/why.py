@@ -11,7 +11,7 @@ from pbl_pipeline.words import STAGES
 from .. import computed_tables, fit, tracking, video
 from ..chain import ON_REQUEST, before, followers
 from ..decisions.not_usable import unusable
-from ..job_errors import error_code, error_found, error_next_step
+from ..job_errors import stored_error
 from ..jobs import jobs_of
 from ..rows import inside
 from .status import EMPTY_COLUMNS
@@ -147,8 +147,8 @@ def _steps(table: Any, where: Any) -> tuple[_Steps, _Steps]:
     columns = ["status", "error_message", "host", "pid", "reserved_time", "priority", "scheduled_time"]
     for row in (jobs_of(table).proj(*columns) & where).to_dicts(order_by="KEY"):
         if row["status"] == "error":
-            message = row["error_message"]
-            add(jobs, row, ERROR, f"{error_code(message)}: {error_found(message)}", error_next_step(message))
+            error = stored_error(row["error_message"])
+            add(jobs, row, ERROR, error.short(), error.next_step)
         elif row["status"] == "reserved":
             add(jobs, row, RUNNING, f"by {row['host']}:{row['pid']} since {row['reserved_time']}")
         elif row["status"] == "pending":
