@@ -94,3 +94,16 @@ def test_maps_of_the_networks_lie_where_their_points_do(name: str, frames: dict[
     assert np.abs(np.median(apart, axis=(0, 1))).max() < 1
     assert np.abs(np.median(moved, axis=(0, 1))).max() < 1
     assert np.abs(moved).max() > 2
+
+
+@pytest.mark.parametrize("x", [0.0, 884.0, -2000.0])
+def test_black_pictures_and_people_at_the_border_have_finite_points(x: float, frames: dict[int, np.ndarray]):
+    asset("blazepose_landmarks")
+    method = METHODS["blazepose-33-heatmaps"]
+    refining = method.function(method.params)
+    for image in (frames[100], np.zeros_like(frames[100])):
+        for roi in ([x, 715.0, 440.0, 0.0], [x, 715.0, 60.0, 1.0]):
+            person = refining.detect(image, np.array(roi), CAMERA)
+            assert np.isfinite(person.xy_px).all()
+            assert np.isfinite(person.xyz_cam_m).all()
+            assert np.all((person.confidence >= 0) & (person.confidence <= 1))
