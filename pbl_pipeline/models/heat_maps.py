@@ -22,8 +22,8 @@ _LEAST = 1e-6
 
 
 def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> Any:
-    """Move points to the means of their peaks (mean shift with a Gaussian window), by the fraction that the height of
-    the peak is of 1.
+    """Move points towards the means of their peaks (mean shift in a Gaussian window): the whole way for a peak of
+    probability 1, not at all for a black map.
 
     Parameters
     ----------
