@@ -18,6 +18,7 @@ import numpy as np
 
 from pbl_pipeline.keypoints.framing import Framing
 from pbl_pipeline.video import guess_camera, read_frames
+from tests import not_none
 
 #: Shares of the height between the feet, or the crown, and the border; below 0 they are cut off.
 SHARES = (0.2, 0.1, 0.05, 0.02, -0.02, -0.05, -0.1, -0.2)
@@ -25,10 +26,11 @@ CROWN, SIDE_PX = 0.07, 640
 
 
 def small(image: np.ndarray) -> np.ndarray:
+    """A picture as the phone's page sends it."""
     scale = min(1.0, SIDE_PX / max(image.shape[:2]))
     packed = cv2.imencode(".jpg", cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
                           [cv2.IMWRITE_JPEG_QUALITY, 70])[1]  # fmt: skip
-    return cv2.imdecode(packed, cv2.IMREAD_COLOR)
+    return not_none(cv2.imdecode(packed, cv2.IMREAD_COLOR))
 
 
 def main(paths: list[str]) -> None:
