@@ -62,13 +62,7 @@ def check_steps(time_s: np.ndarray, refuse: Refusal) -> None:
     step = interval_of(time_s) if len(time_s) > 1 else STEPS_S[1]
     if STEPS_S[0] <= step <= STEPS_S[1]:
         return
-    guess = (
-        said("frame numbers")
-        if np.allclose(np.diff(time_s), 1)
-        else said("milliseconds")
-        if step > 0.25
-        else said("another unit")
-    )
+    guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"
     raise refuse(
         said("{step:.3g} s from frame to frame, such as {guess} read as seconds", step=step, guess=said(guess)),
         f"{STEPS_S[0]:g} to {STEPS_S[1]:g} s",

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results.video_facts import VideoInfo
 
 CAMERA, DEVICE = "camera", "device"
@@ -66,25 +66,34 @@ def check_attitude(time_s: object, quat_wxyz: object, key: object = None) -> tup
     except (TypeError, ValueError) as error:
         raise log_error(f"values that are not numbers ({error})", "numbers", key=key) from error
     if time.ndim != 1 or quat.shape != (len(time), 4):
-        raise log_error(f"times of shape {time.shape}, quaternions of shape {quat.shape}", "(P,) and (P, 4)", key=key)
+        raise log_error(
+            said("times of shape {times}, quaternions of shape {quats}", times=time.shape, quats=quat.shape),
+            "(P,) and (P, 4)",
+            key=key,
+        )
     if len(time) < 2:
-        raise log_error(f"{len(time)} samples", "at least two", key=key)
+        raise log_error(said("{n} samples", n=len(time)), "at least two", key=key)
     for name, array in (("times", time), ("quaternions", quat)):
         bad = int(np.sum(~np.isfinite(array.reshape(len(time), -1)).all(axis=1)))
         if bad:
             raise log_error(
-                f"{bad} of {len(time)} {name} not finite", "finite numbers; leave such samples out", key=key
+                said("{n} of {all} {what} not finite", n=bad, all=len(time), what=said(name)),
+                "finite numbers; leave such samples out",
+                key=key,
             )
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):
         i = int(back[0])
-        found = (
-            f"{len(back)} stamps that repeat or run backwards, the first at {time[i + 1]:.6g} s after {time[i]:.6g} s"
+        found = said(
+            "{n} stamps that repeat or run backwards, the first at {now:.6g} s after {before:.6g} s",
+            n=len(back),
+            now=time[i + 1],
+            before=time[i],
         )
         raise log_error(found, "strictly increasing times; sort them and leave out repeats", key=key)
     norm = np.linalg.norm(quat, axis=1, keepdims=True)
     if not np.all((norm > _SHORTEST_NORM) & np.isfinite(norm)):
-        found = f"{int(np.sum(~(norm > _SHORTEST_NORM)))} quaternions of length near zero"
+        found = said("{n} quaternions of length near zero", n=np.sum(~(norm > _SHORTEST_NORM)))
         raise log_error(found, "quaternions of length 1; leave such samples out", key=key)
     quat = quat / norm
     # q and -q are the same rotation, but their mean is not a rotation.
@@ -145,7 +154,11 @@ def check_roll(path: Path, quat_wxyz: np.ndarray, frame: str) -> None:
     if roll is None or abs(roll) <= _MOST_ROLL_DEG:
         return
     raise log_error(
-        f"by this log (frame {frame}) the upright picture is turned by {roll:.0f} deg against gravity",
+        said(
+            "by this log (frame {frame}) the upright picture is turned by {roll:.0f} deg against gravity",
+            frame=frame,
+            roll=roll,
+        ),
         "a picture that stands upright, within what a hand tilts",
         next_step="check `frame` (device: the phone's own axes) and `rotation_deg` (0 portrait, 90 top to the right, "
         "270 top to the left), and that the quaternions turn the phone's vectors into the world and not back",

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from pbl_pipeline import progress
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results.video_facts import VideoInfo
 
 from .attitude import DEVICE, MAX_HOLE_S, Attitude, camera_in_device, check_roll, held_deg, log_error, unknown_at
@@ -128,7 +128,9 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
     if log.clock in (VIDEO_CLOCK, PICTURES_CLOCK):
         if _cover(log, 0.0, duration, 0.0) == 0.0:
             raise log_error(
-                f"a log from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s, without start_utc",
+                said(
+                    "a log from {start:.6g} to {end:.6g} s, without start_utc", start=log.time_s[0], end=log.time_s[-1]
+                ),
                 f"seconds from the first frame of the video, which lasts {duration:.1f} s",
                 next_step="subtract the time at which the recording began, and write seconds; or add start_utc "
                 "(docs/phone_capture.md)",
@@ -158,8 +160,12 @@ def align_clock(log: PhoneLog, quat_wxyz: np.ndarray, video: VideoInfo, path: Pa
         how = "clock by the time of recording in the file, within 1 s: the pictures do not tell it better"
         return Aligned(shifts[0], how)
     raise log_error(
-        "a log whose part that belongs to the video cannot be found (correlation with the movement of the pictures "
-        f"{match.correlation:.2f} at best, {match.rival:.2f} elsewhere)",
+        said(
+            "a log whose part that belongs to the video cannot be found (correlation with the movement of the pictures "
+            "{best:.2f} at best, {other:.2f} elsewhere)",
+            best=match.correlation,
+            other=match.rival,
+        ),
         "one shift at which the log moves as the pictures do, or a log that begins with the video",
         next_step="write time_s on the video's clock (docs/phone_capture.md), or leave the log out",
         key=path,
@@ -189,7 +195,7 @@ def _anywhere(log: PhoneLog, duration: float, path: Path) -> tuple[float, float]
     last = float(log.time_s[-1]) - duration * LEAST_COVER
     if last < log.time_s[0]:
         raise log_error(
-            f"a log of {log.time_s[-1] - log.time_s[0]:.1f} s",
+            said("a log of {s:.1f} s", s=log.time_s[-1] - log.time_s[0]),
             f"at least {LEAST_COVER:.0%} of the video's {duration:.1f} s",
             next_step="take the log of this recording, or leave it out",
             key=path,
@@ -257,15 +263,13 @@ def _other_time(log: PhoneLog, video: VideoInfo, shift: float, duration: float, 
     )
     begin = datetime.datetime.fromtimestamp((log.start_utc_s or 0.0) + log.time_s[0], datetime.UTC)
     end = datetime.datetime.fromtimestamp((log.start_utc_s or 0.0) + log.time_s[-1], datetime.UTC)
-    zone = (
-        f"the clocks are {abs(hours):g} h apart: one of them is in another time zone; write UTC into the log"
-        if hours is not None
-        else "take the log of this recording"
-    )
+    step = "take the log of this recording, or time_s on the video's clock (docs/phone_capture.md)"
+    if hours is not None:
+        step = said("the clocks are {h:g} h apart: one is in another time zone; write UTC into the log", h=abs(hours))
     return log_error(
-        f"a log from {begin:%Y-%m-%d %H:%M:%S} to {end:%H:%M:%S} UTC",
+        said("a log from {start} to {end} UTC", start=f"{begin:%Y-%m-%d %H:%M:%S}", end=f"{end:%H:%M:%S}"),
         f"the time of the video, {duration:.1f} s around {video.recorded_utc}",
-        next_step=f"{zone}, or time_s on the video's clock (docs/phone_capture.md)",
+        next_step=step,
         key=path,
     )
 
@@ -290,7 +294,7 @@ def attitude_of(log: PhoneLog, path: Path, video: VideoInfo | None = None) -> At
     quat = log.quat_wxyz
     if log.frame == DEVICE:
         if video is not None and "front" in (video.lens or "").lower():
-            raise log_error(f"a video of the {video.lens}", "the camera on the phone's back", key=path)
+            raise log_error(said("a video of the {lens}", lens=video.lens), "the camera on the phone's back", key=path)
         turned = log.rotation_deg
         if turned is None:
             turned = held_deg(video, quat) if video is not None else 0.0

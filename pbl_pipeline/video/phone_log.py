@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import os_errors_as
+from pbl_pipeline.errors import os_errors_as, said
 from pbl_pipeline.sampling import interval_of
 
 from .attitude import CAMERA, DEVICE, check_attitude, log_error
@@ -194,7 +194,7 @@ def _log(
 def _check_names(path: Path, names: list[str]) -> None:
     missing = [n for n in _COLUMNS if n not in names]
     if missing:
-        raise log_error(f"no {', '.join(missing)}", "the fields " + ", ".join(_COLUMNS), key=path)
+        raise log_error(said("no {fields}", fields=", ".join(missing)), "the fields " + ", ".join(_COLUMNS), key=path)
 
 
 def _frame(path: Path, settings: Mapping[str, object]) -> tuple[str, float | None]:
@@ -234,7 +234,9 @@ def _utc(path: Path, value: object) -> float | None:
 
 def _sensor(path: Path, name: str, time: np.ndarray, xyz: np.ndarray) -> Sensor:
     if not np.isfinite(time).all() or not np.isfinite(xyz).all():
-        raise log_error(f"{name}: values that are not finite", "finite numbers; leave such samples out", key=path)
+        raise log_error(
+            said("{name}: values that are not finite", name=name), "finite numbers; leave such samples out", key=path
+        )
     if np.any(np.diff(time) < 0):
-        raise log_error(f"{name}: stamps that run backwards", "increasing times", key=path)
+        raise log_error(said("{name}: stamps that run backwards", name=name), "increasing times", key=path)
     return Sensor(time, xyz)

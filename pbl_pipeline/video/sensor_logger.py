@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
+from pbl_pipeline.errors import said
 from pbl_pipeline.names import is_plain
 
 from .attitude import DEVICE, MAX_HOLE_S, check_attitude, log_error
@@ -137,7 +138,11 @@ def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:
     kept = np.concatenate([[True], np.diff(ns) != 0])
     n = int((~kept).sum())
     if n > _MOST_REPEATS * len(ns):
-        raise log_error(f"{n} of {len(ns)} stamps repeat the one before", "a different stamp for each sample", key=path)
+        raise log_error(
+            said("{n} of {all} stamps repeat the one before", n=n, all=len(ns)),
+            "a different stamp for each sample",
+            key=path,
+        )
     notes = [f"{n} repeated rows were omitted"] if n else []
     rows = [row for row, keep in zip(rows, kept, strict=True) if keep]
     return int(ns[0]), (ns[kept] - ns[0]) / 1e9, rows, notes
@@ -151,7 +156,7 @@ def _check_pitch(path: Path, rows: _Rows, quat_wxyz: np.ndarray) -> None:
     off = float(np.median(np.abs(np.abs(matrix[:, 2, 1]) - stated)))
     if off > _PITCH_TOL:
         raise log_error(
-            f"quaternions whose pitch differs from the column pitch (sines by {off:.2f})",
+            said("quaternions whose pitch differs from the column pitch (sines by {off:.2f})", off=off),
             "quaternions that turn the phone's axes into a world with z up",
             key=path,
         )
@@ -175,10 +180,10 @@ def read_phone_log(path: str | Path) -> PhoneLog:
     if not is_plain(log.device):
         raise log_error(f"a phone called {ascii(log.device)[:80]}", "a name without control characters", key=path)
     if np.abs(log.time_s).max() > _LATEST_S or bounded.span_s(log.time_s) > bounded.MAX_SECONDS:
-        found = f"times from {log.time_s[0]:.6g} to {log.time_s[-1]:.6g} s"
+        found = said("times from {start:.6g} to {end:.6g} s", start=log.time_s[0], end=log.time_s[-1])
         raise log_error(found, f"seconds, {bounded.MAX_SECONDS:g} at most", key=path)
     if log.rate_hz < 1 / MAX_HOLE_S:
-        found = f"{log.rate_hz:.3g} orientations a second"
+        found = said("{n:.3g} orientations a second", n=log.rate_hz)
         raise log_error(found, f"{1 / MAX_HOLE_S:.2g} at least, and 50 for a phone in the hand", key=path)
     _check_gravity(path, log)
     return log
@@ -199,7 +204,7 @@ def _check_gravity(path: Path, log: PhoneLog) -> None:
     off = float(np.degrees(np.median(np.arccos(np.clip(cos, 0, 1)))))
     if off > _MOST_TILT_DEG:
         raise log_error(
-            f"an orientation whose vertical lies {off:.0f} deg from the accelerometer's",
+            said("an orientation whose vertical lies {off:.0f} deg from the accelerometer's", off=off),
             f"at most {_MOST_TILT_DEG:.0f} deg: quaternions that turn the phone's axes into a world with z up",
             key=path,
         )
