@@ -168,10 +168,7 @@ class Site:
 
     def kill_server(self) -> None:
         """Inside an insert, where one begins within some seconds."""
-        inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
-        while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
-            time.sleep(0.002)
-        time.sleep(self.draw.uniform(0, 0.05))
+        inside = self.wait_for_insert()
         if self.mysql is not None:
             self.mysql.kill()
         else:
@@ -179,6 +176,14 @@ class Site:
         self.done["database killed" + (" inside an insert" if inside else "")] += 1
         time.sleep(self.draw.uniform(0.2, 3.0))
         self.start_server()
+
+    def wait_for_insert(self) -> bool:
+        """Wait for a moment inside an insert; False where none began within some seconds."""
+        inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
+        while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
+            time.sleep(0.002)
+        time.sleep(self.draw.uniform(0, 0.05))
+        return inside
 
     def fill(self, disk: str, left: int = 0, longest_s: float = 8.0) -> None:
         """No byte, or so many, are left on a disk for some seconds."""

@@ -97,9 +97,19 @@ def serve(port: int, kept_free: int) -> None:
             time.sleep(draw.uniform(0, 0.03))
             return real(*args)
         finally:
+            time.sleep(draw.uniform(0, 0.03))
             mark.unlink(missing_ok=True)
 
+    def slow(real: Callable[..., Any]) -> Callable[..., Any]:
+        def act(*args: Any) -> Any:
+            time.sleep(draw.uniform(0, 0.03))
+            return real(*args)
+
+        return act
+
     phone_uploads.register = seen
+    for name in ("register_copies", "discard"):  # moments in which a kill is to come
+        setattr(phone_uploads, name, slow(getattr(phone_uploads, name)))
     sys.modules["pbl_workers.web.serve"]._warm = lambda: None  # type: ignore[attr-defined]
     page(Where(port=port), "B")
 
@@ -177,9 +187,13 @@ class Site(chaos.Site):
         return self.draw.choice(below) if below else 0
 
     def kill_page(self) -> None:
+        """Half of the times while a recording is registered."""
+        inside = self.draw.random() < 0.5 and self.wait_for_insert()
+        for mark in Path(os.environ[chaos.INSERTS]).iterdir():
+            mark.unlink(missing_ok=True)
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.page, signal.SIGKILL)
-            self.done["page killed"] += 1
+            self.done["page killed" + (" inside an insert" if inside else "")] += 1
             time.sleep(self.draw.uniform(0.1, 2.0))
 
     def kill_helper(self, opens: bool) -> None:
@@ -470,7 +484,7 @@ def _run(site: Site, sends: int, phones: int, minutes: float, can_fill: bool) ->
     )
     with socket.create_server(("127.0.0.1", 0)) as free:
         site.port = free.getsockname()[1]
-    waiting: list[PhoneOf] = []
+    waiting, visit = list[PhoneOf](), 0
     for i, first in enumerate(range(0, sends, OF_A_LINK)):
         if i % OF_A_VISIT == 0:
             visit = new_visit(f"2026-01-{1 + i // OF_A_VISIT % 28:02d}", f"P{i // OF_A_VISIT:03d}")
@@ -481,8 +495,7 @@ def _run(site: Site, sends: int, phones: int, minutes: float, can_fill: bool) ->
     told = began
     site.keep_page()
     while waiting or any(phone.is_alive() for phone in sending):
-        over = time.monotonic() - began > 60 * minutes or (not waiting and len(heard.ends) >= sends - phones)
-        if over:
+        if time.monotonic() - began > 60 * minutes or (not waiting and len(heard.ends) >= sends - phones):
             break
         sending = [phone for phone in sending if phone.is_alive()]
         while waiting and len(sending) < phones:
@@ -500,6 +513,9 @@ def _run(site: Site, sends: int, phones: int, minutes: float, can_fill: bool) ->
             told = time.monotonic()
             click.echo(f"{told - began:.0f} s: {len(heard.ends)} ended; {heard.again.most_common(4)}", err=True)
     spent = time.monotonic() - began
+    if time.monotonic() - began > 60 * minutes:
+        for phone in sending:
+            phone.no_more = True
     _drain(site, sending, time.monotonic() + DRAIN_S)
     click.echo(f"{spent:.0f} s with faults: " + ", ".join(f"{n} x {what}" for what, n in sorted(site.done.items())))
     click.echo("phones: " + ", ".join(f"{n} x {what}" for what, n in sorted(heard.acts.items())))
@@ -520,7 +536,7 @@ def _run(site: Site, sends: int, phones: int, minutes: float, can_fill: bool) ->
 def _drain(site: Site, sending: list[PhoneOf], until: float) -> None:
     """Let the phones send what they have begun, with nothing that fails."""
     for phone in sending:
-        phone.calm = phone.no_more = True
+        phone.calm = True
     with contextlib.suppress(ProcessLookupError):
         for pid in [site.server, *site.helpers(), site.page]:
             os.kill(pid, signal.SIGCONT)
@@ -539,7 +555,7 @@ def _left(site: Site, films: Films, heard: Heard) -> list[str]:
     from pbl_schemas.capture import PhoneRecording
     from pbl_schemas.intake.phone_recordings import begun_bytes
     from pbl_schemas.operations.archive import UNFINISHED_DAYS, archive_dir, unfinished
-    from pbl_schemas.operations.orphans import orphans
+    from pbl_schemas.operations.orphans import orphans, remove
 
     site.start_server()  # the page may have started it, and stopped it at its end
     connection.connect()
@@ -578,21 +594,20 @@ def _left(site: Site, films: Films, heard: Heard) -> list[str]:
     wrong += [f"left behind: {path.relative_to(site.home)}" for path in sorted(there - expected)]
     wrong += [f"lost: {path}" for path in sorted(expected - there)]
     wrong += [f"folder of parts left: {one.path}" for one in unfinished(archive_dir())]
-    if n := begun_bytes(UNFINISHED_DAYS):
-        wrong.append(f"room promised for {n} bytes")
+    wrong += [f"room promised to {number}: {n} bytes" for number, n in begun_bytes(UNFINISHED_DAYS).items()]
     if n := len(worker.Turn()):
         wrong.append(f"{n} locks left")
     temporary.sweep()
     left = [path.name for path in (site.home / "tmp").iterdir() if not path.name.startswith("pymp-")]
     wrong += [f"temporary: {name}" for name in left]
     stored = orphans(young_s=0.0)
+    removed = remove(stored, 0.0)
     click.echo(
-        f"{len(there)} files in the archive; {stored.n_files} in the store, {len(stored.orphans)} without a row, "
-        f"{len(stored.lost)} lost"
+        f"{len(there)} files in the archive; {stored.n_files} in the store, of which `pbl cron` removed {removed} "
+        f"without a row"
     )
-    wrong += [f"store: without a row: {file.path}" for file in stored.orphans] + [
-        f"lost: {path}" for path in stored.lost
-    ]
+    wrong += [f"store: without a row: {file.path}" for file in orphans(young_s=0.0).orphans]
+    wrong += [f"lost: {path}" for path in stored.lost]
     seconds = sorted(heard.seconds)
     if seconds:
         click.echo(f"a recording took {seconds[len(seconds) // 2]:.1f} s (median), {seconds[-1]:.0f} s (longest)")
