@@ -61,7 +61,7 @@ def limited(
     process = context.Process(target=_call, args=how, daemon=True)
     try:
         process.start()
-    except (EOFError, OSError) as error:  # the process that is copied was ended, or there is no room for another
+    except (EOFError, OSError) as error:  # the process that is copied was killed, or the machine is full
         raise LimitExceeded(f"its process did not start: {error}") from error
     finally:
         theirs.close()

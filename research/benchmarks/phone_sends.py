@@ -276,7 +276,7 @@ def _log(number: int) -> bytes:
 
 @dataclasses.dataclass
 class Heard:
-    """What the phones did and were told."""
+    """Acts of the phones, and the server's answers."""
 
     ends: dict[int, tuple[str, str]] = dataclasses.field(default_factory=dict)  # state and error at the last answer
     begun: set[int] = dataclasses.field(default_factory=set)
@@ -368,9 +368,10 @@ class PhoneOf(threading.Thread):
         ranged = f"bytes {n * PART}-{n * PART + len(part) - 1}/{size}"
         more = {"Content-Range": ranged, "X-SHA256": hashlib.sha256(part).hexdigest()}
         put = "PUT", f"/phone/recordings/{number}.json", part, "octet-stream"
-        if self.unlucky(0.03, "connection cut within a part"):
-            self.broken(*put, cut=True, more=more)
-            raise Again("connection lost")
+        for chance, what, pause_s in ((0.03, "connection cut", 0.0), (0.001, "phone paused for 90 s", STALL_S)):
+            if self.unlucky(chance, f"{what} within a part"):
+                self.broken(*put, cut=True, more=more, pause_s=pause_s)
+                raise Again("connection lost")
         if self.unlucky(0.03, "part sent twice at once"):
             self.beside(*put, more=more)
         self.told(*self.request(*put, more=more)[:2])
@@ -387,12 +388,23 @@ class PhoneOf(threading.Thread):
 
         threading.Thread(target=act, daemon=True).start()
 
-    def broken(self, method: str, path: str, body: bytes, kind: str = "json", *, cut: bool, more: Any = None) -> None:
-        """Send a request and close: within its body, or before the answer."""
+    def broken(
+        self,
+        method: str,
+        path: str,
+        body: bytes,
+        kind: str = "json",
+        *,
+        cut: bool,
+        more: Any = None,
+        pause_s: float = 0,
+    ) -> None:
+        """Send a request and close: within its body, after a pause, or before the answer."""
         headers = {**self.headers(kind, more or {}), "Host": f"127.0.0.1:{self.port}", "Content-Length": str(len(body))}
         head = f"{method} {path} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in headers.items()) + "\r\n"
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self.port), timeout=20) as sent:
             sent.sendall(head.encode() + (body[: self.draw.randrange(len(body))] if cut else body))
+            time.sleep(pause_s)
 
     def headers(self, kind: str, more: dict[str, str]) -> dict[str, str]:
         own = {"Cookie": f"pbl_phone={self.cookie}"} if self.cookie else {}
@@ -435,7 +447,7 @@ class PhoneOf(threading.Thread):
 @click.option("--minutes", default=120.0, show_default=True, help="After which no further recording is begun.")
 @click.option("--keep", is_flag=True, help="Leave the folder with the page's log.")
 def main(sends: int, seed: int, phones: int, minutes: float, keep: bool) -> None:
-    """Send, let things fail, then look at what is there."""
+    """Send, let things fail, then compare tables and files with the recordings."""
     home = database.new_home()
     sizes = {name: room + each * sends for name, (room, each) in DISKS.items()}
     with chaos.disks(home, sizes) as can_fill, pytest.MonkeyPatch.context() as patch:
@@ -548,7 +560,7 @@ def _drain(site: Site, sending: list[PhoneOf], until: float) -> None:
 
 
 def _left(site: Site, films: Films, heard: Heard) -> list[str]:
-    """Return the faults: recordings that are missing, twice, changed or wrongly refused, and what was left behind."""
+    """Return the faults: recordings that are missing, twice, changed or wrongly refused; files and locks left behind."""
     from pbl_pipeline import temporary
     from pbl_pipeline.errors import CODES, INPUT
     from pbl_schemas import connection, video, worker
