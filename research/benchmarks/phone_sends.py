@@ -49,8 +49,8 @@ from tests.videos import constant_rate, write_video
 PART, OF_A_LINK, OF_A_VISIT = 2**16, 50, 2
 #: Disks (MiB): room for so much, and for each recording.
 DISKS = {"db": (900, 0.2), "store": (60, 0.05), "recordings": (80, 0.6)}
-#: Longest pause (s), how many pauses are that long, and the longest of the others.
-STALL_S, STALLS, PAUSE_S = 90.0, 0.06, 8.0
+#: Longest pause (s), the share of pauses that are that long, and the longest of the others.
+STALL_S, STALLS, PAUSE_S = 90.0, 0.1, 8.0
 #: Time in which everything is to be sent once nothing fails (s).
 DRAIN_S = 420.0
 #: A fault comes after so many recordings, or so many seconds.
@@ -560,7 +560,7 @@ def _drain(site: Site, sending: list[PhoneOf], until: float) -> None:
 
 
 def _left(site: Site, films: Films, heard: Heard) -> list[str]:
-    """Return the faults: recordings that are missing, twice, changed or wrongly refused; files and locks left behind."""
+    """Return the faults: recordings that are missing, twice, changed or wrongly refused; remains."""
     from pbl_pipeline import temporary
     from pbl_pipeline.errors import CODES, INPUT
     from pbl_schemas import connection, video, worker

@@ -18,13 +18,14 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from pymysql.err import OperationalError
 from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import to_row
 from pbl_pipeline.words import UNUSABLE
-from pbl_schemas import gait, keypoints, session, video
+from pbl_schemas import gait, keypoints, session, tables_version, video
 from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
 from pbl_schemas.intake import phone_recordings
@@ -809,6 +810,17 @@ def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, monkey
     monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + len(whole)))
     answer = browser.post("/phone/recordings.json", json=stated(whole))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_a_database_that_goes_away_before_the_question_is_not_running(visit: int, monkeypatch: pytest.MonkeyPatch):
+    browser = phone(visit)
+
+    def gone() -> None:
+        raise OperationalError(2003, "Can't connect to MySQL server on '127.0.0.1' ([Errno 111] Connection refused)")
+
+    monkeypatch.setattr(tables_version, "refuse_newer", gone)
+    answer = browser.get("/phone/state.json")
+    assert (answer.status_code, code(answer)) == (503, "DB_NOT_RUNNING")
 
 
 @pytest.mark.parametrize("whole", [True, False])
