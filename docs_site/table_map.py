@@ -17,12 +17,25 @@ _ORIGIN = ("code_version", "method_hash", "model_sha256", "host", "seconds", "co
 _Column = tuple[str, str, str, bool]
 #: Prefix of a visit's columns, where a trial has the same ones without it.
 _VISIT = "session_"
-_KINDS = {dj.Manual: "manual", dj.Lookup: "lookup", dj.Computed: "computed", dj.Part: "part"}
+_KINDS = {dj.Manual: "", dj.Lookup: " (lookup)", dj.Computed: " (computed)", dj.Part: " (part)"}
 #: Columns of a method and of a check after their prefix: they stand at the top of the page, each table has the word.
 _GROUPS = {
     "method": ("_method", "_method_name", "_method_version", "_params", "_method_sha"),
     "check": ("_check", "_check_outcome", "_check_value", "_check_threshold", "_check_advice"),
 }
+#: Meanings of columns by their ending, which the top of the page states for all.
+_SAID = {
+    "_created": ("when registered", "when planned", "when decided", "when"),
+    "_by": ("name of who decided", "name of who corrected", "name of who decided, as the page knows it"),
+    "_at": ("when",),
+    "_sha256": ("of its bytes", "of the copy's bytes", "of the file's bytes", "of the bytes of the copy"),
+    "_size": ("(byte) length", "(byte) length of the file", "(byte) length of the copy"),
+    "_reason": ("why EMPTY",),
+    "_missing": ("why it is null",),
+    "_file": ("the file",),
+}
+#: Types that a reader asks the server for.
+_PLAIN = re.compile(r"float64|(var)?char\(\d+\)|int\d+|datetime(\(3\))?|date")
 #: So many consecutive columns have to be alike to be described by those of another table.
 _LEAST_ALIKE = 4
 #: Longer names of columns do not widen the others'.
@@ -31,18 +44,20 @@ _WIDEST = 40
 _START = """\
 # Tables
 
-Each section is a schema of the server, `pbl_<section>`, in the order of computing. People and `pbl ingest` fill *manual* tables, `pbl populate`
-*computed* ones; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
-has the key of its table.
+Each section is a schema of the server, `pbl_<section>`, in the order of computing. `pbl populate` fills *computed* tables, people and `pbl ingest`
+those without a word; *lookup* tables hold methods and terms. Keys stand above `---`. `->` is a foreign key, whose columns the table also has; a part
+has the key of its table. *as in* a table: the same columns without `session_`.
 
-A column without a type is float64. `datetime` is in UTC; `_created`: when the row was made. *its unit*: the unit in the name of the row. *as in*
-a table: the same columns without `session_`. Words that stand for columns with a prefix:
+`T.heading` of a table T prints all types; below are those of terms, bool, json and files (`<object@arrays>`: [formats](files.md)). A column with a unit in
+brackets is float64 (*its unit*: that in the name of the row). Times are in UTC. Unless stated, `_created` is when the row was made, `_by` who decided,
+by name, `_sha256` that of the file, `_size` its length (byte), `_reason` why EMPTY, and `_missing` why it is null. Words that stand for columns with
+a prefix:
 
 - *origin*, where a computed row comes from: `_code_version`, `_method_hash`, `_model_sha256`, `_host`, `_seconds` (s), `_computed`
-- *method*: `_method` varchar(48), the key: name and version, such as demo-v1; `_method_name` varchar(40); `_method_version` int16 counts up when
-  parameters change; `_params` json; `_method_sha` char(16), hash of all these
-- *check*: `_check` varchar(64), the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
-  `_check_threshold` (its unit); `_check_advice` varchar(1000), what to do about it
+- *method*: `_method`, the key: name and version, such as demo-v1; `_method_name`; `_method_version` counts up when parameters change; `_params` json;
+  `_method_sha`, hash of all these
+- *check*: `_check`, the key: name, with its unit; `_check_outcome` enum('PASS','WARN','EMPTY','NEEDS_CHOICE','FAIL'); `_check_value`,
+  `_check_threshold` (its unit); `_check_advice`: what to do about it
 
 Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
 """  # noqa: E501
@@ -51,9 +66,8 @@ Made by `python -m docs_site.table_map > docs/tables.md`; do not edit.
 _JOINS = """\
 ## Joins
 
-A natural join (`A * B`) pairs rows by their common columns. If these do not tell one visit from another, such as the name of a method,
-it pairs **every visit with every other** and raises nothing: `lab.Subject * gdi.SessionGdi` has each person with the visits of all people. Count the
-rows (`len(A * B)`).
+A natural join (`A * B`) pairs rows by their common columns. If these do not tell one visit from another, it pairs **every visit with every other**
+and raises nothing: `lab.Subject * gdi.SessionGdi` has each person with the visits of all people. Count the rows (`len(A * B)`).
 
 | rows | tables | safe chain |
 |---|---|---|
@@ -63,8 +77,8 @@ rows (`len(A * B)`).
 | of a part | `SessionGdi.Measure`, `GDI.Cycle`, ... | through its table: `gdi.SessionGdi.Measure * gdi.SessionGdi.proj('session_id')` |
 | of a person | `lab.Subject` | never without `session.Session` between it and results |
 
-**Deleting results of chosen visits.** DataJoint 2.3.5 cannot delete from a table restricted by a query that is itself restricted: "Attribute `pbl_session` is
-not found in query" ([cause](../research/reports/2026-11-29_datajoint_delete.md)). Restrict by the keys instead, and let results of the whole visit go along:
+**Deleting results of chosen visits.** DataJoint 2.3.5 cannot delete where a restriction is itself restricted: "Attribute `pbl_session` is not found in
+query" ([cause](../research/reports/2026-11-29_datajoint_delete.md)). Restrict by the keys, and let results of the whole visit go along:
 
 ```python
 from pbl_schemas import gdi, session
@@ -79,7 +93,7 @@ chosen = gdi.GDI & (session.Session & {"subject": "P001"})
 
 
 def kind(cls: Any) -> str:
-    """manual, lookup, computed or part."""
+    """Return the word behind the name of a table: its tier, "" for a manual one."""
     return next(word for base, word in _KINDS.items() if issubclass(cls, base))
 
 
@@ -112,7 +126,7 @@ def table_map() -> str:
         if name.split(".")[0] != stage:
             stage = name.split(".")[0]
             lines += ["", f"## {stage}", "", modules()[STAGES.index(stage)].__doc__ or ""]
-        lines += ["", f"### {name} ({kind(cls)})", "", *([comment(cls), ""] if comment(cls) else [])]
+        lines += ["", f"### {name}{kind(cls)}", "", *([comment(cls), ""] if comment(cls) else [])]
         lines += [f"    {line}" for line in _listed(name, cls, written)]
     return "\n".join(lines) + "\n"
 
@@ -129,7 +143,7 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
         if group:
             rows.append((f"{column.removesuffix(_GROUPS[group][0])}_*", group, "", in_key))
         elif n:
-            rows.append((", ".join(c[0] for c in own[i : i + n]), f"as in {alike}", "", in_key))
+            rows.append((f"{column}, ..., {own[i + n - 1][0]}", f"as in {alike}", "", in_key))
         else:
             said = (_type(type_), _meaning(column, type_, text, own[0][0]), in_key)
             if rows and rows[-1][1:] == said:
@@ -150,20 +164,21 @@ def _listed(name: str, cls: Any, written: dict[str, list[_Column]]) -> list[str]
 
 
 def _type(text: str) -> str:
-    return "" if text == "float64" else text.replace("', '", "','")
+    return "" if _PLAIN.fullmatch(text) else text.replace("', '", "','")
 
 
 def _meaning(column: str, type_: str, text: str, key: str) -> str:
     """The comment of a column, less what the top of the page states for all."""
     if type_ == "datetime":
         text = re.sub(r",? UTC$", "", text)
-        text = "" if column.endswith("_created") and text == "when registered" else text
+    text = re.sub(r"(: [^;]*)?; docs/files\.md$", "", text)
+    text = "" if any(column.endswith(end) and text in said for end, said in _SAID.items()) else text
     return text.replace(f"in the unit (see {key})", "(its unit)")
 
 
 def _line(row: tuple[str, str, str], wide: int) -> list[str]:
     """A column with its type and meaning, broken below its name."""
-    text = f"{row[0]:<{wide}}  {row[1]:<14}  {row[2]}".rstrip()
+    text = f"{row[0]:<{wide}}  {'  '.join(filter(None, row[1:]))}".rstrip()
     below = " " * (2 + wide * (len(row[0]) <= wide))
     return textwrap.wrap(text, 130, subsequent_indent=below, break_long_words=False, break_on_hyphens=False)
 

@@ -113,15 +113,22 @@ class Axes:
         opacity: float = 1.0,
         dash: str = "none",
     ) -> None:
-        """A curve; it is broken where a value is NaN."""
-        points = np.stack([self.x(x), self.y(y)], axis=-1)
-        for run in runs(np.isfinite(points).all(axis=1)):
-            self.add(
-                Markup(
-                    '<polyline points="{}" fill="none" stroke="{}" stroke-width="{}" stroke-opacity="{}"'
-                    ' stroke-dasharray="{}" stroke-linejoin="round"/>'
-                ).format(_points(points[run]), colour, width, opacity, dash)
-            )
+        """A curve, or several (N, P); it is broken where a value is NaN."""
+        across, up = self.x(x), np.atleast_2d(self.y(y))
+        whole = " ".join(f"{v:.1f},%.1f" for v in across.tolist())  # visits have hundreds of cycles
+        lines = []
+        for row in up:
+            if (seen := np.isfinite(row)).all():
+                lines.append(whole % tuple(row.tolist()))
+            else:
+                lines += [_points(np.stack([across[r], row[r]], axis=-1)) for r in runs(seen)]
+        drawn = Markup("").join(map(Markup('<polyline points="{}"/>').format, lines))
+        self.add(
+            Markup(
+                '<g fill="none" stroke="{}" stroke-width="{}" stroke-opacity="{}" stroke-dasharray="{}"'
+                ' stroke-linejoin="round">{}</g>'
+            ).format(colour, width, opacity, dash, drawn)
+        )
 
     def box(self, x0: float, x1: float, y0: float, y1: float, colour: str, opacity: float = 1.0) -> None:
         self.add(
@@ -176,9 +183,8 @@ def cycle_chart(
     if norm is not None:
         axes.curve(norm[0], norm[1], "#9aa3ad", 1.2)
     for side, curves in cycles.items():
-        colour = SIDE_COLOUR[side]
-        for c in curves:
-            axes.curve(percent, c, colour, 0.9, 0.38 * opacity[side])
+        if curves:
+            axes.curve(percent, np.stack(curves), SIDE_COLOUR[side], 0.9, 0.38 * opacity[side])
     for side, curves in cycles.items():
         if not curves:
             continue

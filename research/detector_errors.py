@@ -18,7 +18,9 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.fit.units import crop_px
 from pbl_pipeline.keypoints import METHODS, Keypoints
+from pbl_pipeline.keypoints.blazepose import INPUT_SIZE
 from research.confidence import detected, keypoints_option, truth_of
 from research.reliability.point_truth import PointTruth
 
@@ -39,6 +41,7 @@ def errors_of(keypoints: Keypoints, truth: PointTruth) -> dict[str, float]:
     gross = float(np.mean(off[known] > _GROSS_M))
     xy[~(off <= _GROSS_M)] = np.nan
     xy_constant, xy_rest = _parts(xy)
+    crop_m = crop_px(keypoints)[:, None] / px_per_m
     turn, size, left = _similarity(np.asarray(keypoints.xyz_cam_m, float), truth.xyz_cam_m, known & (off <= _GROSS_M))
     ray = truth.xyz_cam_m / np.linalg.norm(truth.xyz_cam_m, axis=-1, keepdims=True)
     along = np.sum(left * ray, axis=-1, keepdims=True)
@@ -50,6 +53,7 @@ def errors_of(keypoints: Keypoints, truth: PointTruth) -> dict[str, float]:
     return {
         "xy_constant_m": _rms(xy_constant),
         "xy_m": _rms(xy_rest),
+        "xy_crop_px": float(np.nanmedian(np.linalg.norm(xy_rest, axis=-1) / crop_m) * INPUT_SIZE),
         "xy_correlation": _correlation(xy_rest, step),
         "gross": gross,
         **{f"lean_{axis}_deg": float(v) for axis, v in zip(_AXES, np.nanmean(turn, axis=0), strict=True)},

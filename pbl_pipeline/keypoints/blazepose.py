@@ -15,6 +15,7 @@ from scipy.special import expit
 from pbl_pipeline import assets
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.models import Network
+from pbl_pipeline.models.heat_maps import SIDE
 from pbl_pipeline.tracking import circle_roi
 from pbl_pipeline.video import Camera, cut_image
 
@@ -68,8 +69,9 @@ NAMES: tuple[str, ...] = (
 N_POINTS = len(NAMES)
 #: The network adds six points; the first two are the middle of the hips and a point of the region of interest.
 N_ALL = 39
-#: Sizes of the networks' outputs: points of the picture, of the world, and the presence of a person.
+#: Sizes of the networks' outputs: points of the picture, of the world, and the presence of a person; and heat maps.
 _OUTPUTS = (N_ALL * 5, N_ALL * 3, 1)
+_MAPS = N_ALL * SIDE**2
 #: Index of the same point in the mirrored picture: left and right are exchanged.
 MIRROR = np.array(mirror_of(NAMES))
 
@@ -98,11 +100,13 @@ class BlazePoseLandmarks:
         agree_width_mm: float = 20.0,
         sha256: str = MODEL_SHA256,
         quick_path: str | Path | None = None,
+        window_cells: float = 0.0,
     ) -> None:
-        def load(path: str | Path, sha256: str) -> Network:
-            return Network(path, sha256, 1 / 255, outputs=_OUTPUTS, num_threads=1)
+        def load(path: str | Path, sha256: str, window_cells: float = 0.0) -> Network:
+            outputs = (*_OUTPUTS, _MAPS) if window_cells else _OUTPUTS
+            return Network(path, sha256, 1 / 255, outputs=outputs, num_threads=1, window_cells=window_cells)
 
-        self._model = load(model_path, sha256)
+        self._model = load(model_path, sha256, window_cells)
         self._quick = load(quick_path, MODEL_SHA256) if quick_path else self._model
         self.model_sha256 = self._model.sha256
         self.mirrored_inference = MirroredInference(NAMES, agree_mm, agree_width_mm)
@@ -191,4 +195,4 @@ def blazepose(params: KeypointParams) -> BlazePoseLandmarks:
         )
     path = assets.fetch(_NETWORKS[sha256])
     quick = assets.fetch(_NETWORKS[MODEL_SHA256]) if params.lighter_first else None
-    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256=sha256, quick_path=quick)
+    return BlazePoseLandmarks(path, params.agree_mm, params.agree_width_mm, sha256, quick, params.window_cells)

@@ -139,12 +139,12 @@ def ends(keypoints: Keypoints) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
     """For the feet and the lower border, then for the head and the upper one: their points (J,) bool, and the frames
     (T,) bool in which the person reaches to that border."""
     box, height = np.asarray(keypoints.box_px, float), keypoints.image_size_px[1]
-    feet, head = _feet_and_head(tuple(keypoints.names))
+    feet, head = feet_and_head(tuple(keypoints.names))
     return (feet, box[:, 3] >= height - 1), (head, box[:, 1] <= 0)
 
 
 @functools.cache
-def _feet_and_head(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def feet_and_head(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Markers (J,) bool of the feet, and of the head."""
     feet, head = (np.array([bool(p.search(n)) for n in names]) for p in (_FEET, _HEAD))
     return feet, head

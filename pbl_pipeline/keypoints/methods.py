@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from pbl_pipeline import models
 from pbl_pipeline.methods import Stage
 
@@ -22,9 +24,9 @@ class RegisteredModels:
 
 #: A family is a detector: a function from its parameters to a `KeypointDetector`.
 METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
-METHODS.register("blazepose-33", 3, KeypointParams(crop_step_px=0.25), blazepose)
+_FULL = METHODS.register("blazepose-33", 3, KeypointParams(crop_step_px=0.25), blazepose).params
 #: Shares inferences at 24 frames/s and more: each is slow, and those of two neighbouring frames differ little.
-METHODS.register(
+_HEAVY = METHODS.register(
     "blazepose-heavy",
     4,
     KeypointParams(
@@ -34,5 +36,9 @@ METHODS.register(
         lighter_first=True,
         crop_step_px=0.25,
     ),
-)
+).params
+#: With points refined by the networks' heat maps. Not the default: error models and intervals are those of the others.
+for _name, _params, _curve in (("33", _FULL, "blazepose-v2"), ("heavy", _HEAVY, "blazepose-heavy-v4")):
+    _refined = dataclasses.replace(_params, window_cells=1.5, confidence_curve=_curve)
+    METHODS.register(f"blazepose-{_name}-heatmaps", 1, _refined)
 METHODS.register_family("onnx", ModelKeypointParams, onnx)

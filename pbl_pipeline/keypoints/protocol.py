@@ -49,6 +49,9 @@ class KeypointParams:
     # a network move by a pixel if a crop moves by a ten-thousandth of one, so without it the rounding of another device
     # in an earlier stage would show.
     crop_step_px: float = later(0.0)
+    # Standard deviation, in cells, of the window in which a point is refined by its heat map (`heat_maps.refined`); 0:
+    # the points as regressed.
+    window_cells: float = later(0.0)
 
     def points(self) -> tuple[str, bool]:
         """Marker set of the keypoints, and whether their 3D is relative to the root of the body."""

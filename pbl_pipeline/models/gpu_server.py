@@ -67,8 +67,10 @@ class Program:
         device = jax.devices()[0]
         if device.platform != "gpu" and not any_device:
             raise RuntimeError(f"JAX finds no GPU, only {device.device_kind}")
-        self.sizes, self.image_shape, self.batch = model.output_sizes, model.image_shape, batch
-        self.device = device.device_kind
+        self.image_shape, self.batch, self.device = model.image_shape, batch, device.device_kind
+        picture = np.random.default_rng(0).integers(0, 256, self.image_shape, np.uint8)
+        expected = spec.decoded(LiteModel(spec.path, spec.sha256, spec.outputs)(spec.entered(picture)))
+        self.sizes = tuple(expected)
         self._weights = jax.device_put(model.weights)
         scale, offset = np.float32(spec.scale), np.float32(spec.offset)
 
@@ -76,10 +78,13 @@ class Program:
             # Factors rounded to ten bits (TensorFloat-32) are a third faster here, but points then differ by 4 px of
             # 256 in poor pictures, so that results would depend on the device.
             with jax.default_matmul_precision("highest"):
-                return jax.numpy.concatenate(model(weights, images.astype(np.float32) * scale + offset), axis=1)
+                values = model(weights, images.astype(np.float32) * scale + offset)
+                found = dict(zip(model.output_sizes, values, strict=True))
+                found = jax.vmap(lambda one: spec.decoded(one, jax.numpy))(found)
+                return jax.numpy.concatenate([found[size] for size in self.sizes], axis=1)
 
         self._run = jax.jit(outputs)
-        self._check(spec)
+        self._check(picture, expected)
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
         """Return the outputs (N, sum of sizes) of pictures (N, H, W, 3) uint8."""
@@ -92,10 +97,8 @@ class Program:
                     raise
                 self.batch //= 2
 
-    def _check(self, spec: NetworkSpec) -> None:
-        picture = np.random.default_rng(0).integers(0, 256, self.image_shape, np.uint8)
+    def _check(self, picture: np.ndarray, expected: dict[int, np.ndarray]) -> None:
         got = np.split(self(picture[None])[0], np.cumsum(self.sizes)[:-1])
-        expected = LiteModel(spec.path, spec.sha256, spec.outputs)(spec.entered(picture))
         for size, values in zip(self.sizes, got, strict=True):
             wanted = expected[size].ravel()
             off = float(np.max(np.abs(values - wanted)) / max(float(np.max(np.abs(wanted))), 1.0))

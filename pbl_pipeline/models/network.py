@@ -19,11 +19,13 @@ from collections import deque
 from collections.abc import Collection
 from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from . import gpu_address
 from .devices import asked_device, unavailable
+from .heat_maps import decoded
 from .tflite import NUM_THREADS, LiteModel
 
 #: First line of a connection to the process that owns the GPU whose videos are decoded; of others, a `NetworkSpec`.
@@ -45,11 +47,16 @@ class NetworkSpec:
     outputs: tuple[int, ...] | None  # sizes of the wanted outputs, None: all
     scale: float  # the values 0 to 255 of a picture are multiplied by it
     offset: float = 0.0  # and added to it
+    window_cells: float = 0.0  # of `heat_maps.decoded`; 0: the outputs as they are
 
     def entered(self, image: np.ndarray) -> np.ndarray:
         """Return a picture (H, W, 3) uint8 as input of the network, float32."""
         values = np.multiply(image, np.float32(self.scale), dtype=np.float32)
         return values + np.float32(self.offset) if self.offset else values
+
+    def decoded(self, outputs: dict[int, Any], xp: Any = np) -> dict[int, Any]:
+        """Return the network's outputs for one picture as the caller gets them."""
+        return decoded(outputs, self.window_cells, xp) if self.window_cells else outputs
 
 
 class Network:
@@ -78,9 +85,10 @@ class Network:
         offset: float = 0.0,
         outputs: Collection[int] | None = None,
         num_threads: int = NUM_THREADS,
+        window_cells: float = 0.0,
     ) -> None:
         wanted = None if outputs is None else tuple(sorted(outputs))
-        self._spec = NetworkSpec(str(Path(path).resolve()), sha256, wanted, scale, offset)
+        self._spec = NetworkSpec(str(Path(path).resolve()), sha256, wanted, scale, offset, window_cells)
         self._threads, self._lock = num_threads, threading.Lock()
         self.sha256, self.device, self.note = sha256, "", ""
         self._remote: _Remote | None = None
@@ -115,7 +123,7 @@ class Network:
                         self._fall_back(error)
         with self._lock:
             assert self._lite is not None
-            return self._lite(self._spec.entered(image))
+            return self._spec.decoded(self._lite(self._spec.entered(image)))
 
     def _load(self) -> LiteModel:
         return LiteModel(self._spec.path, self.sha256, self._spec.outputs, self._threads)

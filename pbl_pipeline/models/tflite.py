@@ -1,9 +1,8 @@
 """TensorFlow Lite models, loaded with a checked hash and only the outputs that are used.
 
-BlazePose's landmark network also returns a silhouette of 256 x 256 and a heatmap for every point. Those two branches
-are a seventh of its multiplications and, because they work on large maps, half of its time. The runtime computes every
-output of the file, so the file is rewritten with fewer; the rest is computed from the same weights in the same order,
-bit for bit.
+BlazePose's landmark networks also return heat maps, which take a hundredth (heavy) or a tenth (full) of the time of
+the points, and a silhouette of 256 x 256 pixels: a tenth or four tenths. The runtime computes every output of the file,
+so the file is rewritten with fewer; the rest is computed from the same weights in the same order, bit for bit.
 """
 
 from __future__ import annotations

@@ -89,16 +89,17 @@ def encoded(video: Path, variant: str, out: Path) -> Path:
     return out
 
 
-def keypoints_of(name: str, variant: str, folder: Path) -> Keypoints:
+def keypoints_of(name: str, variant: str, folder: Path, method: str | None = None) -> Keypoints:
     """Return the keypoints of a variant of a recording, detected or taken from `folder`."""
-    kept = folder / f"{name}.{variant.replace(' ', '_')}.npz"
+    detector = KEYPOINT_METHODS.find(method)
+    kept = folder / f"{name}.{variant.replace(' ', '_')}.{detector.key}.npz"
     if not kept.exists():
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
             video = videos()[name]
             if variant != "as it is":
                 video = encoded(video, variant, Path(scratch) / "video.mp4")
-            clip_keypoints(video, Path(scratch) / "people.png", KEYPOINT_METHODS.find()).save(kept)
+            clip_keypoints(video, Path(scratch) / "people.png", detector).save(kept)
     return Keypoints.load(kept)
 
 
@@ -119,7 +120,8 @@ def angles_apart(first: TrialFit, other: TrialFit, sides_exchanged: bool) -> flo
 @keypoints_option
 @click.option("--clip", "clips", multiple=True, help="Name of a recording; all of them where none is named.")
 @click.option("--params", default=METHODS.default, show_default=True, help="Name of a paramset.")
-def main(folder: Path, clips: Sequence[str], params: str) -> None:
+@click.option("--method", help="Of the keypoints; default: the project's.")
+def main(folder: Path, clips: Sequence[str], params: str, method: str | None) -> None:
     """Print index and angles of every variant; exit code 1 where the index spreads by more than the bar."""
     spreads = []
     click.echo(f"{'':10}" + "".join(f"{v:>16}" for v in VARIANTS) + f"{'sd':>7}")
@@ -127,7 +129,7 @@ def main(folder: Path, clips: Sequence[str], params: str) -> None:
         cells, indices, first = [], [], None
         for variant in VARIANTS:
             try:
-                fit = fitted(name, keypoints_of(name, variant, folder), METHODS.find(params))
+                fit = fitted(name, keypoints_of(name, variant, folder, method), METHODS.find(params))
             except PblError as error:
                 cells.append(f"{error.code:>16}")
                 continue

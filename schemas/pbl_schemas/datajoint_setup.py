@@ -36,12 +36,15 @@ with warnings.catch_warnings():
 import pymysql
 from datajoint import table as datajoint_table
 from datajoint.adapters import ADAPTERS, MySQLAdapter
+from datajoint.codecs import decode_attribute
 from datajoint.errors import AccessError, DuplicateError, IntegrityError, LostConnectionError, MissingTableError
 from datajoint.hash_registry import get_store_backend
+from datajoint.jobs import ERROR_MESSAGE_LENGTH
 from datajoint.storage import StorageBackend, build_object_path
 from pymysql.converters import escape_string
 
 __all__ = [
+    "ERROR_MESSAGE_LENGTH",
     "UTC",
     "AccessError",
     "DuplicateError",
@@ -53,6 +56,7 @@ __all__ = [
     "build_object_path",
     "columns_read_once",
     "datajoint",
+    "decode_attribute",
     "dj",
     "full_path",
     "inserting",

@@ -9,11 +9,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pymysql
-from datajoint.jobs import ERROR_MESSAGE_LENGTH
 
 from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said_of
 
-from .datajoint_setup import AWAY, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
+from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
 
 #: Words of object stores for "full": MinIO, quotas.
 _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")

@@ -12,7 +12,7 @@ import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .datajoint_setup import REPEAT, columns_read_once, dj
+from .datajoint_setup import REPEAT, columns_read_once, decode_attribute, dj
 
 T = TypeVar("T")
 #: Values in one restriction: a statement stays short however many there are.
@@ -63,11 +63,13 @@ def one(query: Any, *columns: str) -> Any:
 
 def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of a table that agree with a key, in the order of its primary key."""
-    columns = table.heading.attributes.values()
-    if any(c.codec or c.json or c.uuid for c in columns):
-        return (table & key).to_dicts(order_by="KEY")
-    # Numbers, texts and dates: a third of the time of DataJoint's own, which looks at each value for what to decode.
-    return list((table & key & dj.Top(None, "KEY")).cursor(as_dict=True))
+    rows = list((table & key & dj.Top(None, "KEY")).cursor(as_dict=True))
+    # A third of the time of DataJoint's own `to_dicts`, which looks at each value for what to decode.
+    for name, column in table.heading.attributes.items():
+        if column.codec or column.json or column.uuid:
+            for row in rows:
+                row[name] = decode_attribute(column, row[name], squeeze=False, connection=table.connection)
+    return rows
 
 
 def row_of(table: Any, key: Any, rows: Rows = stored_rows) -> dict[str, Any]:

@@ -123,7 +123,7 @@ def test_visits_filmed_from_other_sides(from_other_sides: None):
     knee = next(c for c in charts_of(found, ["a", "b"]) if c.title == "Knee flexion")
     assert knee.far == {"left": [1], "right": [0]}
     lines = [
-        [float(o) for o in re.findall(r'<polyline[^>]*opacity="([\d.]+)"', str(knee.sides[s]))] for s in knee.sides
+        [float(o) for o in re.findall(r'<g fill="none"[^>]*opacity="([\d.]+)"', str(knee.sides[s]))] for s in knee.sides
     ]
     assert lines == [[1.0, 0.4], [0.4, 1.0]]
     page = web.client().get("/compare?v=1&v=2").text

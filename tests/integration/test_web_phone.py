@@ -16,12 +16,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from pymysql.err import OperationalError
 from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.keypoints import framing
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import to_row
 from pbl_pipeline.words import UNUSABLE
@@ -450,11 +453,11 @@ def test_drawn_mixes_of_takes_are_complete_by_usable_ones_alone(visit: int):
             times = 2 if rng.random() < 0.2 else 1  # a walk that was sent with two logs is one video
             about = {"step": step} if step else {}
             for _ in range(times):
-                sent.insert(0, (Sent(number, visit, "", 1, 0, about, "received", "", number), judged))
+                sent.insert(0, (Sent(number, visit, "", 1, 0, about, "received", None, number), judged))
             if step and wanted[step][0] == activity and judged.state in ("usable", "remarks"):
                 good[step].add(number)
             if rng.random() < 0.1:
-                sent.append((Sent(1000 + number, visit, "", 1, 0, about, "uploading", "", None), None))
+                sent.append((Sent(1000 + number, visit, "", 1, 0, about, "uploading", None, None), None))
         steps = steps_of(visit, sent)
         assert {str(s.number): s.done for s in steps} == {n: len(found) for n, found in good.items()}
         assert all(s.complete for s in steps) == all(len(good[n]) >= k for n, (_, k) in wanted.items())
@@ -870,3 +873,31 @@ def test_parts_of_a_recording_that_did_not_go_on_give_their_room_back(visit: int
 def test_the_size_of_a_part_is_that_of_the_page(visit: int):
     page = phone(visit).get("/phone").text
     assert f'data-part="{PART_BYTES}"' in page
+
+
+def test_a_picture_is_looked_at_while_filming(visit: int, monkeypatch: pytest.MonkeyPatch):
+    """The networks have their own test; here, who is answered, and what is refused."""
+    seen = []
+    stand_in = SimpleNamespace(cut_off=lambda image: seen.append(image.shape) or framing.FEET)
+    monkeypatch.setattr(framing, "Framing", lambda: stand_in)
+    picture = cv2.imencode(".jpg", np.zeros((90, 160, 3), np.uint8))[1].tobytes()
+    jpeg, path = {"content-type": "image/jpeg"}, "/phone/look.json"
+    browser = phone(visit)
+    assert browser.post(path, content=picture, headers=jpeg).json() == {"cut": "feet"}
+    assert seen == [(90, 160, 3)]
+    for content, headers in (
+        (b"", jpeg),
+        (b"text", jpeg),
+        (picture, {"content-type": "image/png"}),
+        (bytes(300_000), jpeg),
+    ):
+        assert browser.post(path, content=content, headers=headers).status_code in (400, 413, 415)
+    assert stranger().post(path, content=picture, headers=jpeg).status_code in (401, 403)
+    assert web.client(target=nothing).post(path, content=picture, headers=jpeg).status_code == 403
+
+    def absent() -> None:
+        raise PblError("ASSET_MISSING", "no network", "one", "connect")
+
+    monkeypatch.setattr(framing, "Framing", absent)
+    assert phone(visit).post(path, content=picture, headers=jpeg).json() == {"cut": None}
+    assert len(seen) == 1

@@ -10,10 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pytest
 
-from pbl_pipeline.video import VideoInfo, probe, read_phone_log
+from pbl_pipeline import assets
+from pbl_pipeline.keypoints import framing
+from pbl_pipeline.keypoints.framing import Framing
+from pbl_pipeline.video import VideoInfo, probe, read_frames, read_phone_log
 from pbl_schemas import connection, video
 from pbl_schemas.capture import PhoneRecording
 from pbl_schemas.intake import phone_recordings
@@ -42,6 +46,18 @@ CANVAS = """
   }, 33);
   navigator.mediaDevices.getUserMedia = async () => canvas.captureStream(30);
 }
+"""
+
+
+#: In the page: the next three texts of the hint, and when each came (ms).
+CUT_WHEN = """
+() => new Promise((done) => {
+  const found = [];
+  new MutationObserver(() => {
+    found.push([document.querySelector(".cut").textContent, performance.now()]);
+    if (found.length === 3) done(found);
+  }).observe(document.querySelector(".cut"), {childList: true});
+})
 """
 
 
@@ -228,6 +244,30 @@ def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: i
     assert about["dropped"] <= 0.01 * about["frames"], about
     info = film_of(visit)
     assert (info.width_px, info.height_px, info.n_frames) == (1920, 1080, about["frames"])
+
+
+def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: int, monkeypatch: pytest.MonkeyPatch):
+    """The woman of the demo, whole and then without feet, in turns of 5 s: within 2 s the page says which."""
+    (frame,) = read_frames(assets.fetch("demo_video"), start=110, stop=111)
+    x, pictures = 915, []
+    for top, bottom in ((430, 980), (430, 830)):
+        half = (bottom - top) * 2 // 3
+        pictures.append(cv2.resize(frame.image[top:bottom, x - half : x + half], (640, 480)))
+    looked = Framing()
+    assert [looked.cut_off(p) for p in pictures] == ["", "feet"]
+    turns = [p for p in pictures for _ in range(150)]
+    monkeypatch.setattr(framing, "Framing", lambda: looked)
+    with with_camera(chromium, tmp_path / "camera.mjpeg", turns) as browser, filming(browser, visit) as page:
+        start(page)
+        said = page.evaluate(CUT_WHEN)
+        page.locator(".record").click()
+        page.wait_for_selector(".after:not([hidden])")
+        keep(page)
+    assert [text.startswith("The feet are cut off") for text, _ in said] == [True, False, True]
+    # Each turn lasts 5 s: a hint that came late in one turn and early in the other is off by more than that.
+    assert abs(said[1][1] - said[0][1] - 5000) < 2000
+    about = about_the_recording()
+    assert about["dropped"] <= 0.1 * about["frames"], about
 
 
 def test_reloads_in_the_middle_of_an_upload(camera: Any, visit: int):

@@ -81,6 +81,7 @@ EXPECTED = {
     "GET /phone/authority.crt": ("*", ""),
     "GET /phone": (PHONE, ""),
     "GET /phone/state.json": (PHONE, ""),
+    "POST /phone/look.json": (PHONE, ""),
     "POST /phone/recordings.json": (PHONE, ""),
     "PUT /phone/recordings/1.json": (PHONE, ""),
     "POST /phone/finish/1.json": (PHONE, ""),

@@ -86,7 +86,7 @@ def _modules(package: str) -> dict[str, set[str]]:
                 base = ".".join(part for part in (base, node.module) if part)
                 targets |= {full if (full := f"{base}.{a.name}") in known else base for a in node.names}
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-                targets |= {a.value for a in node.args if isinstance(a, ast.Constant)}
+                targets |= {str(a.value) for a in node.args if isinstance(a, ast.Constant)}
                 ahead = [
                     str(a.values[0].value)
                     for a in node.args

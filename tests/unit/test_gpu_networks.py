@@ -28,7 +28,7 @@ from research.clip_keypoints import clip_keypoints
 from tests import refused
 from tests.videos import write_video
 
-LANDMARKS = (195, 117, 1)
+LANDMARKS, MAPS = (195, 117, 1), 64 * 64 * 39
 
 
 def spec_of(name: str) -> NetworkSpec:
@@ -68,6 +68,24 @@ def test_jax_function_has_litert_s_numbers(name: str) -> None:
             # Of coordinates up to 256 px, logits and metres; float32 sums in another order.
             largest = max(float(np.abs(expected[size]).max()), 1.0)
             assert np.abs(np.asarray(values[i]) - expected[size].ravel()).max() < 1e-4 * largest
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("little_optimised")
+def test_points_are_refined_in_the_program_as_by_litert() -> None:
+    """No map leaves it."""
+    spec = spec_of("blazepose_landmarks")
+    spec = dataclasses.replace(spec, outputs=(*LANDMARKS, MAPS), window_cells=1.5)
+    program = gpu_server.Program(spec, any_device=True, batch=2)
+    assert sorted(program.sizes) == [1, 117, 195]
+    shown = pictures(256, 2)
+    lite = LiteModel(spec.path, spec.sha256, spec.outputs)
+    for picture, row in zip(shown, program(np.array(shown)), strict=True):
+        raw = lite(spec.entered(picture))
+        got = dict(zip(program.sizes, np.split(row, np.cumsum(program.sizes)[:-1]), strict=True))
+        for size, expected in spec.decoded(raw).items():
+            assert np.abs(got[size] - expected.ravel()).max() < 0.02
+        assert np.abs(got[195] - raw[195].ravel()).max() > 1  # px
 
 
 def test_unknown_operation_is_named() -> None:

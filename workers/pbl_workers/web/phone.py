@@ -61,6 +61,8 @@ _NEXT_STEP = "tell who runs the server; the recording stays on the phone until t
 _on_disk = functools.partial(on_disk, _NEXT_STEP)
 #: Recordings of all visits that are put together and opened at a time.
 _OPENED_AT_ONCE = 4
+#: Longest picture (byte) that is looked at while filming.
+_LOOK_BYTES = 262_144
 log = logging.getLogger(__name__)
 
 
@@ -195,6 +197,8 @@ class Phones:
         #: Of each visit one recording at a time is finished; of all, as many are opened at once.
         self._finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
         self._opening = asyncio.Semaphore(_OPENED_AT_ONCE)
+        #: One picture at a time is looked at; None: not yet, or the networks are not on this machine.
+        self._looking, self._framing = asyncio.Lock(), None
 
     async def state(self, request: Request) -> Response:
         phone: Phone = request.state.phone
@@ -226,6 +230,27 @@ class Phones:
         body = json.dumps(told).encode()
         self._said[session_id, language] = rows, (body, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
         return self._said[session_id, language][1]
+
+    async def look(self, request: Request) -> Response:
+        """Say what a picture cuts off of the person; nothing where another one is being looked at. It is not kept."""
+        body, cut = await _body(request, "image/jpeg", _LOOK_BYTES), None
+        if not self._looking.locked():
+            async with self._looking:
+                cut = await asyncio.to_thread(self._cut_off, body)
+        return JSONResponse({"cut": cut})
+
+    def _cut_off(self, picture: bytes) -> str | None:
+        from pbl_pipeline.keypoints.framing import Framing, read_picture
+
+        image = read_picture(picture)
+        if image is None:
+            raise Refused("form")
+        try:
+            self._framing = self._framing or Framing()
+        except PblError as error:
+            log.warning("no hint while filming: %s", error.short())
+            return None
+        return self._framing.cut_off(image)
 
     async def finish(self, request: Request) -> Response:
         await _body(request, "application/json", BODY_BYTES)
@@ -264,6 +289,7 @@ def routes() -> list[Address]:
         Address("/phone/store.js", worker, OPEN),
         Address("/phone/authority.crt", authority, OPEN),
         Address("/phone/state.json", phones.state, FILM),
+        Address("/phone/look.json", phones.look, FILM, methods=["POST"]),
         Address("/phone/recordings.json", begin, FILM, methods=["POST"]),
         Address("/phone/recordings/{phone_recording:int}.json", part, FILM, methods=["PUT"]),
         Address("/phone/finish/{phone_recording:int}.json", phones.finish, FILM, methods=["POST"]),

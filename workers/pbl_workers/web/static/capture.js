@@ -1,6 +1,7 @@
 // The page of a phone that films a visit: opens the camera, films, keeps, sends, and shows what the server says.
 
 import { openCamera, Take } from "./capture_film.js";
+import { lookAt } from "./capture_look.js";
 import { logOf, Sensors, up } from "./capture_sensors.js";
 import { all, keep, newFile, Refusal, remove, request, send } from "./capture_takes.js";
 
@@ -35,6 +36,8 @@ let chosen = null;
 
 /** @type {Promise<void>|null} */
 let listening = null;
+/** @type {any} */
+let looking = null;
 
 async function open() {
   if (!navigator.mediaDevices) return say("not_secure");
@@ -52,6 +55,11 @@ async function open() {
   allow.hidden = true, record.hidden = false;
   record.focus();
   stream.getVideoTracks()[0].onended = () => stop("interrupted");
+  looking ??= lookAt(video, (cut) => {
+    tell(".cut", cut && t(`cut_${cut}`));
+    $(".cut").dataset.cut = cut;
+    if (cut && take) navigator.vibrate?.(60);
+  });
   setTimeout(() => { if (!take) say("ready", sensors.source ? "" : t("no_sensors")); }, 700);
 }
 allow.onclick = open;

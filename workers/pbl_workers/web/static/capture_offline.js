@@ -1,7 +1,7 @@
 // Keeps the phone's page usable without network: what it consists of, as it was loaded last.
 
 const CACHE = "phone-1";
-const PARTS = ["/phone", "/static/page.css", "/static/capture.css", "/static/icon.svg", "/static/capture.js", "/static/capture_film.js",
+const PARTS = ["/phone", "/static/page.css", "/static/capture.css", "/static/icon.svg", "/static/capture.js", "/static/capture_film.js", "/static/capture_look.js",
   "/static/capture_sensors.js", "/static/capture_takes.js", "/phone/store.js", "/vendor/mediabunny-1.61.0.min.js"];
 const worker = /** @type {any} */ (self);
 
