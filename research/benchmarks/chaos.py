@@ -18,6 +18,7 @@ import multiprocessing
 import os
 import platform
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -253,12 +254,12 @@ def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
             wrong = _run(site, minutes, supervisors, can_fill)
         finally:
             site.end_bosses()
-            database.remove_home(home / "nothing")
             from pbl_schemas.operations import embedded
 
             if site.mysql is not None:
                 site.mysql.stop()
             embedded.stop(folder=embedded.Folder(home / "db"))
+    shutil.rmtree(home, ignore_errors=True)
     for line in wrong:
         click.echo(f"WRONG: {line}")
     raise SystemExit(1 if wrong else 0)

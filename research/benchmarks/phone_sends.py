@@ -26,6 +26,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -468,8 +469,8 @@ def main(sends: int, seed: int, phones: int, minutes: float, keep: bool) -> None
             from pbl_schemas.operations import embedded
 
             embedded.stop(folder=embedded.Folder(home / "db"))
-            if not keep:
-                database.remove_home(home / "nothing")
+    if not keep:
+        shutil.rmtree(home, ignore_errors=True)
     for line in wrong[:40]:
         click.echo(f"WRONG: {line}")
     click.echo(f"{len(wrong)} wrong" + (f"; {home}" if keep else ""))
