@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -22,8 +23,15 @@ from pbl_pipeline import assets, settings
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.resources import cores
+from pbl_pipeline.temporary import new_folder
 
-OK, NOTE, MISSING = "ok", "note", "missing"
+if TYPE_CHECKING:
+    from pbl_pipeline.visit import Visit
+
+OK, NOTE, MISSING, WRONG = "ok", "note", "missing", "wrong"
+#: What the default methods measure in the demo recording, and how far another machine may be off.
+REFERENCE = {"index": 95.85, "double support": 24.51, "cadence": 97.91}
+MOST_OFF = 0.05
 
 #: Free space (GB) below which a session of videos will not fit.
 _MIN_FREE_GB = 2.0
@@ -38,14 +46,16 @@ class Finding:
     """One line of the table."""
 
     what: str
-    state: str  # "ok", "note" (works, but read it) or "missing" (needed, with a next step)
+    state: str  # "ok", "note" (works, but read it), "missing" or "wrong" (with a next step)
     detail: str
     next_step: str = ""
 
 
 @click.command()
 @click.option("--fetch", is_flag=True, help="First fetch the model and demo files that are missing.")
-def doctor(fetch: bool) -> None:
+@click.option("--self-check", is_flag=True, help="Then measure the demo recording and compare the results with those "
+              "of other machines (a minute).")  # fmt: skip
+def doctor(fetch: bool, self_check: bool) -> None:
     """Show what is installed, which device is used, and how to get missing parts.
 
     Exits with code 0 if everything that the default chain needs is there, else 1. Changes nothing without --fetch.
@@ -58,6 +68,10 @@ def doctor(fetch: bool) -> None:
     missing = [f for f in found if f.state == MISSING]
     summary = f"{len(missing)} missing: {', '.join(f.what for f in missing)}" if missing else "Nothing is missing."
     click.echo(f"\n{summary}")
+    if self_check and not missing:
+        measured = _self_check()
+        _print([measured])
+        missing = [measured] if measured.state == WRONG else []
     sys.exit(1 if missing else 0)
 
 
@@ -78,12 +92,38 @@ def examine(fetch_errors: dict[str, PblError] | None = None) -> list[Finding]:
 
 
 def _print(found: list[Finding]) -> None:
-    colours = {OK: "green", NOTE: "yellow", MISSING: "red"}
+    colours = {OK: "green", NOTE: "yellow", MISSING: "red", WRONG: "red"}
     width = max(len(f.what) for f in found)
     for f in found:
         click.echo(f"{f.what:<{width}}  {click.style(f'{f.state:<7}', fg=colours[f.state])}  {f.detail}")
         if f.next_step:
             click.echo(f"{'':<{width}}           next: {f.next_step}")
+
+
+def digits(visit: Visit) -> dict[str, float]:
+    """Return what `REFERENCE` holds, of a visit; NaN for what is not known."""
+    assert visit.measures is not None
+    found = {"index": visit.measures.gdi.mean}
+    for what, name in (("double support", "double_support_percent"), ("cadence", "cadence_steps_per_min")):
+        measure = visit.measures.spatiotemporal.measures[name]
+        found[what] = None if measure is None else measure.mean
+    return {what: float("nan") if value is None else float(value) for what, value in found.items()}
+
+
+def _self_check() -> Finding:
+    """Measure the demo recording from the file to the index. Raises the `PblError`s of `run_visit`."""
+    from pbl_pipeline.pipeline import run_visit
+
+    with new_folder() as folder:
+        visit, _ = run_visit([assets.fetch("demo_video")], folder, assets.fetch("demo_camera"))
+    found = digits(visit)
+    detail = ", ".join(f"{what} {value:.2f} (elsewhere {REFERENCE[what]:.2f})" for what, value in found.items())
+    if all(abs(value - REFERENCE[what]) <= MOST_OFF for what, value in found.items()):
+        return Finding("self-check", OK, detail)
+    advice = (
+        "do not measure with it; PBL_ONNX_DEVICE=cpu JAX_PLATFORMS=cpu tells if a GPU is at fault; report the table"
+    )
+    return Finding("self-check", WRONG, detail, advice)
 
 
 def _fetch_missing() -> dict[str, PblError]:

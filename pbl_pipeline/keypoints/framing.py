@@ -51,7 +51,7 @@ class Framing:
 
 
 def read_picture(content: bytes) -> np.ndarray | None:
-    """Return a JPEG (H, W, 3) uint8 BGR; None for what is no JPEG of at most `MOST_PX` a side, whose size is read
+    """Return a JPEG (H, W, 3) uint8 BGR; None for other bytes, and for a side beyond `MOST_PX`: the size is read
     before its pixels."""
     size = jpeg_size(content)
     if size is None or not 0 < min(size) <= max(size) <= MOST_PX:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pbl_pipeline.cli import doctor
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
@@ -105,6 +106,16 @@ def test_cadence_is_what_a_person_counts(out):
     assert session["step_time_s"]["mean"] == pytest.approx(60 / CADENCE_BY_EYE, rel=0.025)
     assert session["stride_time_s"]["mean"] == pytest.approx(120 / CADENCE_BY_EYE, rel=0.025)
     assert session["cycles"]["used"] >= 4
+
+
+def test_it_has_the_digits_that_a_self_check_compares(out):
+    session = json.loads((out / "metrics.json").read_text())["session"]
+    found = {
+        "index": session["gdi"]["mean"],
+        "double support": session["double_support_percent"]["mean"],
+        "cadence": session["cadence_steps_per_min"]["mean"],
+    }
+    assert found == pytest.approx(doctor.REFERENCE, abs=0.2 * doctor.MOST_OFF)
 
 
 def test_each_foot_down_is_where_a_person_sees_it(out):

@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner, Result
@@ -178,3 +179,19 @@ def test_errors_keep_their_advice(machine):
     error = PblError("ASSET_MISSING", found="why", expected="x", next_step="do this", key="demo_video")
     found = {f.what: f for f in module._assets({"demo_video": error})}
     assert (found["demo_video"].detail, found["demo_video"].next_step) == ("why", "do this")
+
+
+@pytest.mark.parametrize(("off", "state"), [(0.0, "ok"), (0.04, "ok"), (0.06, "wrong"), (float("nan"), "wrong")])
+def test_the_self_check_compares_what_the_demo_measures(monkeypatch, off: float, state: str):
+    """The measurement itself has its test with the demo (`test_it_has_the_digits_that_a_self_check_compares`)."""
+    monkeypatch.setattr(module, "examine", lambda failed: [module.Finding("all", module.OK, "")])
+    monkeypatch.setattr(assets, "fetch", lambda name: name)
+    seen = {"double_support_percent": "double support", "cadence_steps_per_min": "cadence"}
+    measures = {name: SimpleNamespace(mean=module.REFERENCE[what]) for name, what in seen.items()}
+    index = SimpleNamespace(mean=None if off != off else module.REFERENCE["index"] + off)
+    visit = SimpleNamespace(measures=SimpleNamespace(spatiotemporal=SimpleNamespace(measures=measures), gdi=index))
+    monkeypatch.setattr("pbl_pipeline.pipeline.run_visit", lambda paths, *_: (visit, {}))
+    result = doctor("--self-check")
+    assert f"  {state} " in line(result, "self-check")
+    assert result.exit_code == (state == "wrong")
+    assert ("do not measure" in result.output) == (state == "wrong")
