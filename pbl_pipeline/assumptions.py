@@ -47,9 +47,11 @@ def check_size(size: float, refuse: Refusal) -> None:
         return
     names = ((own, read) for own in UNITS for read in ("metres", "centimetres", "millimetres"))
     own, read = min(names, key=lambda n: abs(np.log(size * UNITS[n[0]] / UNITS[n[1]])))
-    times = said("{x:.3g} times", x=size) if size > 1 else said("1/{x:.3g} of", x=1 / size)
+    times = said("{x:.4g} times", x=size) if size > 1 else said("1/{x:.3g} of", x=1 / size)
     raise refuse(
-        said("a body {times} that of an adult, such as {own} read as {read}", times=times, own=own, read=read),
+        said(
+            "a body {times} that of an adult, such as {own} read as {read}", times=times, own=said(own), read=said(read)
+        ),
         f"{SIZES[0]:g} to {SIZES[1]:g} times an adult's size",
         "correct the unit: of a .trc or .c3d that of its header; metres in all other files",
     )
@@ -60,9 +62,15 @@ def check_steps(time_s: np.ndarray, refuse: Refusal) -> None:
     step = interval_of(time_s) if len(time_s) > 1 else STEPS_S[1]
     if STEPS_S[0] <= step <= STEPS_S[1]:
         return
-    guess = "frame numbers" if np.allclose(np.diff(time_s), 1) else "milliseconds" if step > 0.25 else "another unit"
+    guess = (
+        said("frame numbers")
+        if np.allclose(np.diff(time_s), 1)
+        else said("milliseconds")
+        if step > 0.25
+        else said("another unit")
+    )
     raise refuse(
-        said("{step:.3g} s from frame to frame, such as {guess} read as seconds", step=step, guess=guess),
+        said("{step:.3g} s from frame to frame, such as {guess} read as seconds", step=step, guess=said(guess)),
         f"{STEPS_S[0]:g} to {STEPS_S[1]:g} s",
         "write the time of each frame in seconds",
     )

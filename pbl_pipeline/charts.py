@@ -113,7 +113,7 @@ class Axes:
         opacity: float = 1.0,
         dash: str = "none",
     ) -> None:
-        """A curve, or several (N, P); it is broken where a value is NaN."""
+        """A curve, or several (N, P); it is broken where `y` is NaN."""
         across, up = self.x(x), np.atleast_2d(self.y(y))
         whole = " ".join(f"{v:.1f},%.1f" for v in across.tolist())  # visits have hundreds of cycles
         lines = []

@@ -7,6 +7,7 @@ and a test fails when the two differ.
 from __future__ import annotations
 
 import contextlib
+import string
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import PurePath
 from typing import Any, NamedTuple
@@ -116,7 +117,8 @@ class Said(str):
 
 
 def said(template: str, /, **values: Any) -> Said:
-    """Fill the places of a text, such as "{seconds:.1f} s": numbers and words, which may be texts of `said`."""
+    """Fill the places of a text, such as "{seconds:.1f} s", with numbers, names, and words that are texts of `said`
+    themselves: names stay as they are in every language."""
     plain = {k: v.item() if hasattr(v, "item") else v for k, v in values.items()}
     number = int, float, Said
     return _said(template, {k: v if isinstance(v, number) else harmless(str(v), lines=False) for k, v in plain.items()})
@@ -129,10 +131,14 @@ def _said(template: str, values: dict[str, Any], text: str | None = None) -> Sai
 
 
 def said_of(data: Any) -> str:
-    """Return the text that `Said.data` or a text became in JSON."""
-    if not isinstance(data, dict):
-        return str(data)
-    return _said(data["says"], {k: said_of(v) if isinstance(v, dict) else v for k, v in data["of"].items()})
+    """Return the text that `Said.data` or a text became in JSON; of anything else its text."""
+    try:
+        places = [name for _, name, _, _ in string.Formatter().parse(data["says"]) if name is not None]
+        if all(map(str.isidentifier, places)):
+            return _said(data["says"], {k: said_of(v) if isinstance(v, dict) else v for k, v in data["of"].items()})
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        pass
+    return str(data)
 
 
 def _data(value: Any) -> Any:

@@ -96,7 +96,7 @@ def library_words(language: str, english: str) -> str:
 
 
 def _own_words(language: str, english: str) -> str | None:
-    """`_library_words`; a text of `errors.said` by its template, whose values need not be told from the text."""
+    """`_library_words`; a text of `errors.said` by its template: its names stay, its numbers and own texts do not."""
     if isinstance(english, Said):
         name = bare(english.template)
         own = catalogue().get(f"said.{name}") or catalogue().get(f"library.{name}")
@@ -114,7 +114,7 @@ def _value(language: str, text: Said, name: str) -> str:
     """Return a value of a text as the text shows it, in a language."""
     value = text.values[name]
     if isinstance(value, str):
-        return _in_place(language, value)
+        return library_words(language, value) if isinstance(value, Said) else value
     spec = next((spec for _, field, spec, _ in string.Formatter().parse(text.template) if field == name), "")
     return decimals(language, format(value, spec or ""))
 
@@ -237,8 +237,9 @@ def library(language: str, english: str) -> str:
 def on_page(language: str, english: str) -> Markup:
     """Return a text as `library` does, without codes of errors and without the sentences that name a command: a page
     says what to click."""
-    if not isinstance(english, Said):
-        english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], english)
+    if isinstance(english, Said) and (own := _own_words(language, english)) is not None:
+        return escape(own)
+    english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], str(english))
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown

@@ -17,7 +17,7 @@ import numpy as np
 
 from pbl_pipeline import progress
 from pbl_pipeline.code_version import code_version
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import check_out_file, complete_file, sha256_of
 from pbl_pipeline.render import draw_skeleton
 from pbl_pipeline.runs import ranges
@@ -262,8 +262,8 @@ def _pictures(video: Path, info: VideoInfo, heads: Heads, how: str) -> Iterator[
     if n != info.n_frames:
         raise PblError(
             "VIDEO_CHANGED",
-            found=f"{'more than ' if n > info.n_frames else ''}{min(n, info.n_frames)} frames",
-            expected=f"the {info.n_frames} frames that were probed",
+            found=said("more than {n} frames" if n > info.n_frames else "{n} frames", n=min(n, info.n_frames)),
+            expected=said("the {n} frames that were probed", n=info.n_frames),
             next_step="run it again when the file is complete",
             key=str(video),
         )

@@ -120,7 +120,7 @@ def solve_implicit(session: Session, params: ImplicitAdamParams) -> Solution:
         if not np.isfinite(loss):
             raise PblError(
                 "FIT_DIVERGED",
-                found=said("loss {loss} after {n} steps", loss=loss, n=chunk * CHUNK + kept),
+                found=said("a loss that is not finite, after {n} steps", n=chunk * CHUNK + kept),
                 expected="a finite loss",
                 next_step="check the keypoints and the camera matrix; report the keypoints file if both are sound",
             )

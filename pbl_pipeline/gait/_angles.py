@@ -145,9 +145,9 @@ def check_ranges(series: AngleSeries, name: str) -> None:
                 raise PblError(
                     "GAIT_INPUT",
                     found=said(
-                        "{angle} of the {side} side from {low:.0f} to {high:.0f} deg",
-                        angle=angle.replace("_", " "),
-                        side=side,
+                        "{angle}, {side}: {low:.0f} to {high:.0f} deg",
+                        angle=said(angle.replace("_", " ")),
+                        side=said(side),
                         low=low,
                         high=high,
                     ),

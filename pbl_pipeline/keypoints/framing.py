@@ -56,15 +56,21 @@ def read_picture(content: bytes) -> np.ndarray | None:
     size = jpeg_size(content)
     if size is None or not 0 < min(size) <= max(size) <= MOST_PX:
         return None
-    return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error:
+        return None
 
 
 def jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Return width and height that the frame header of a JPEG states (ITU-T T.81, B.2.2); None without one."""
+    """Return width and height that the frame header of a JPEG states (ITU-T T.81, B.2.2). None for one that is not of
+    baseline coding, as browsers write it, and where anything but tables, comments and data of applications precedes."""
     at = 2
     while content[:2] == b"\xff\xd8" and at + 9 <= len(content) and content[at] == 0xFF:
         marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+        if marker == 0xC0:
             return int.from_bytes(content[at + 7 : at + 9], "big"), int.from_bytes(content[at + 5 : at + 7], "big")
+        if marker not in (0xC4, 0xDB, 0xDD, 0xFE) and not 0xE0 <= marker <= 0xEF:
+            return None
         at += 2 + length
     return None

@@ -22,13 +22,13 @@ _LEAST = 1e-6
 
 
 def refined(points: Any, logits: Any, sd_cells: float, xp: Any = np) -> Any:
-    """Move points towards the means of their peaks (mean shift in a Gaussian window): the whole way for a peak of
-    probability 1, not at all for a black map.
+    """Move points towards the means of their peaks (mean shift in a Gaussian window): the nearer and the higher a
+    peak, the further; not at all for a black map.
 
     Parameters
     ----------
     points : (J, 2)
-        x, y in px of the network's picture; any finite value.
+        x, y in px of the network's picture, also beyond it.
     logits : (SIDE, SIDE, J)
         Map of each point, rows downwards.
     sd_cells

@@ -23,7 +23,7 @@ import dataclasses
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 
 from .associate import measure
 from .types import Detection, PersonTrack, SubjectChoice, Tracking
@@ -87,7 +87,7 @@ def choose_walker(tracking: Tracking, params: SubjectParams, override: int | Non
         if override not in scores:
             raise PblError(
                 "SUBJECT_UNKNOWN_PERSON",
-                found=f"person {override}",
+                found=said("person {n}", n=override),
                 expected=f"one of the tracked persons: {', '.join(map(str, scores)) or 'none was found'}",
                 next_step="look at the numbers in the list of persons and choose one of them",
                 key=override,

@@ -101,7 +101,7 @@ def _mp4(file: BinaryIO, size: int) -> str | None:
                 "the '{box}' box ends at byte {end}, the file at {size}", box=name.decode(), end=at + length, size=size
             )
     if b"moov" not in boxes:
-        return "the index of the recording (the 'moov' box) is not in the file"
+        return said("the index of the recording (the 'moov' box) is not in the file")
     return None
 
 

@@ -284,9 +284,9 @@ class Decoder:
         if self._demux_error is not None:
             return said("reading stops there: {why}", why=self._demux_error)
         if self._last_packet_corrupt:
-            return "the last packet of the file is incomplete"
+            return said("the last packet of the file is incomplete")
         if self._last_frame_corrupt:
-            return "the last picture is incomplete"
+            return said("the last picture is incomplete")
         beyond_s = self._seconds(self._max_packet_pts) - self._seconds(self._last_pts)
         if self._max_packet_pts is not None and beyond_s > 0:
             return said("the pictures of the last {s:.2f} s do not decode", s=beyond_s)
@@ -356,7 +356,7 @@ class Decoder:
             "VIDEO_NOT_A_VIDEO",
             found="a video stream that no decoder here reads"
             if unknown
-            else said("a file with {kinds} streams and no video", kinds=", ".join(kinds) or "no"),
+            else said("a file without a video stream, with {kinds}", kinds=", ".join(kinds) or "-"),
             expected=_EXPECTED,
             next_step="choose the file that holds the pictures; convert it to MP4 (H.264) if its codec is unusual",
             key=self.path,

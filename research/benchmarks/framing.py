@@ -56,7 +56,7 @@ def main(paths: list[str]) -> None:
                 for what, part in (("feet", image[: min(foot, height)]), ("head", image[max(crown, 0) :])):
                     if (what == "feet" and foot <= height) or (what == "head" and crown >= 0):
                         said = framing.cut_off(small(part))
-                        seen.setdefault((what, share), Counter())["nobody" if said is None else said or "whole"] += 1
+                        seen.setdefault((what, share), Counter())["no one" if said is None else said or "whole"] += 1
     for (what, share), counts in sorted(seen.items()):
         click.echo(f"{what} {share:+.2f}: " + ", ".join(f"{k} {n}" for k, n in sorted(counts.items())))
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, from_row, to_row
 from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, VariableScore
@@ -361,7 +361,7 @@ def norm_of_row(name: str, sha256: str, ref: Mapping[str, Any] | None = None) ->
     if norm.sha256 != sha256:
         raise PblError(
             "NORM_INVALID",
-            found=f"normative set {name} with SHA-256 {norm.sha256}",
+            found=said("normative set {name} with SHA-256 {sum}", name=name, sum=norm.sha256),
             expected=f"SHA-256 {sha256}, as the row says",
             next_step="use the version of pbl-pipeline that wrote the row, or plan the session with the newer set",
         )

@@ -10,7 +10,7 @@ from typing import Any
 
 import pymysql
 
-from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said_of
+from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said, said_of
 
 from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
 
@@ -56,7 +56,7 @@ def of_server(error: Exception) -> PblError:
     if isinstance(error, LostConnectionError) or number in AWAY:
         return PblError(
             "DB_NOT_RUNNING",
-            found=f"the database went away while it was asked ({text})",
+            found=said("the database went away while it was asked ({why})", why=text),
             expected="an answer",
             next_step="try again; if that fails: `pbl db status`, `pbl db start`",
         )
@@ -67,7 +67,7 @@ def of_server(error: Exception) -> PblError:
     }
     return PblError(
         "DB_REFUSED",
-        found=f"error {number} of the server: {text}",
+        found=said("error {n} of the server: {why}", n=number, why=text),
         expected="a statement that the server executes; nothing was written",
         next_step=next((said for numbers, said in steps.items() if number in numbers), "report it with the whole text"),
     )
@@ -133,16 +133,16 @@ def stored_error(message: str) -> PblError:
     """Return the error that a row's message holds: as `as_text` writes it, or the text of one, as earlier versions and
     DataJoint's own populate write it. INTERNAL, the whole message as found, for one that is not coded."""
     code, start = error_code(message), _CODE.match(message)
-    said = message[start.end() :].strip() if start else ""
+    rest = message[start.end() :].strip() if start else ""
     try:
-        data = json.loads(said) if said.startswith("{") else None
+        data = json.loads(rest) if rest.startswith("{") else None
     except ValueError:
         data = None
-    if isinstance(data, dict) and start and start[1] == code:
+    if isinstance(data, dict):  # also of a code that another package declares, which is not loaded here
         found, expected, next_step = (said_of(data.get(name, "")) for name in ("found", "expected", "next_step"))
         return PblError(code, found, expected, next_step, data.get("key"))
     lines = [line.strip() for line in message.splitlines()]
-    of_one_line = said if start and start[1] == code and len(lines) == 1 else message.strip()
+    of_one_line = rest if start and start[1] == code and len(lines) == 1 else message.strip()
     # The last next step: names stand before it, and the name of a file may hold a line that looks like one.
     next_step = _stated("next:", reversed(lines), _REPORT)
     return PblError(code, _stated("found:", lines, of_one_line), _stated("expected:", lines, ""), next_step)

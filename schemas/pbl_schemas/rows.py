@@ -64,7 +64,7 @@ def one(query: Any, *columns: str) -> Any:
 def stored_rows(table: Any, key: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of a table that agree with a key, in the order of its primary key."""
     rows = list((table & key & dj.Top(None, "KEY")).cursor(as_dict=True))
-    # A third of the time of DataJoint's own `to_dicts`, which looks at each value for what to decode.
+    # DataJoint's own `to_dicts` looks at each value for what to decode: three times as long where there is nothing.
     for name, column in table.heading.attributes.items():
         if column.codec or column.json or column.uuid:
             for row in rows:

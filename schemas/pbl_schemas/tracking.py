@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline import methods
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import check_numbers, load_npz
 from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
@@ -247,7 +247,7 @@ def set_override(key: Mapping[str, Any], person_id: int) -> None:
         if person_id not in persons:
             raise PblError(
                 "SUBJECT_UNKNOWN_PERSON",
-                found=f"person {person_id}",
+                found=said("person {n}", n=person_id),
                 expected=f"one of {persons}" if persons else "a video in which a person was found",
                 next_step="choose one of the numbers above",
                 key=f"video_id={key['video_id']}",

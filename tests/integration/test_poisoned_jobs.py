@@ -182,5 +182,5 @@ def test_an_error_of_a_job_is_german_and_whole_on_pages(tables: None, tmp_path: 
     browser.headers["accept-language"] = "de"
     for path in ("/visits/1", "/recordings/1", "/operate"):
         assert "Aufnahme gang: Doppelschritte von 0,12 s" in browser.get(path).text, path
-    assert "erichtigen Sie die Zeiten der Bilder" in browser.get("/visits/1").text
+    assert "ie Zeiten der Bilder berichtigen" in browser.get("/visits/1").text
     assert why(1).verdict.startswith("reading of the video failed (FIT_INPUT: trial gang: strides of 0.12 s)")

@@ -37,5 +37,17 @@ def test_only_small_jpegs_are_decoded():
     at = good.index(b"\xff\xc0") + 5
     large = good[:at] + b"\xff\xff\xff\xff" + good[at + 4 :]  # says 65,535 px a side
     assert jpeg_size(large) == (65535, 65535)
-    for content in (large, b"", b"\xff\xd8", good[:20], cv2.imencode(".png", image)[1].tobytes(), b"\xff\xd8" * 50):
+    # What is no table before the size, and progressive coding, which costs a hundred times as much to read.
+    odd = good[:2] + b"\xff\x00\x00\x04ab" + good[2:]
+    progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    for content in (
+        large,
+        odd,
+        progressive,
+        b"",
+        b"\xff\xd8",
+        good[:20],
+        cv2.imencode(".png", image)[1].tobytes(),
+        b"\xff\xd8" * 50,
+    ):
         assert read_picture(content) is None

@@ -13,6 +13,7 @@ from datajoint.jobs import ERROR_MESSAGE_LENGTH, TRUNCATION_APPENDIX
 from pbl_pipeline import texts
 from pbl_pipeline.assumptions import check_size
 from pbl_pipeline.errors import PblError, Said, said
+from pbl_pipeline.gait._angles import LEG_ANGLES
 from pbl_schemas.job_errors import as_text, error_code, error_message, stored_error
 from tests.source import PACKAGES, files, nodes
 
@@ -68,6 +69,17 @@ def test_texts_of_earlier_versions_and_of_datajoint_are_read():
     for text in (str(error), f"PblError: {error}"):
         assert parts(stored_error(text)) == parts(error)
     assert parts(stored_error("VIDEO_DAMAGED: 3 pictures"))[:2] == ("VIDEO_DAMAGED", "3 pictures")
+    unknown = stored_error('PLATE_SATURATED: {"found": "6 kN", "expected": "5 kN", "next_step": "record again"}')
+    assert parts(unknown) == ("INTERNAL", "6 kN", "5 kN", "record again")
+    for odd in (
+        '{"says": "{x"}',
+        '{"says": "{x}", "of": {}}',
+        '{"says": "{x.__class__}", "of": {"x": 1}}',
+        "[1]",
+        "null",
+    ):
+        assert stored_error(f'FIT_INPUT: {{"found": {odd}}}').code == "FIT_INPUT"
+        assert "<class" not in stored_error(f'FIT_INPUT: {{"found": {odd}}}').found
     for text in ("KeyboardInterrupt", "DataJointError: fetch1 found nothing", "NO_SUCH_CODE: {}", "INTERNAL: [1]"):
         assert stored_error(text).code == "INTERNAL"
     cut = error_message(PblError("VIDEO_DAMAGED", "x" * 500, "y", "z"), "Keypoints", KEY)[:300] + TRUNCATION_APPENDIX
@@ -83,27 +95,32 @@ def test_a_text_with_values_is_said_in_the_language_of_the_page():
     with pytest.raises(PblError) as error:
         check_size(1000.0, functools.partial(refuse, "a: b"))
     back = stored(error.value)
-    assert back.found == "trial a: b: a body 1e+03 times that of an adult, such as millimetres read as metres"
-    german = (
-        "Aufnahme a: b: ein Körper von 1e+03 mal der Größe eines Erwachsenen, etwa Millimeter, die als Meter gelesen"
-    )
+    assert back.found == "trial a: b: a body 1000 times that of an adult, such as millimetres read as metres"
+    german = "Aufnahme a: b: ein Körper vom 1000-Fachen der Größe eines Erwachsenen, etwa mit Millimetern, die als"
     for text in (back.found, back.short()):
         assert texts.on_page("de", text).startswith(german)
         assert texts.on_page("en", text) == back.found
     assert back.short().startswith("FIT_INPUT: ")
     lasts = said("the whole video lasts {s:.2f} s", s=0.5)
     assert "0,50" in texts.on_page("de", lasts)
-    # Words in a value are those of a person, not a template nor a tag.
+    # Words in a value are a name, such as of a recording, not a template, a tag, a word or a command.
+    named = said("trial {name}: NaN or infinite points with confidence above 0", name="fast")
+    assert texts.on_page("de", named).startswith("Aufnahme fast:")
+    assert "/data/pbl study" in texts.on_page("de", said("no file at {path}", path="/data/pbl study"))
     assert "&lt;b&gt;{n}" in texts.on_page("de", said("no file at {path}", path="<b>{n}"))
 
 
 def templates() -> set[str]:
-    """Every text that the code says with values."""
+    """Every text that the code says with values; each call has the values of its text."""
     found = set()
     for path in files(*PACKAGES):
         for node in nodes(path):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "said":
-                found.add(ast.literal_eval(node.args[0]))
+                if not isinstance(node.args[0], ast.Constant):
+                    continue  # of several texts, or one that is handed on
+                found.add(text := str(node.args[0].value))
+                places = {field for _, field, _, _ in Formatter().parse(text) if field}
+                assert places == {k.arg for k in node.keywords}, text
     return found
 
 
@@ -113,6 +130,7 @@ def test_what_is_said_with_values_has_its_german_and_is_said():
     filled = [said(t, **{f: 0.5 for _, f, _, _ in Formatter().parse(t) if f}) for t in every]
     untold = [t.template for t in filled if "<span" in texts.on_page("de", t)]
     assert not untold
-    plain = {texts.bare(t) for t in every}
+    written = {str(n.value) for path in files(*PACKAGES) for n in nodes(path) if isinstance(n, ast.Constant)}
+    plain = {texts.bare(t) for t in every | written} | {name.replace("_", " ") for name in LEG_ANGLES}
     assert not [n for n in texts.catalogue() if n.startswith("said.") and n.removeprefix("said.") not in plain]
     assert json.loads(json.dumps(said("{n} frames", n=np.int32(3)).data())) == {"says": "{n} frames", "of": {"n": 3}}

@@ -58,7 +58,7 @@ class Phone:
 
 @dataclasses.dataclass(frozen=True)
 class Sent:
-    """A recording that a phone sends. `about`: statements of the phone; `error`: why it was refused."""
+    """A recording that a phone sends. `about`: statements of the phone; `error`: why it was not taken."""
 
     number: int
     session_id: int

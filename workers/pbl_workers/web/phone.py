@@ -197,8 +197,8 @@ class Phones:
         #: Of each visit one recording at a time is finished; of all, as many are opened at once.
         self._finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
         self._opening = asyncio.Semaphore(_OPENED_AT_ONCE)
-        #: One picture at a time is looked at; None: not yet, or the networks are not on this machine.
-        self._looking, self._framing = asyncio.Lock(), None
+        #: One picture at a time is looked at; the networks once one was, None if they are not on this machine.
+        self._looking, self._framing = asyncio.Lock(), list[Any]()
 
     async def state(self, request: Request) -> Response:
         phone: Phone = request.state.phone
@@ -232,12 +232,12 @@ class Phones:
         return self._said[session_id, language][1]
 
     async def look(self, request: Request) -> Response:
-        """Say what a picture cuts off of the person; nothing where another one is being looked at. It is not kept."""
-        body, cut = await _body(request, "image/jpeg", _LOOK_BYTES), None
-        if not self._looking.locked():
-            async with self._looking:
-                cut = await asyncio.to_thread(self._cut_off, body)
-        return JSONResponse({"cut": cut})
+        """Say what a picture cuts off of the person; 204 where another one is being looked at. It is not kept."""
+        body = await _body(request, "image/jpeg", _LOOK_BYTES)
+        if self._looking.locked():
+            return Response(status_code=204)
+        async with self._looking:
+            return JSONResponse({"cut": await asyncio.to_thread(self._cut_off, body)})
 
     def _cut_off(self, picture: bytes) -> str | None:
         from pbl_pipeline.keypoints.framing import Framing, read_picture
@@ -245,12 +245,13 @@ class Phones:
         image = read_picture(picture)
         if image is None:
             raise Refused("form")
-        try:
-            self._framing = self._framing or Framing()
-        except PblError as error:
-            log.warning("no hint while filming: %s", error.short())
-            return None
-        return self._framing.cut_off(image)
+        if not self._framing:
+            try:
+                self._framing.append(Framing())
+            except PblError as error:
+                log.warning("no hint while filming, until the next start: %s", error.short())
+                self._framing.append(None)
+        return self._framing[0] and self._framing[0].cut_off(image)
 
     async def finish(self, request: Request) -> Response:
         await _body(request, "application/json", BODY_BYTES)
