@@ -59,8 +59,12 @@ def limited(
     ours, theirs = context.Pipe(duplex=False)
     how = (theirs, dict(os.environ), n_bytes, seconds, returns, function, args)
     process = context.Process(target=_call, args=how, daemon=True)
-    process.start()
-    theirs.close()
+    try:
+        process.start()
+    except (EOFError, OSError) as error:  # the process that is copied was killed, or the machine is full
+        raise LimitExceeded(f"its process did not start: {error}") from error
+    finally:
+        theirs.close()
     try:
         end = time.monotonic() + seconds
         while not ours.poll(min(0.2, max(0.0, end - time.monotonic()))):

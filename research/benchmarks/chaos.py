@@ -18,11 +18,12 @@ import multiprocessing
 import os
 import platform
 import random
+import shutil
 import signal
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -168,10 +169,7 @@ class Site:
 
     def kill_server(self) -> None:
         """Inside an insert, where one begins within some seconds."""
-        inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
-        while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
-            time.sleep(0.002)
-        time.sleep(self.draw.uniform(0, 0.05))
+        inside = self.wait_for_insert()
         if self.mysql is not None:
             self.mysql.kill()
         else:
@@ -180,8 +178,16 @@ class Site:
         time.sleep(self.draw.uniform(0.2, 3.0))
         self.start_server()
 
-    def fill(self, disk: str) -> None:
-        """No byte is left on a disk for some seconds."""
+    def wait_for_insert(self) -> bool:
+        """Wait for a moment inside an insert; False where none began within some seconds."""
+        inserts, until = Path(os.environ[INSERTS]), time.monotonic() + 10.0
+        while not (inside := any(inserts.iterdir())) and time.monotonic() < until:
+            time.sleep(0.002)
+        time.sleep(self.draw.uniform(0, 0.05))
+        return inside
+
+    def fill(self, disk: str, left: int = 0, longest_s: float = 8.0) -> None:
+        """No byte, or so many, are left on a disk for some seconds."""
         ballast = self.home / disk / "ballast"
         with ballast.open("wb") as file:
             size, chunk = 0, 64 << 20
@@ -191,7 +197,8 @@ class Site:
                     size += chunk
                 except OSError:
                     chunk //= 2
-        time.sleep(self.draw.uniform(2.0, 8.0))
+            file.truncate(max(0, size - left))
+        time.sleep(self.draw.uniform(longest_s / 4, longest_s))
         ballast.unlink()
         self.done[f"disk of the {disk} full"] += 1
 
@@ -227,7 +234,8 @@ def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:
 def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
     """Let things fail for some minutes, then count."""
     home = database.new_home()
-    with _disks(home, minutes) as can_fill, pytest.MonkeyPatch.context() as patch:
+    sizes = {name: size(minutes) for name, size in DISKS.items()}
+    with disks(home, sizes) as can_fill, pytest.MonkeyPatch.context() as patch:
         database.leave_nothing_of_the_developer(patch)
         (home / "inserts").mkdir()
         patch.setenv("PBL_HOME", str(home))
@@ -246,28 +254,28 @@ def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
             wrong = _run(site, minutes, supervisors, can_fill)
         finally:
             site.end_bosses()
-            database.remove_home(home / "nothing")
             from pbl_schemas.operations import embedded
 
             if site.mysql is not None:
                 site.mysql.stop()
             embedded.stop(folder=embedded.Folder(home / "db"))
+    shutil.rmtree(home, ignore_errors=True)
     for line in wrong:
         click.echo(f"WRONG: {line}")
     raise SystemExit(1 if wrong else 0)
 
 
 @contextlib.contextmanager
-def _disks(home: Path, minutes: float) -> Iterator[bool]:
-    """Mount the small disks; whether that was allowed."""
+def disks(home: Path, sizes: Mapping[str, float]) -> Iterator[bool]:
+    """Mount small disks (MiB by name) in a folder; whether that was allowed."""
     mounted: list[Path] = []
     try:
-        for name, size in DISKS.items():
+        for name, size in sizes.items():
             (home / name).mkdir()
-            command = ["mount", "-t", "tmpfs", "-o", f"size={size(minutes):.0f}m,mode=755", "none", str(home / name)]
+            command = ["mount", "-t", "tmpfs", "-o", f"size={size:.0f}m,mode=755", "none", str(home / name)]
             if subprocess.run(command, check=False, capture_output=True).returncode == 0:
                 mounted.append(home / name)
-        yield len(mounted) == len(DISKS)
+        yield len(mounted) == len(sizes)
     finally:
         for disk in mounted:
             subprocess.run(["umount", "--lazy", str(disk)], check=False)

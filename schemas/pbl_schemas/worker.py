@@ -86,5 +86,7 @@ def installation_lock(work: str, server: Any) -> Iterator[bool]:
         )
         yield mine.rowcount == 1
     finally:
-        server.query(f"DELETE FROM {table} WHERE work=%s AND turn_lock=%s", args=(work, lock))  # noqa: S608
-        server.query("SELECT RELEASE_LOCK(%s)", args=(lock,))
+        try:
+            server.query(f"DELETE FROM {table} WHERE work=%s AND turn_lock=%s", args=(work, lock))  # noqa: S608
+        finally:  # a full disk refuses the first, and this connection may live for months
+            server.query("SELECT RELEASE_LOCK(%s)", args=(lock,))

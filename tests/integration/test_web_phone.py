@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from pymysql.err import OperationalError
 from starlette.testclient import TestClient
 
 from pbl_pipeline.errors import PblError
@@ -27,7 +28,7 @@ from pbl_pipeline.keypoints import framing
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import to_row
 from pbl_pipeline.words import UNUSABLE
-from pbl_schemas import gait, keypoints, session, video
+from pbl_schemas import gait, keypoints, session, tables_version, video
 from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
 from pbl_schemas.intake import phone_recordings
@@ -798,6 +799,45 @@ def test_room_is_promised_to_all_recordings_that_were_begun(
     assert [row["phone_recording"] for row in PhoneRecording().to_dicts()] == [first["number"]]
     assert send(browser, one)["state"] == "received"
     assert send(browser, two)["state"] == "received"
+
+
+def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Neither the upload of a browser nor parts that a killed server left count as those of what was begun."""
+    whole, sent = film(tmp_path), film(tmp_path, "sent")
+    browser = phone(visit)
+    with monkeypatch.context() as killed:
+        killed.setattr(phone_uploads, "discard", lambda *_: None)
+        assert send(browser, sent)["state"] == "received"
+    (tmp_path / "archive" / "_phone" / "P001" / "browser-1.mp4").write_bytes(bytes(9 * len(whole)))
+    disk = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + len(whole)))
+    answer = browser.post("/phone/recordings.json", json=stated(whole))
+    assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_a_database_that_goes_away_before_the_question_is_not_running(visit: int, monkeypatch: pytest.MonkeyPatch):
+    browser = phone(visit)
+
+    def gone() -> None:
+        raise OperationalError(2003, "Can't connect to MySQL server on '127.0.0.1' ([Errno 111] Connection refused)")
+
+    monkeypatch.setattr(tables_version, "refuse_newer", gone)
+    answer = browser.get("/phone/state.json")
+    assert (answer.status_code, code(answer)) == (503, "DB_NOT_RUNNING")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_server_that_is_killed_at_the_end_leaves_no_parts(
+    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bool
+):
+    """The phone, which got no answer, asks again."""
+    browser, sent = phone(visit), film(tmp_path) if whole else b"no video at all" * 1000
+    with monkeypatch.context() as killed:
+        killed.setattr(phone_uploads, "discard", lambda *_: None)
+        send(browser, sent)
+    assert list((tmp_path / "archive" / "_phone").rglob("0"))
+    assert begin(browser, sent)["state"] == ("received" if whole else "refused")
+    assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
 
 def test_no_part_takes_the_room_that_is_kept_free(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pymysql.err import OperationalError
 
 import pbl_schemas
 from pbl_schemas import connection, video
@@ -63,3 +65,17 @@ def test_two_processes_do_not_do_the_same_work_at_once(server: Any):
         assert (first, second) == (True, False)
     with installation_lock("refresh", video.Video.connection) as third:
         assert third
+
+
+def test_work_that_ended_on_a_full_disk_can_be_done_again(server: Any):
+    """The connection of a page lives on: it does not keep the lock when its row cannot be deleted."""
+
+    def query(text: str, **more: Any) -> Any:
+        if text.startswith("DELETE"):
+            raise OperationalError(1114, "The table 'turn' is full")
+        return server.query(text, **more)
+
+    with pytest.raises(OperationalError), installation_lock("refresh", SimpleNamespace(query=query)):
+        pass
+    with installation_lock("refresh", video.Video.connection) as again:
+        assert again

@@ -1,11 +1,14 @@
 """Functions in processes that begin as copies of one that has imported."""
 
 import os
+import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import forkserver
 
 import pytest
 
-from pbl_pipeline.limited import limited
+from pbl_pipeline.limited import LimitExceeded, limited
 
 
 def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(monkeypatch: pytest.MonkeyPatch):
@@ -14,6 +17,21 @@ def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(monkeypatch
         assert limited(os.getenv, "PBL_TEST_COPY", returns=True) == value
     monkeypatch.delenv("PBL_TEST_COPY")
     assert limited(os.getenv, "PBL_TEST_COPY", returns=True) is None
+
+
+def test_a_process_that_cannot_start_says_nothing_about_what_it_was_to_do():
+    limited(os.getpid)
+    copied = forkserver._forkserver._forkserver_pid  # type: ignore[attr-defined]
+    os.kill(copied, signal.SIGSTOP)
+    with ThreadPoolExecutor(1) as thread:
+        waiting = thread.submit(limited, os.getpid)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.5)
+        os.kill(copied, signal.SIGKILL)
+        with pytest.raises(LimitExceeded, match="did not start"):
+            waiting.result(30)
+    os.waitid(os.P_PID, copied, os.WEXITED | os.WNOWAIT)
+    assert limited(os.getpid, returns=True)
 
 
 def test_what_is_preloaded_sets_no_environment():

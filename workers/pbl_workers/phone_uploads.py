@@ -7,9 +7,11 @@ existing parts count, and all of them stay until the recording is registered.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
@@ -49,11 +51,11 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
     return start // PART_BYTES
 
 
-def check_promised(begun_bytes: int, next_step: str) -> None:
-    """Raise `PblError` FILE_UNWRITABLE if all recordings that were begun do not fit, each twice: the parts stay until
-    the whole is registered."""
-    here = sum(one.n_bytes for one in unfinished(archive_dir()))
-    check_room(max(2 * begun_bytes - here, 0), next_step)
+def check_promised(begun: Mapping[int, int], next_step: str) -> None:
+    """Raise `PblError` FILE_UNWRITABLE if all recordings that were begun (byte by number) do not fit, each twice: the
+    parts stay until the whole is registered."""
+    here = {one.path.name: one.n_bytes for one in unfinished(archive_dir())}
+    check_room(sum(max(2 * n - here.get(str(number), 0), 0) for number, n in begun.items()), next_step)
 
 
 def keep_part(phone: Phone, sent: Sent, number: int, body: bytes, sha256: str) -> None:
@@ -120,7 +122,7 @@ def remove_joined(phone: Phone, sent: Sent) -> None:
 
 
 def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
-    """Register a recording that was put together, have it computed first, and remove its parts; return its video_id.
+    """Register a recording that was put together, and have it computed first; return its video_id.
 
     Raises `PblError` DB_REFUSED while the drop folder is being imported or a person removed; DB_NOT_FOUND if the
     visit is gone; VIDEO_DUPLICATE if another visit has the recording; what is wrong with it.
@@ -146,13 +148,13 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
             )
         result = register_copies(visit, f"phone-{sent.number}.mp4", copies, archive_dir())
     assert result.video_id is not None
-    phone_recordings.received(sent.number, result.video_id)
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)
-    discard(phone, sent)
+    phone_recordings.received(sent.number, result.video_id)
     return result.video_id
 
 
 def discard(phone: Phone, sent: Sent) -> None:
     """Remove the parts of a recording that is registered or cannot be."""
-    shutil.rmtree(folder(phone, sent), ignore_errors=True)
+    with contextlib.suppress(OSError):  # it is not there, and the disk has no room for it
+        shutil.rmtree(folder(phone, sent), ignore_errors=True)
     remove_folders(archive_dir(), phone.subject)

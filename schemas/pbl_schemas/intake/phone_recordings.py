@@ -218,11 +218,12 @@ def begin(phone: Phone, stated: object) -> Sent:
     return _sent((PhoneRecording & same).fetch1())
 
 
-def begun_bytes(days: float) -> int:
-    """Return the length of all recordings that phones began to send within so many days and have not ended (byte)."""
+def begun_bytes(days: float) -> dict[int, int]:
+    """Return the length (byte), by number, of the recordings that phones began to send within so many days and have not
+    ended."""
     since = utc_now() - datetime.timedelta(days=days)
     begun = PhoneRecording & {"phone_state": UPLOADING} & f"phone_created > '{since:%F %T}'"
-    return int(sum(sum(begun.to_arrays(name)) for name in ("phone_video_size", "phone_log_size")))
+    return {int(r["phone_recording"]): r["phone_video_size"] + r["phone_log_size"] for r in begun.to_dicts()}
 
 
 def not_begun(number: int) -> None:

@@ -50,6 +50,7 @@ STATUS = {"DB_NOT_FOUND": 404, "VIDEO_MISSING": 404, "USAGE": 400, "DB_NOT_RUNNI
     "PHONE_LINK": 403,
     "UPLOAD_REFUSED": 422,
     "FILE_UNWRITABLE": 507,
+    "STORE_FULL": 507,
     "MACHINE_SHORT": 503,
 }
 #: Cache header of `vendor/`: its file names carry their versions.

@@ -161,6 +161,8 @@ async def removed(request: Request, sent: Sent, error: PblError) -> None:
 
 
 async def told(request: Request, sent: Sent) -> Response:
+    if sent.state != UPLOADING:  # here alone: also those that a killed server left, when the phone asks again
+        await asyncio.to_thread(phone_uploads.discard, request.state.phone, sent)
     missing = await _on_disk(phone_uploads.missing, request.state.phone, sent)
     if len(missing) == sent.n_parts:
         begun = await site.ask(request, phone_recordings.begun_bytes, UNFINISHED_DAYS)
@@ -262,7 +264,7 @@ class Phones:
                         copies = await _on_disk(phone_uploads.put_together, phone, sent)
                     await site.ask(request, phone_uploads.register, phone, sent, copies)
                 except PblError as error:
-                    await asyncio.to_thread(phone_uploads.remove_joined, phone, sent)
+                    await _on_disk(phone_uploads.remove_joined, phone, sent)
                     if not error.final:
                         if error.code == "MACHINE_SHORT":
                             log.warning("recording %d of visit %d: %s", sent.number, phone.session_id, error.short())
@@ -270,7 +272,6 @@ class Phones:
                         await removed(request, sent, error)
                         raise
                     await site.ask(request, phone_recordings.refused, sent.number, error)
-                    await asyncio.to_thread(phone_uploads.discard, phone, sent)
                 else:
                     with contextlib.suppress(PblError):  # others wait: its jobs are the first in the queue
                         compute(request, phone.session_id, False)

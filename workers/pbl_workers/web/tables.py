@@ -56,13 +56,13 @@ class Tables:
         from pbl_schemas import connection, tables_version
         from pbl_schemas.job_errors import of_server, store_full
 
-        if not self._declared:
-            pbl_schemas.activate(methods=False)
-            self._declared = True
-        else:
-            connection.connect()  # a server that was started again is found again
-            tables_version.refuse_newer()  # migrated while the page was served
         try:
+            if not self._declared:
+                pbl_schemas.activate(methods=False)
+                self._declared = True
+            else:
+                connection.connect()  # a server that was started again is found again
+                tables_version.refuse_newer()  # migrated while the page was served
             return question(*args)
         except (pymysql.err.Error, connection.LostConnectionError) as error:
             raise of_server(error) from error
