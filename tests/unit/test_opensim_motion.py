@@ -186,7 +186,7 @@ def test_exchanged_legs_are_told_by_the_standing_foot(mot: Path):
         (lambda c: c | {"time": 1000 * c["time"]}, "milliseconds read as seconds"),
         (lambda c: c | {"time": c["time"] / 10}, "strides of 0.11 s"),
         (lambda c: c | {f"pelvis_t{x}": 1000 * c[f"pelvis_t{x}"] for x in "xyz"}, "millimetres read as metres"),
-        (lambda c: c | {"hip_flexion_r": c["hip_flexion_r"] + 180}, "hip flexion of the right side"),
+        (lambda c: c | {"hip_flexion_r": c["hip_flexion_r"] + 180}, "hip flexion, right"),
         (
             lambda c: {n.replace("hip_", "Right hip "): c[n] for n in ("time", "hip_flexion_r")},
             "no coordinate of a leg",
