@@ -45,8 +45,6 @@ class Clock {
       video.requestVideoFrameCallback(shown);
     };
     video.requestVideoFrameCallback(shown);
-    // A picture that is sought while the video is out of sight may never be reported.
-    video.addEventListener("seeked", () => { if (this.video === video && video.paused) this.#at(frameAt(this.times, video.currentTime)); });
     for (const name of ["play", "pause", "ended"]) video.addEventListener(name, () => { this.playing = !video.paused; this.changed(); });
   }
 
