@@ -4,6 +4,7 @@
 #   install [--into NAME] PACKAGE==VERSION ...   a virtual environment NAME (`venv`) with these packages
 #   observe NAME                                 run the Python script on standard input there; its output is what is seen;
 #                                                with exit status 75 it could not do its work here
+#   mimic_server                                 a server of MySQL's protocol for the next script: `mimic.running`
 #   expect                                       compare what was seen with standard input; exits 0 or 1
 #
 # Exit codes: 0 behaves as described, 1 changed, 2 cannot run here.
@@ -43,6 +44,46 @@ observe() {
   elif ((status)); then
     { printf 'the script ended with %s: ' "$status"; tail -n 1 script.err; } >>seen
   fi
+}
+
+# A server that answers every query with one row, written to server.py, and mimic.py with its start: `with running()`.
+mimic_server() {
+  cat >server.py <<'PY'
+import asyncio, sys
+from mysql_mimic import MysqlServer, Session
+
+class One(Session):
+    async def query(self, expression, sql, attrs):
+        return [(1,)], ["one"]
+
+    async def schema(self):
+        return {}
+
+async def main():
+    server = MysqlServer(session_factory=One)
+    await server.start_server(host="127.0.0.1", port=int(sys.argv[1]))
+    print("ready", flush=True)
+    await server.serve_forever()
+
+asyncio.run(main())
+PY
+  cat >mimic.py <<'PY'
+import contextlib, socket, subprocess, sys
+
+@contextlib.contextmanager
+def running():
+    """Yield the port of a server that runs; it is killed at the end."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = subprocess.Popen([sys.executable, "server.py", str(port)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert server.stdout.readline() == "ready\n"
+        yield port
+    finally:
+        server.kill()
+        server.wait()
+PY
 }
 
 expect() {

@@ -11,42 +11,17 @@
 source "$(dirname "${BASH_SOURCE[0]}")/_common.sh"
 
 install datajoint==2.3.5 pymysql==1.2.4 mysql-mimic==3.0.5 sqlglot==30.30.0
-cat >server.py <<'PY'
-import asyncio, sys
-from mysql_mimic import MysqlServer, Session
-
-class One(Session):
-    async def query(self, expression, sql, attrs):
-        return [(1,)], ["one"]
-
-    async def schema(self):
-        return {}
-
-async def main():
-    server = MysqlServer(session_factory=One)
-    await server.start_server(host="127.0.0.1", port=int(sys.argv[1]))
-    print("ready", flush=True)
-    await server.serve_forever()
-
-asyncio.run(main())
-PY
+mimic_server
 observe venv <<'PY'
-import logging, socket, subprocess, sys
+import logging
+from mimic import running
 
-with socket.socket() as free:
-    free.bind(("127.0.0.1", 0))
-    port = free.getsockname()[1]
-server = subprocess.Popen([sys.executable, "server.py", str(port)], stdout=subprocess.PIPE, text=True)
-try:
-    assert server.stdout.readline() == "ready\n"
+with running() as port:
     import datajoint
 
     logging.disable()
     print("database.reconnect is", datajoint.config["database.reconnect"])
     first, second = (datajoint.Connection("127.0.0.1", "root", "", port, use_tls=False) for _ in range(2))
-finally:
-    server.kill()
-    server.wait()
 for connection, reconnect in ((first, False), (second, True)):
     try:
         connection.query("SELECT 1", reconnect=reconnect)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import string
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import PurePath
 from typing import Any, NamedTuple
 from unicodedata import category
@@ -128,6 +128,17 @@ def _said(template: str, values: dict[str, Any], text: str | None = None) -> Sai
     made = Said(template.format(**values) if text is None else text)
     made.template, made.values = template, values
     return made
+
+
+def as_said(text: str) -> Said:
+    """Return a text of the library, which a page finds in its catalogue, for a place of another; not for a name."""
+    return text if isinstance(text, Said) else said(text.replace("{", "{{").replace("}", "}}"))
+
+
+def joined(texts: Iterable[str], between: str = ", ") -> Said:
+    """Join texts of the library; empty ones are left out."""
+    parts = {f"part{i}": as_said(text) for i, text in enumerate(filter(None, texts))}
+    return said(between.join(f"{{{name}}}" for name in parts), **parts)
 
 
 def said_of(data: Any) -> str:

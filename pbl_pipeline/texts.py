@@ -30,6 +30,8 @@ _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
 #: The code of an error before what was found: of use to engineers, not on a page.
 _CODED = re.compile(r"\b([A-Z][A-Z0-9_]+): ")
+#: A place of a text, and what needs a language outside of places.
+_PLACE, _WORDS = re.compile(r"\{\w*\}"), re.compile(r"[^\W\d_]")
 #: How a place of a text shows its value.
 _SPEC = re.compile(r":[^{}]*(?=\})")
 #: Tags of a page, and its parts that are not read or are marked as names.
@@ -100,8 +102,9 @@ def _own_words(language: str, english: str) -> str | None:
     if isinstance(english, Said):
         name = bare(english.template)
         own = catalogue().get(f"said.{name}") or catalogue().get(f"library.{name}")
-        if own is not None:
-            return own[language].format(**{name: _value(language, english, name) for name in english.values})
+        template = own[language] if own else name
+        if own or (english.values and not _WORDS.search(_PLACE.sub("", name))):  # one that only joins has no language
+            return template.format(**{place: _value(language, english, place) for place in english.values})
     return _library_words(language, str(english))
 
 

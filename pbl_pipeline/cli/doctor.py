@@ -100,7 +100,7 @@ def _print(found: list[Finding]) -> None:
             click.echo(f"{'':<{width}}           next: {f.next_step}")
 
 
-def digits(visit: Visit) -> dict[str, float]:
+def _digits(visit: Visit) -> dict[str, float]:
     """Return what `REFERENCE` holds, of a visit; NaN for what is not known."""
     assert visit.measures is not None
     found = {"index": visit.measures.gdi.mean}
@@ -116,7 +116,7 @@ def _self_check() -> Finding:
 
     with new_folder() as folder:
         visit, _ = run_visit([assets.fetch("demo_video")], folder, assets.fetch("demo_camera"))
-    found = digits(visit)
+    found = _digits(visit)
     detail = ", ".join(f"{what} {value:.2f} (elsewhere {REFERENCE[what]:.2f})" for what, value in found.items())
     if all(abs(value - REFERENCE[what]) <= MOST_OFF for what, value in found.items()):
         return Finding("self-check", OK, detail)

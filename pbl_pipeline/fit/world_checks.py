@@ -16,7 +16,7 @@ import numpy as np
 
 from pbl_pipeline.assumptions import SIZES, UNITS, check_size, check_steps, check_strides
 from pbl_pipeline.body import MarkerSet, load_body
-from pbl_pipeline.errors import PblError, Said, said
+from pbl_pipeline.errors import PblError, as_said, joined, said
 from pbl_pipeline.keypoints import MOST_MISS_M, SEEN_SHARE, Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.keypoints.multi_view import meeting_points
 from pbl_pipeline.video import CameraPose
@@ -183,7 +183,7 @@ def explained(trial: MultiView, name: str, markers: MarkerSet) -> PblError | Non
             found=said(
                 "trial {name}: {wrong}: read so, the cameras agree within {cm:.0f} cm",
                 name=name,
-                wrong=functools.reduce(lambda first, rest: said("{first}, {rest}", first=first, rest=rest), wrong),
+                wrong=joined(wrong),
                 cm=100 * np.nanmax(miss) * UNITS[unit],
             ),
             expected="x_camera = R x_world + t with y down and z forward, t in metres",
@@ -231,7 +231,7 @@ def _turned(trial: World, turn: np.ndarray) -> World:
 def _error(name: str, found: str, expected: str, next_step: str) -> PblError:
     return PblError(
         "FIT_INPUT",
-        found=said("trial {name}: {found}", name=name, found=found if isinstance(found, Said) else said(found)),
+        found=said("trial {name}: {found}", name=name, found=as_said(found)),
         expected=expected,
         next_step=next_step,
         key=name,

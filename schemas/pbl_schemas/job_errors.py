@@ -69,7 +69,7 @@ def of_server(error: Exception) -> PblError:
         "DB_REFUSED",
         found=said("error {n} of the server: {why}", n=number, why=text),
         expected="a statement that the server executes; nothing was written",
-        next_step=next((said for numbers, said in steps.items() if number in numbers), "report it with the whole text"),
+        next_step=next((step for numbers, step in steps.items() if number in numbers), "report it with the whole text"),
     )
 
 

@@ -1,4 +1,4 @@
-"""What a picture cuts off of the person in it, and pictures that are not looked at."""
+"""Feet and heads that a picture cuts off, and pictures that are not looked at."""
 
 import cv2
 import numpy as np
@@ -37,7 +37,7 @@ def test_only_small_jpegs_are_decoded():
     at = good.index(b"\xff\xc0") + 5
     large = good[:at] + b"\xff\xff\xff\xff" + good[at + 4 :]  # says 65,535 px a side
     assert jpeg_size(large) == (65535, 65535)
-    # What is no table before the size, and progressive coding, which costs a hundred times as much to read.
+    # Another segment than a table before the size, and progressive coding, which takes a hundred times as long to read.
     odd = good[:2] + b"\xff\x00\x00\x04ab" + good[2:]
     progressive = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     for content in (

@@ -12,7 +12,7 @@ from datajoint.jobs import ERROR_MESSAGE_LENGTH, TRUNCATION_APPENDIX
 
 from pbl_pipeline import texts
 from pbl_pipeline.assumptions import check_size
-from pbl_pipeline.errors import PblError, Said, said
+from pbl_pipeline.errors import PblError, Said, joined, said
 from pbl_pipeline.gait._angles import LEG_ANGLES
 from pbl_schemas.job_errors import as_text, error_code, error_message, stored_error
 from tests.source import PACKAGES, files, nodes
@@ -103,6 +103,11 @@ def test_a_text_with_values_is_said_in_the_language_of_the_page():
     assert back.short().startswith("FIT_INPUT: ")
     lasts = said("the whole video lasts {s:.2f} s", s=0.5)
     assert "0,50" in texts.on_page("de", lasts)
+    # Texts that are joined, or stand in another, are said too, and a page that knows none of them says so.
+    both = joined(["", back.found, "not computed yet", "a {brace}"], "; ")
+    assert both == f"{back.found}; not computed yet; a {{brace}}"
+    assert texts.on_page("de", both).endswith(f"; {texts.library_words('de', 'not computed yet')}; a {{brace}}")
+    assert not joined([])
     # Words in a value are a name, such as of a recording, not a template, a tag, a word or a command.
     named = said("trial {name}: NaN or infinite points with confidence above 0", name="fast")
     assert texts.on_page("de", named).startswith("Aufnahme fast:")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import settings
 from pbl_pipeline.change import Result
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import PblError, as_said, said
 from pbl_pipeline.words import NOT_COMPUTED
 
 from .. import fit, gait, gdi, qc, session, video
@@ -104,7 +104,7 @@ class ShownRecording:
             return self.recording
         raise PblError(
             "DB_NOT_FOUND",
-            found=said("no fit of recording {n}: {why}", n=self.number, why=self.recording.problem),
+            found=said("no fit of recording {n}: {why}", n=self.number, why=as_said(self.recording.problem)),
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )

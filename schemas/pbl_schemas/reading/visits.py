@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import PblError, as_said, joined, said
 from pbl_pipeline.names import distinct
 from pbl_pipeline.texts import LANGUAGES
 
@@ -105,13 +105,14 @@ def fitted_visit(restriction: Any, *, gait: bool = True, whole: bool = False) ->
     `load_visit` raises, and `PblError` DB_NOT_FOUND if it is not computed yet."""
     visit = load_visit(restriction, measures=gait)
     if visit.solution is None or (whole and visit.measures is None):
-        problems: str = ""
-        for r in reversed([r for r in visit.left_out if r.problem]):
-            problems = said("{name}: {why}; {rest}", name=r.name, why=r.problem, rest=problems)
-        what = "no finished fit and measures of {visit}. {why}" if whole else "no finished fit of {visit}. {why}"
+        left_out = [r for r in visit.left_out if r.problem]
+        problems = joined([said("{name}: {why}", name=r.name, why=as_said(r.problem)) for r in left_out], "; ")
+        what = (
+            "no finished fit and measures of session '{visit}'." if whole else "no finished fit of session '{visit}'."
+        )
         raise PblError(
             "DB_NOT_FOUND",
-            found=said(what, visit=visit.label, why=problems),
+            found=joined([said(what, visit=visit.label), problems], " "),
             expected="a session that was populated",
             next_step="run `pbl populate`, then `pbl status`",
             key=f"subject {visit.subject}",

@@ -13,7 +13,7 @@ import logging
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import segno
@@ -42,6 +42,9 @@ from .address import FILM, OPEN, Address, number_of
 from .computing import begin as compute
 from .pages import reader_language
 from .tables import on_disk
+
+if TYPE_CHECKING:
+    from pbl_pipeline.keypoints.framing import Framing
 
 #: The phone's page may use its camera and sensors.
 _MAY = {
@@ -197,8 +200,8 @@ class Phones:
         #: Of each visit one recording at a time is finished; of all, as many are opened at once.
         self._finishing: WeakValueDictionary[int, asyncio.Lock] = WeakValueDictionary()
         self._opening = asyncio.Semaphore(_OPENED_AT_ONCE)
-        #: One picture at a time is looked at; the networks once one was, None if they are not on this machine.
-        self._looking, self._framing = asyncio.Lock(), list[Any]()
+        #: One picture at a time is looked at.
+        self._looking = asyncio.Lock()
 
     async def state(self, request: Request) -> Response:
         phone: Phone = request.state.phone
@@ -239,19 +242,24 @@ class Phones:
         async with self._looking:
             return JSONResponse({"cut": await asyncio.to_thread(self._cut_off, body)})
 
+    @functools.cached_property
+    def _framing(self) -> Framing | None:
+        """The networks that look, once a picture came; None if they are not on this machine."""
+        from pbl_pipeline.keypoints.framing import Framing
+
+        try:
+            return Framing()
+        except PblError as error:
+            log.warning("no hint while filming, until the next start: %s", error.short())
+            return None
+
     def _cut_off(self, picture: bytes) -> str | None:
-        from pbl_pipeline.keypoints.framing import Framing, read_picture
+        from pbl_pipeline.keypoints.framing import read_picture
 
         image = read_picture(picture)
         if image is None:
             raise Refused("form")
-        if not self._framing:
-            try:
-                self._framing.append(Framing())
-            except PblError as error:
-                log.warning("no hint while filming, until the next start: %s", error.short())
-                self._framing.append(None)
-        return self._framing[0] and self._framing[0].cut_off(image)
+        return None if self._framing is None else self._framing.cut_off(image)
 
     async def finish(self, request: Request) -> Response:
         await _body(request, "application/json", BODY_BYTES)

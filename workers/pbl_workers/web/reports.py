@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response
 
 from pbl_pipeline import settings
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import PblError, joined, said
 from pbl_schemas import privacy, video
 from pbl_schemas.reading import shown as reading
 from pbl_schemas.reading.visit_state import results_state
@@ -95,7 +95,7 @@ def overlay_key(video_id: int) -> tuple[Any, ...]:
     if not about.recording.fitted or about.recording.path is None:
         raise PblError(
             "DB_NOT_FOUND",
-            found=said("no pictures with a fit of recording {n}. {why}", n=video_id, why=about.recording.problem),
+            found=joined([said("no pictures with a fit of recording {n}.", n=video_id), about.recording.problem], " "),
             expected="a recording to which a body is fitted",
             next_step="`pbl populate`; `pbl why` says what stops it",
         )
