@@ -12,9 +12,10 @@ SEGMENTS = ("pelvis", "thigh_r", "thigh_l", "shank_r", "shank_l", "foot_r", "foo
 class SensorLog:
     """What one sensor measured: one row for each of its T samples, in the axes of the sensor, times increasing.
 
-    `time` is in seconds from the log's own start and `started_utc` says when that was, where the file says it. A
-    quantity that the sensor does not give is `None`, a sample that is missing is NaN in its row. `orientation` takes
-    vectors of the sensor to a world whose third axis points up; the direction of its first axis is free.
+    `time` is in seconds of one clock of all sensors of a visit, from the start of the first one; `started_utc` says
+    when that was, where the file says it. A quantity that the sensor does not give is `None`, a sample that is missing
+    is NaN in its row. `orientation` takes vectors of the sensor to a world whose third axis points up; the direction of
+    its first axis is free.
     """
 
     name: str
@@ -23,4 +24,5 @@ class SensorLog:
     rate: np.ndarray | None  # (T, 3) rad/s
     acceleration: np.ndarray | None  # (T, 3) m/s2, of a sensor at rest 9.81 upwards
     orientation: np.ndarray | None  # (T, 4) unit quaternion, scalar first
-    started_utc: float | None = None  # s since 1970
+    started_utc: float | None = None  # s since 1970, of time 0
+    notes: tuple[str, ...] = ()  # what was left out, and what differs from what the file says

@@ -85,10 +85,8 @@ def read_sensor_logger(path: Path) -> PhoneLog:
 
 def _tables(path: Path) -> tuple[Callable[[str], _Rows], str]:
     """Return a function from a sensor's name to its rows (empty if there are none), and the name of the format."""
-    if path.is_dir():
-        return lambda name: _csv(path, _member(path, name)), "folder"
-    if path.suffix.lower() == ".zip":
-        return lambda name: _csv(path, _unzipped(path, name)), "zip"
+    if path.is_dir() or path.suffix.lower() == ".zip":
+        return lambda name: _csv(path, member_text(path, name)), "folder" if path.is_dir() else "zip"
     text = read_text(path)
     if text.lstrip()[:1] == "[":
         try:
@@ -104,12 +102,11 @@ def _csv(path: Path, text: str | None) -> _Rows:
     return [] if text is None else read_table(path, text, _COLUMNS)[1]
 
 
-def _member(folder: Path, name: str) -> str | None:
-    file = next((f for f in sorted(folder.glob("*.csv")) if f.stem.lower() == name.lower()), None)
-    return None if file is None else read_text(file)
-
-
-def _unzipped(path: Path, name: str) -> str | None:
+def member_text(path: Path, name: str) -> str | None:
+    """Text of a sensor's file in an export, a folder or an archive; None without it. Raises `PblError` PHONE_LOG."""
+    if path.is_dir():
+        file = next((f for f in sorted(path.glob("*.csv")) if f.stem.lower() == name.lower()), None)
+        return None if file is None else read_text(file)
     try:
         with bounded.opened_zip(path) as archive:
             wanted = f"{name}.csv".lower()

@@ -1,0 +1,292 @@
+"""Comparison of what a sensor's file says with a body, gravity and the clock: no wrong unit becomes a number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline import bounded
+from pbl_pipeline.errors import said
+from pbl_pipeline.sampling import interval_of
+
+from .log import SensorLog
+from .samples import Samples, log_error
+
+#: Rates of sampling (Hz), median length (m/s2) of an acceleration with gravity, and the angular speed (rad/s) of the
+#: 1000th fastest sample: a foot reaches 15 in walking, 25 in a sprint.
+_HZ, _GRAVITY, _FASTEST = (20.0, 2000.0), (7.5, 13.0), 40.0
+#: Most stamps that repeat the one before, most samples at the end of a sensor's range, as shares.
+_MOST_REPEATS, _MOST_CLIPPED = 0.1, 0.05
+#: Where a sensor's range can end, from: 250 deg/s and 2 g, less what a calibration takes.
+_CLIPS = {"rate": (4.1, "angular rate"), "acceleration": (18.0, "acceleration")}
+#: Differences of two clocks (fraction) that are said, and that are refused.
+_DRIFT, _OTHER_RATE = 1e-4, 0.01
+#: Tilt (deg) of an orientation against the mean acceleration, and wander of its heading (deg) against the gyroscope.
+_TILT_DEG, _WANDER_DEG = 25.0, 15.0
+#: A comparison of two rates needs this much movement (rad/s) and so many samples.
+_MOVES, _ENOUGH, _MOST_COMPARED = 0.3, 50, 50_000
+_DAY_S = 86400.0
+#: Raises the error for what was found, what is expected and the next step.
+Refuse = Callable[..., NoReturn]
+
+
+def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> SensorLog:
+    """The log of a sensor on a segment; `begin`: the stamp that becomes time 0.
+
+    Raises `PblError` SENSOR_LOG: stamps that go back, repeat, or are not of seconds; neither rate and acceleration nor
+    orientation; accelerations in g or without gravity; rates in degrees; an orientation whose world is not upright or
+    that does not belong to the rates; a sensor that reached the end of its range too often.
+    """
+    notes: list[str] = []
+
+    def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
+        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=segment, found=found)
+        more = {"next_step": next_step} if next_step else {}
+        raise log_error(about, expected, key=path, **more)
+
+    kept = _kept(samples, notes, refuse)
+    time = samples.stamp[kept]
+    rate, acceleration, turns = (
+        None if x is None else np.where(np.isfinite(x[kept]).all(axis=1, keepdims=True), x[kept], np.nan)
+        for x in (samples.rate, samples.acceleration, samples.orientation)
+    )
+    if (
+        acceleration is not None and (none := np.asarray(~acceleration.any(axis=1))).any()
+    ):  # a sample that is missing, as zeros
+        rate, acceleration = (None if x is None else np.where(none[:, None], np.nan, x) for x in (rate, acceleration))
+    if turns is None and (rate is None or acceleration is None):
+        refuse(
+            "no orientation, and not both an angular rate and an acceleration",
+            "angular rate and acceleration, or orientation",
+            "export it with the gyroscope, or with the orientation",
+        )
+    if turns is not None:
+        turns = _unit(turns, refuse)
+    if acceleration is not None:
+        _check_gravity(acceleration, refuse)
+        if turns is not None:
+            _check_upright(turns, acceleration, refuse)
+    if rate is not None:
+        _check_rate(time, rate, acceleration, turns, refuse)
+        _note_heading(time, rate, turns, notes)
+    elif turns is not None:
+        notes.append("no angular rate: the orientation is that of the sensor's program, its heading may be a magnet's")
+    rate, acceleration = (
+        _unclipped(x, *_CLIPS[k], notes, refuse) for k, x in (("rate", rate), ("acceleration", acceleration))
+    )
+    start = None if samples.start_utc is None else float(samples.start_utc + begin)
+    return SensorLog(samples.name, segment, time - begin, rate, acceleration, turns, start, tuple(notes))
+
+
+def _kept(samples: Samples, notes: list[str], refuse: Refuse) -> np.ndarray:
+    """Rows (K,) whose stamps increase."""
+    rows = np.flatnonzero(np.isfinite(samples.stamp))
+    step = np.diff(samples.stamp[rows])
+    back, same = int((step < 0).sum()), int((step == 0).sum())
+    if back:
+        refuse(said("{n} of {all} stamps go back", n=back, all=len(rows)), "times that increase")
+    if same > _MOST_REPEATS * len(rows):
+        refuse(
+            said("{n} of {all} stamps repeat the one before", n=same, all=len(rows)),
+            "a different stamp for each sample",
+        )
+    if same or len(rows) < len(samples.stamp):
+        notes.append(f"{same} repeated rows and {len(samples.stamp) - len(rows)} without a time were left out")
+    rows = rows[np.concatenate([[True], step > 0])] if len(rows) else rows
+    time = samples.stamp[rows]
+    hz = 1 / interval_of(time) if len(time) > 1 else 0.0
+    if not _HZ[0] <= hz <= _HZ[1] or bounded.span_s(time) > bounded.MAX_SECONDS:
+        refuse(
+            said("{n} samples, {hz:.3g} a second", n=len(time), hz=hz),
+            f"times in s, {_HZ[0]:g} to {_HZ[1]:g} samples a second, at most {bounded.MAX_SECONDS:g} s",
+        )
+    if samples.counter is not None and samples.stated_hz and len(time) >= _ENOUGH:
+        counter = samples.counter[rows]
+        off = (time[-1] - time[0]) * samples.stated_hz / max(counter[-1] - counter[0], 1) - 1
+        if abs(off) > _OTHER_RATE:
+            refuse(
+                said("{n:g} samples in {s:.4g} s", n=counter[-1] - counter[0], s=time[-1] - time[0]),
+                f"{samples.stated_hz:g} a second, as the file states",
+            )
+        if abs(off) > _DRIFT:
+            notes.append(f"the stamps run {1e6 * off:+.0f} ppm against the stated {samples.stated_hz:g} Hz")
+    return rows
+
+
+def _unit(turns: np.ndarray, refuse: Refuse) -> np.ndarray:
+    length = np.linalg.norm(turns, axis=1, keepdims=True)
+    off = np.abs(length - 1) > 0.02
+    if off.sum() > 0.5 * np.isfinite(length).sum():
+        refuse(said("quaternions of length {n:.3g}", n=np.nanmedian(length)), "unit quaternions")
+    return np.where(off, np.nan, turns / np.where(off, 1.0, length))
+
+
+def _check_gravity(acceleration: np.ndarray, refuse: Refuse) -> None:
+    length = np.linalg.norm(acceleration, axis=1)
+    least, typical = np.quantile(length[np.isfinite(length)], (0.1, 0.5)) if np.isfinite(length).any() else (0.0, 0.0)
+    if _GRAVITY[0] <= typical <= _GRAVITY[1]:
+        return
+    units = (unit for unit, g in (("g", 1.0), ("mg", 1000.0)) if 0.75 * g <= typical <= 1.3 * g)
+    in_g = next(units, None) if least > 0.5 * typical else None  # without gravity it comes to nearly 0
+    cause = f", as in {in_g}" if in_g else ", as without gravity" if typical < _GRAVITY[0] else ""
+    refuse(
+        said("accelerations of typically {a:.3g}{cause}", a=typical, cause=said(cause)),
+        "m/s2 with gravity, 9.81 at rest",
+        "multiply by 9.80665 and divide by 1000 where it is mg" if in_g else "export the acceleration with gravity",
+    )
+
+
+def _slope(of: np.ndarray, on: np.ndarray) -> float:
+    """Factor from the second vectors (T, 3) to the first ones; NaN where there is too little movement."""
+    known = np.isfinite(of).all(axis=1) & np.isfinite(on).all(axis=1)
+    size = np.linalg.norm(on, axis=1)
+    known &= size > _MOVES
+    if known.sum() < _ENOUGH:
+        return np.nan
+    return float((of[known] * on[known]).sum() / (on[known] ** 2).sum())
+
+
+def _turning(time: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Angular rate (T, 3) of an orientation, in the axes of the sensor, NaN where it is not known."""
+    out = np.full((len(time), 3), np.nan)
+    known = np.asarray(np.isfinite(turns).all(axis=1))
+    quat = np.where(known[:, None], turns, [1.0, 0, 0, 0])
+    before, after = (Rotation.from_quat(q, scalar_first=True) for q in (quat[:-1], quat[1:]))
+    out[:-1] = (before.inv() * after).as_rotvec() / np.diff(time)[:, None]
+    out[:-1][~(known[1:] & known[:-1])] = np.nan
+    return out
+
+
+def _check_rate(
+    time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray | None, turns: np.ndarray | None, refuse: Refuse
+) -> None:
+    fastest = float(np.nanquantile(np.linalg.norm(rate, axis=1), 0.999))
+    factor = np.nan
+    if turns is not None:
+        factor = _slope(rate, _turning(time, turns))
+    elif acceleration is not None:
+        factor = _by_gravity(time, rate, acceleration)
+    if fastest > _FASTEST or factor > 20:
+        refuse(
+            said("angular rates of up to {w:.3g}, as in deg/s", w=fastest),
+            f"rad/s, in which a person reaches less than {_FASTEST:g}",
+            "multiply by pi / 180",
+        )
+    if 0 < factor < 0.05:
+        refuse(
+            said("angular rates of up to {w:.3g} rad/s, 1/57 of what its other values turn by", w=fastest),
+            "rates in the unit that the format states",
+            "set the unit of the program's export back to deg/s",
+        )
+    if not (np.isnan(factor) or 0.8 <= factor <= 1.25):
+        refuse(
+            said("rates that are {f:.2f} times those of its orientation", f=factor),
+            "an orientation from the sensor's axes to a world, which turns as the rates say",
+        )
+
+
+def _by_gravity(time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray) -> float:
+    """Factor (57.3 or its inverse) by which rates are too large, as gravity tells: where nothing else accelerates, it
+    keeps its direction over a quarter of a second once the sensor's turns are taken out. NaN where it tells nothing."""
+    n = min(len(time), _MOST_COMPARED)
+    length = np.linalg.norm(acceleration[:n], axis=1)
+    still = np.abs(length - np.nanmedian(length)) < 0.1 * np.nanmedian(length)
+    later = max(int(0.25 / interval_of(time)), 1)
+    both = still[:-later] & still[later:]
+    if both.sum() < _ENOUGH:
+        return np.nan
+    turn, up = np.nan_to_num(rate[:n]) * np.gradient(time[:n])[:, None], acceleration[:n] / length[:, None]
+    off = {}
+    for factor in (57.3, 1.0, 1 / 57.3):
+        q, done = Rotation.from_rotvec(turn / factor), 1
+        while done < n:  # each becomes the product of all up to it
+            q = Rotation.concatenate([q[:done], q[:-done] * q[done:]])
+            done *= 2
+        world = q.apply(np.nan_to_num(up))
+        cos = np.sum(world[:-later] * world[later:], axis=1)[both]
+        off[factor] = float(np.median(np.arccos(np.clip(cos, -1, 1))))
+    best = min(off, key=lambda factor: off[factor])
+    return best if off[1.0] > np.radians(3) and off[best] < 0.4 * off[1.0] else np.nan
+
+
+def _check_upright(turns: np.ndarray, acceleration: np.ndarray, refuse: Refuse) -> None:
+    known = np.isfinite(turns).all(axis=1) & np.isfinite(acceleration).all(axis=1)
+    if not known.any():
+        return
+    r = Rotation.from_quat(turns[known], scalar_first=True)
+    mean, other = (x.apply(acceleration[known]).mean(axis=0) for x in (r, r.inv()))
+    tilt, inverse = (np.degrees(np.arccos(np.clip(m[2] / np.linalg.norm(m), -1, 1))) for m in (mean, other))
+    if tilt <= _TILT_DEG:
+        return
+    axis = "xyz"[np.argmax(np.abs(mean))]
+    sign = "" if mean["xyz".index(axis)] > 0 else "-"
+    refuse(
+        said("an orientation in whose world the acceleration at rest points {tilt:.0f} deg off z", tilt=tilt),
+        "from the sensor's axes to a world whose z points up; an acceleration that is +9.81 upwards at rest",
+        "turn the quaternion around: it is from the world to the sensor"
+        if inverse <= _TILT_DEG
+        else f"in this file up is {sign}{axis}: turn the world, or the sign of the accelerations",
+    )
+
+
+def _note_heading(time: np.ndarray, rate: np.ndarray, turns: np.ndarray | None, notes: list[str]) -> None:
+    if turns is None:
+        return
+    off = rate - _turning(time, turns)
+    known = np.isfinite(off).all(axis=1)
+    if known.sum() < _ENOUGH:
+        return
+    world = Rotation.from_quat(turns[known], scalar_first=True).apply(off[known])[:, 2]
+    angle = np.degrees(np.cumsum(world * np.gradient(time)[known]))
+    angle -= np.polyval(np.polyfit(time[known], angle, 1), time[known])  # a bias of the gyroscope
+    if (wander := float(np.ptp(angle))) > _WANDER_DEG:
+        notes.append(
+            f"the heading of the orientation wanders {wander:.0f} deg against the gyroscope, as a magnet's does"
+        )
+
+
+def _unclipped(
+    values: np.ndarray | None, from_: float, what: str, notes: list[str], refuse: Refuse
+) -> np.ndarray | None:
+    """Values (T, 3) with NaN in the rows where an axis stays at the end of its range for three samples."""
+    if values is None:
+        return None
+    clipped = np.zeros(len(values), bool)
+    for x in values.T:
+        for end in (np.nanmax(x), np.nanmin(x)):
+            at = np.abs(x - end) <= 1e-4 * abs(end)
+            if abs(end) >= from_:
+                run = at[:-2] & at[1:-1] & at[2:]
+                clipped |= np.convolve(run, [1, 1, 1]) > 0
+    share = float(clipped.mean())
+    if share > _MOST_CLIPPED:
+        refuse(
+            said(
+                "an {what} at the end of the sensor's range in {share:.0%} of the samples", what=said(what), share=share
+            ),
+            f"at most {_MOST_CLIPPED:.0%}",
+            "record with a larger range",
+        )
+    if clipped.any():
+        notes.append(f"{what}: {int(clipped.sum())} samples at the end of the sensor's range were left out")
+    return np.where(clipped[:, None], np.nan, values)
+
+
+def check_day(logs: Sequence[SensorLog], recorded_utc: float, name: str) -> None:
+    """Raise `PblError` SENSOR_LOG where a log that counts in UTC is of another day than a video recorded then (s since
+    1970)."""
+    for log in logs:
+        if log.started_utc is None:
+            continue
+        first, last = log.started_utc + log.time[0], log.started_utc + log.time[-1]
+        if (days := max(first - recorded_utc, recorded_utc - last) / _DAY_S) > 1:
+            raise log_error(
+                said("sensor {name}: its log lies {days:.1f} days from the video", name=log.name, days=days),
+                "the log of the same visit",
+                next_step="name the log of this visit, or correct the clock of the recording",
+                key=name,
+            )

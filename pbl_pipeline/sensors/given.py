@@ -1,0 +1,173 @@
+"""Sensors that a person names for a visit: on the command line (`shank_r=FILE`), or in a file that lists them."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbl_pipeline import bounded
+from pbl_pipeline.errors import PblError, said, unread_file
+
+from .checked import checked
+from .formats import read_samples
+from .log import SEGMENTS, SensorLog
+from .samples import Samples, log_error
+
+#: Words of a sensor's name by which its segment is known.
+_WORDS = {
+    "pelvis": "pelvis|sacrum|lumbar|waist",
+    "thigh": "thigh|femur|upper ?leg",
+    "shank": "shank|tibia|lower ?leg|calf|ankle",
+    "foot": "foot|calcn|instep",
+}
+#: Sensors of one recording whose logs overlap by less than this share are not of one recording.
+_OVERLAP = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Worn:
+    """A sensor that a person names. segment: None where the names of the sensors in the file say it; sensor: one of
+    several in the file; rate_hz: samples a second, for a file that does not state them."""
+
+    file: Path
+    segment: str | None = None
+    sensor: str | None = None
+    rate_hz: float | None = None
+
+
+def segment_of(name: str) -> str | None:
+    """The segment that the name of a sensor says (`Right Ankle`, `tibia_r_imu`), None if none or several."""
+    words = re.sub(r"[^a-z]+", " ", name.lower())
+    found = [segment for segment, pattern in _WORDS.items() if re.search(pattern, words)]
+    sides = [side for side, pattern in (("r", r"\b(right|r)\b"), ("l", r"\b(left|l)\b")) if re.search(pattern, words)]
+    if len(found) != 1 or (found != ["pelvis"] and len(sides) != 1):
+        return None
+    return "pelvis" if found == ["pelvis"] else f"{found[0]}_{sides[0]}"
+
+
+def worn_of(given: str) -> list[Worn]:
+    """What `SEGMENT=FILE`, `SEGMENT=FILE#SENSOR` or `FILE` on the command line means.
+
+    A file without a segment is a list of sensors (`.toml`; `.csv` with the columns segment, file; OpenSense's `.xml`)
+    or a log whose sensors have the names of segments.
+
+    Raises `PblError` USAGE for another segment, FILE_MISSING, FILE_FORMAT for a list that cannot be read.
+    """
+    segment, equals, rest = given.partition("=")
+    if equals and "/" not in segment and "\\" not in segment:
+        file, _, sensor = rest.partition("#") if not Path(rest).exists() else (rest, "", "")
+        return [Worn(Path(file), _known(segment), sensor or None)]
+    path = Path(given)
+    try:
+        if path.suffix.lower() == ".toml":
+            rows = [(k, v if isinstance(v, dict) else {"file": v}) for k, v in bounded.read_toml(path).items()]
+            return [_row(path, {"segment": k, **v}) for k, v in rows]
+        if path.suffix.lower() == ".xml":
+            return _opensense(path)
+        if path.suffix.lower() == ".csv" and bounded.read_start(path, 64).decode("utf-8-sig", "replace").startswith(
+            "segment"
+        ):
+            rows = pd.read_csv(io.StringIO(bounded.read_text(path)), dtype=str, keep_default_na=False)
+            return [_row(path, {str(k).strip(): v.strip() for k, v in row.items()}) for row in rows.to_dict("records")]
+    except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
+        raise unread_file(error, "a list of sensors and their segments", "see docs/imu.md", path) from error
+    return [Worn(path)]
+
+
+def _known(segment: str) -> str:
+    if segment not in SEGMENTS:
+        raise PblError(
+            "USAGE",
+            found=said("a sensor on {segment}", segment=segment),
+            expected=", ".join(SEGMENTS),
+            next_step="name one of these segments",
+        )
+    return segment
+
+
+def _row(path: Path, row: dict[str, Any]) -> Worn:
+    hz = row.get("rate_hz") or None
+    return Worn(path.parent / row["file"], _known(row["segment"]), row.get("sensor") or None, float(hz) if hz else None)
+
+
+def _opensense(path: Path) -> list[Worn]:
+    """The sensors of OpenSense's settings of a reader; those on other parts of the body are left out."""
+    text = bounded.read_text(path)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("a document type, which settings do not have")
+    root = ElementTree.fromstring(text)  # noqa: S314  without entities
+    prefix, out = (root.findtext(".//trial_prefix") or "").strip(), []
+    for sensor in root.iter("ExperimentalSensor"):
+        segment = segment_of(sensor.findtext("name_in_model") or "")
+        name = f"{prefix}{sensor.get('name', '')}.txt"
+        if segment is not None:
+            packed = path.parent / f"{name}.gz"
+            out.append(Worn(packed if packed.exists() else path.parent / name, segment))
+    if not out:
+        raise ValueError("no ExperimentalSensor on pelvis, thighs, shanks or feet")
+    return out
+
+
+def read_worn(worn: Sequence[Worn]) -> tuple[SensorLog, ...]:
+    """Read sensors of a visit and bring them to one clock, whose time 0 is the start of the first of them.
+
+    Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples` and `checked`, and for logs that are not of one
+    recording; USAGE: a segment or a sensor is named twice, or the one of a file is not known.
+    """
+    files = {(w.file, w.rate_hz): read_samples(w.file, w.rate_hz) for w in worn}
+    found = [(*pair, w) for w in worn for pair in _chosen(w, files[w.file, w.rate_hz])]
+    for what, names in (("segment", [s for s, _, _ in found]), ("sensor", [x.name for _, x, _ in found])):
+        if twice := sorted({n for n in names if names.count(n) > 1}):
+            raise PblError(
+                "USAGE",
+                found=said("the {what} {name} twice", what=said(what), name=twice[0]),
+                expected="each segment with one sensor of its own",
+                next_step="name each sensor once",
+            )
+    clocks = {x.clock for _, x, _ in found}
+    if len(clocks) > 1:
+        raise log_error(
+            said("sensors on different clocks: {clocks}", clocks=", ".join(sorted(clocks))),
+            "sensors that were synchronised in one recording",
+            key=found[0][2].file,
+        )
+    begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if len(x.stamp)), default=0.0)
+    logs = tuple(checked(x, segment, w.file, begin) for segment, x, w in found)
+    first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
+    if logs and last - first < _OVERLAP * min(x.time[-1] - x.time[0] for x in logs):
+        raise log_error(
+            said("logs that have {s:.3g} s in common", s=max(last - first, 0.0)),
+            "sensors of one recording",
+            key=found[0][2].file,
+        )
+    return logs
+
+
+def _chosen(worn: Worn, samples: Sequence[Samples]) -> list[tuple[str, Samples]]:
+    """Segments and sensors of a file that are named. Raises `PblError` USAGE."""
+    by_name = [(segment_of(x.name), x) for x in samples]
+    if worn.segment is None:
+        pairs = [(s, x) for s, x in by_name if s is not None]
+    elif worn.sensor is not None:
+        pairs = [(worn.segment, x) for x in samples if x.name == worn.sensor]
+    else:
+        ours = [x for s, x in by_name if s == worn.segment] if len(samples) > 1 else samples
+        pairs = [(worn.segment, x) for x in ours]
+    if not pairs or (worn.segment is not None and len(pairs) > 1):
+        names = ", ".join(x.name for x in samples)
+        raise PblError(
+            "USAGE",
+            found=said("sensors {names} in {file}", names=names[:200], file=worn.file.name),
+            expected=said("which of them is on {segment}", segment=worn.segment or "which segment"),
+            next_step="name it: --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE where the file has one sensor",
+            key=worn.file,
+        )
+    return pairs

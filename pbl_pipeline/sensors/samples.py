@@ -1,0 +1,144 @@
+"""Samples of a sensor as a file holds them, and the tables that they are read from."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline import bounded
+from pbl_pipeline.errors import PblError, os_errors_as
+
+#: Bytes of a log, unpacked: six sensors in one file at 128 Hz for 20 minutes.
+MAX_LOG = 4 * bounded.MAX_TEXT
+
+log_error = functools.partial(
+    PblError, "SENSOR_LOG", next_step="export it again as docs/imu.md says, or leave this sensor out"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """What a file holds of one sensor: N rows in SI units and in the axes of the sensor, NaN where a cell is empty.
+
+    Sensors with the same `clock` are synchronous; the stamps of "UTC" are seconds since 1970. A `counter` counts
+    samples, of which the file states `stated_hz` a second. `orientation` (quaternions, scalar first) is from the sensor
+    to a world whose z points up, as the program's documents say; `checked` compares it with the accelerations.
+    """
+
+    name: str
+    clock: str
+    stamp: np.ndarray  # (N,) s
+    rate: np.ndarray | None = None  # (N, 3) rad/s
+    acceleration: np.ndarray | None = None  # (N, 3) m/s2
+    orientation: np.ndarray | None = None  # (N, 4)
+    start_utc: float | None = None  # s since 1970 at stamp 0
+    counter: np.ndarray | None = None  # (N,)
+    stated_hz: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LogFile:
+    """A file to read. `text` is empty for a folder or an archive; `rate_hz` is the rate that a person states."""
+
+    path: Path
+    text: str
+    rate_hz: float | None = None
+
+    @property
+    def stem(self) -> str:
+        """Name of the file without its suffixes."""
+        return self.path.name.removesuffix(".gz").rpartition(".")[0] or self.path.name
+
+    def refuse(self, found: str, expected: str) -> PblError:
+        """The error SENSOR_LOG about this file."""
+        return log_error(found, expected, key=self.path)
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A format of logs: its name, whether a file is of it, and the sensors in one. `reads` raises `PblError`."""
+
+    name: str
+    knows: Callable[[LogFile], bool]
+    reads: Callable[[LogFile], Sequence[Samples]]
+
+
+def opened(path: Path, rate_hz: float | None = None) -> LogFile:
+    """Read the text of a log. Raises `PblError` FILE_MISSING, SENSOR_LOG (no text, or too long)."""
+    if path.is_dir() or path.suffix.lower() == ".zip":
+        return LogFile(path, "", rate_hz)
+    with os_errors_as("FILE_MISSING", "the log of a wearable sensor", "check the path", path):
+        try:
+            return LogFile(path, bounded.read_text(path, MAX_LOG), rate_hz)
+        except ValueError as error:
+            raise log_error(f"no text to read ({error})", "a log as docs/imu.md says", key=path) from error
+
+
+def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] = ()) -> pd.DataFrame:
+    """The table of a file whose line `header` has the names of its columns, without the lines `skip`; cells are texts.
+
+    Raises `PblError` SENSOR_LOG.
+    """
+    try:
+        bounded.count_rows(file.text.count("\n"))
+        lines = [*range(header), *skip]
+        found = pd.read_csv(
+            io.StringIO(file.text), sep=separator, skiprows=lines, index_col=False, dtype=str, comment="#"
+        )
+    except (ValueError, pd.errors.ParserError) as error:
+        raise file.refuse(f"no table ({error})", "rows with a cell for each name in the header") from error
+    names = [str(name).strip() for name in found.columns]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise file.refuse(f"the column {twice[0]} twice", "each column once")
+    found.columns = names
+    return found
+
+
+def numbers(file: LogFile, found: pd.DataFrame, names: Sequence[str]) -> np.ndarray | None:
+    """Columns (N, K) of a table, or (N,) where `names` is one; None where one is absent or all cells are empty.
+
+    Raises `PblError` SENSOR_LOG for a cell that is no number.
+    """
+    wanted = [names] if isinstance(names, str) else list(names)
+    if not set(wanted) <= set(found.columns):
+        return None
+    try:
+        values = np.column_stack([np.asarray(pd.to_numeric(found[n].str.strip()), float) for n in wanted])
+    except (ValueError, TypeError) as error:
+        raise file.refuse(f"columns {', '.join(wanted)}: {error}", "a number in each cell, or none") from error
+    if np.isnan(values).all():
+        return None
+    return values[:, 0] if isinstance(names, str) else values
+
+
+def counted_on(values: np.ndarray, wraps_at: float) -> np.ndarray:
+    """A counter (N,) that goes on where it began at 0 again."""
+    back = np.diff(values, prepend=values[:1]) < -wraps_at / 2
+    return values + wraps_at * np.cumsum(back)
+
+
+def quaternions(matrices: np.ndarray | None = None, euler_deg: np.ndarray | None = None) -> np.ndarray | None:
+    """Quaternions (N, 4), scalar first, of rotation matrices (N, 9) by rows, or of roll, pitch and yaw (N, 3) in deg
+    about x, y and z: R = Rz Ry Rx. NaN where a value is, or where a matrix is not a rotation."""
+    values = matrices if matrices is not None else euler_deg
+    if values is None:
+        return None
+    known = np.isfinite(values).all(axis=1)
+    if matrices is not None:
+        m = values.reshape(-1, 3, 3)
+        off = np.abs(m @ m.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        known &= (off < 0.02) & (np.linalg.det(np.nan_to_num(m)) > 0)
+        turns = Rotation.from_matrix(m[known]) if known.any() else None
+    else:
+        turns = Rotation.from_euler("ZYX", values[known][:, ::-1], degrees=True) if known.any() else None
+    out = np.full((len(values), 4), np.nan)
+    if turns is not None:
+        out[known] = turns.as_quat(scalar_first=True)
+    return out
