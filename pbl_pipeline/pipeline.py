@@ -28,6 +28,8 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.resources import processes_at_once, shared_cores
+from pbl_pipeline.sensors.checked import check_day
+from pbl_pipeline.sensors.log import SensorLog
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
@@ -50,6 +52,7 @@ def run_visit(
     height_m: float | None = None,
     mass_kg: float | None = None,
     activity: str | None = None,
+    sensors: Sequence[SensorLog] = (),
 ) -> tuple[Visit, Mapping[str, PblError]]:
     """Compute a visit from its videos. Returns it with the errors of the videos that were left out, by their names.
 
@@ -60,11 +63,12 @@ def run_visit(
     holds a sensor log of the phone for each path, or nothing; one that does not belong to its video leaves that out.
     `camera_motion` None stands for "handheld" where there are logs, else "static". `height_m`: as in `fit_session`;
     `mass_kg`: as in `visit_kinetics`. `activity`: what the person does in the videos; None: unknown, which counts
-    as walking.
+    as walking. `sensors`: logs of the wearable sensors of the visit, as `read_given` returns them.
 
     Raises the error of the video where no video of the visit can be fitted: the VIDEO_ codes,
     TRACK_NO_PERSON, TRACK_TOO_SHORT, SUBJECT_NEEDS_CHOICE, SUBJECT_UNKNOWN_PERSON, ASSET_ codes, CAMERA_INVALID, MODEL_
-    codes, DEVICE_UNAVAILABLE. NORM_UNKNOWN, NORM_INVALID; FILE_MISSING, PHONE_LOG for a log that cannot be read.
+    codes, DEVICE_UNAVAILABLE. NORM_UNKNOWN, NORM_INVALID; FILE_MISSING, PHONE_LOG for a log that cannot be read;
+    SENSOR_LOG for sensors of another day.
     """
     # A wrong name or log must not cost a fit.
     keypoints, people = KEYPOINT_METHODS.find(keypoints), TRACKING_METHODS.find(people)
@@ -95,12 +99,16 @@ def run_visit(
     recordings = [r for r in found if not r.problem]
     if not recordings:
         raise next(iter(problems.values()))
+    check_day(sensors, {r.name: r.video.recorded_utc for r in recordings if r.video is not None})
+    # Where a video lies in the log is looked for: its time of recording is rounded to seconds.
+    more = {"sensors": sensors, "sensor_clock_s": [None] * len(recordings)} if sensors else {}
     fit = fit_session(
         [r.keypoints for r in recordings if r.keypoints is not None],
         [r.name for r in recordings],
         method,
         camera_motion,
         height_m=height_m,
+        **more,
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
     left_out = [r for r in found if r.problem]

@@ -10,7 +10,7 @@ import click
 
 from pbl_pipeline.errors import PblError
 
-from .options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, fit_paramset
+from .options import CAMERA_MOTION_HELP, CAMERA_MOTIONS, HEIGHT, IMU, fit_paramset, sensor_logs
 
 if TYPE_CHECKING:
     from pbl_pipeline.body import MarkerSet
@@ -35,6 +35,7 @@ _ENDS = (".npz", ".keypoints", ".markers", ".csv", ".h5", ".hdf5", ".dlc", ".ana
 @click.option("--camera", type=click.Path(path_type=Path), help="Calibration file of the camera of 2D keypoints.")
 @click.option("--person", multiple=True, metavar="NAME", help="Person or individual of 2D keypoints; once, or a file.")
 @HEIGHT
+@IMU
 @click.option(
     "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Vertical axis of .trc files."
 )
@@ -53,6 +54,7 @@ def fit(
     camera: Path | None,
     person: tuple[str, ...],
     height_m: float | None,
+    imu: tuple[str, ...],
     up: str,
 ) -> None:
     """Fit one body to FILES, the trials of one session.
@@ -71,6 +73,7 @@ def fit(
 
     check_out_folder(out)
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
+    sensors = sensor_logs(imu)
     table = _marker_set(marker_set)
     facts = _facts(len(files), video, fps, width, height, camera, person)
     trials: Sequence[Any] = [_load(path, table, up, f) for path, f in zip(files, facts, strict=True)]
@@ -82,9 +85,11 @@ def fit(
     else:
         names = distinct_names([Path(stem + ".npz") for stem in stems])
     motions = [camera_motion or _motion(trial) for trial in trials]
-    markers = {} if table is None else {"markers": table}
+    more: dict[str, Any] = {} if table is None else {"markers": table}
+    if sensors:
+        more |= {"sensors": sensors, "sensor_clock_s": [None] * len(trials)}
     motion = motions[0] if len(set(motions)) == 1 else motions
-    session = fit_session(trials, names, paramset, motion, height_m=height_m, **markers)
+    session = fit_session(trials, names, paramset, motion, height_m=height_m, **more)
     recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
     laboratory = all(isinstance(trial, WorldMarkers) for trial in trials)
     kind = "rig" if cameras else "markers" if laboratory else "single"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, Points
     from pbl_pipeline.keypoints import KeypointParams
     from pbl_pipeline.methods import Method
+    from pbl_pipeline.sensors.log import SensorLog
     from pbl_pipeline.tracking import TrackingParams
     from pbl_pipeline.visit import Visit
 
@@ -30,6 +31,12 @@ HEIGHT = click.option(
 )
 MASS = click.option(
     "--mass-kg", type=float, help="Measured body mass, such as 68.5: forces can then be shown in newtons."
+)
+IMU = click.option(
+    "--imu",
+    multiple=True,
+    metavar="[SEGMENT=]FILE",
+    help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit.",
 )
 COMPARE = click.option(
     "--compare",
@@ -53,6 +60,16 @@ DEVICE = click.option(
 PEOPLE = click.option(
     "--people", metavar="NAME", help="Tracking method, such as blazepose-tiles, or a detector of `pbl models list`."
 )
+
+
+def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
+    """Read the sensors of `--imu`, and print what was left out of them. Raises the `PblError`s of `read_given`."""
+    from pbl_pipeline.sensors.given import given_sensors, read_given
+
+    logs = read_given([one for text in given for one in given_sensors(text)])
+    for log in logs:
+        click.echo("; ".join((f"{log.segment}: sensor {log.name}, {log.time[-1] - log.time[0]:.0f} s", *log.notes)))
+    return logs
 
 
 def show_changes(visit: Visit, before: Visit, metrics: Path) -> None:

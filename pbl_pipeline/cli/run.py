@@ -14,6 +14,7 @@ from .options import (
     COMPARE,
     DEVICE,
     HEIGHT,
+    IMU,
     KEYPOINTS,
     LANGUAGE,
     MASS,
@@ -21,6 +22,7 @@ from .options import (
     Person,
     fit_paramset,
     keypoint_method,
+    sensor_logs,
     show_changes,
     tracking_method,
 )
@@ -36,6 +38,7 @@ from .options import (
     multiple=True,
     help="Sensor log of the phone (docs/phone_capture.md), once for each VIDEO, in their order.",
 )
+@IMU
 @click.option("--camera-motion", type=click.Choice(CAMERA_MOTIONS), help=CAMERA_MOTION_HELP)
 @click.option(
     "--person",
@@ -61,6 +64,7 @@ def run(
     out: Path,
     camera: Path | None,
     attitude: tuple[Path, ...],
+    imu: tuple[str, ...],
     camera_motion: str | None,
     person: int | None,
     people: str | None,
@@ -106,6 +110,7 @@ def run(
         )
     before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
+    sensors = sensor_logs(imu)
     method, finder = keypoint_method(keypoints, device), tracking_method(people)
     paramset = fit_paramset(solver, params, [method.params.points()])
     visit, problems = run_visit(
@@ -122,6 +127,7 @@ def run(
         height_m,
         mass_kg,
         activity,
+        sensors,
     )
     today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
     visit = dataclasses.replace(visit, subject=subject, label=f"computed {today}")

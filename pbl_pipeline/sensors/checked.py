@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import datetime
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -276,17 +277,21 @@ def _unclipped(
     return np.where(clipped[:, None], np.nan, values)
 
 
-def check_day(logs: Sequence[SensorLog], recorded_utc: float, name: str) -> None:
-    """Raise `PblError` SENSOR_LOG where a log that counts in UTC is of another day than a video recorded then (s since
-    1970)."""
-    for log in logs:
-        if log.started_utc is None:
-            continue
-        first, last = log.started_utc + log.time[0], log.started_utc + log.time[-1]
-        if (days := max(first - recorded_utc, recorded_utc - last) / _DAY_S) > 1:
-            raise log_error(
-                said("sensor {name}: its log lies {days:.1f} days from the video", name=log.name, days=days),
-                "the log of the same visit",
-                next_step="name the log of this visit, or correct the clock of the recording",
-                key=name,
-            )
+def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> None:
+    """Raise `PblError` SENSOR_LOG where a log that counts in UTC is of another day than a video.
+
+    recorded: time of recording of each video as its file states it (`VideoInfo.recorded_utc`), by its name.
+    """
+    for name, utc in recorded.items():
+        moment = None if utc is None else datetime.datetime.fromisoformat(utc).timestamp()
+        for log in logs:
+            if log.started_utc is None or moment is None:
+                continue
+            first, last = log.started_utc + log.time[0], log.started_utc + log.time[-1]
+            if (days := max(first - moment, moment - last) / _DAY_S) > 1:
+                raise log_error(
+                    said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=log.name, days=days),
+                    "the log of the same visit",
+                    next_step="name the log of this visit, or correct the clock of the recording",
+                    key=name,
+                )

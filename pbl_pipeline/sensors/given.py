@@ -33,14 +33,16 @@ _OVERLAP = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class Worn:
+class Given:
     """A sensor that a person names. segment: None where the names of the sensors in the file say it; sensor: one of
-    several in the file; rate_hz: samples a second, for a file that does not state them."""
+    several in the file; rate_hz: samples a second, for a file that does not state them; called: name of the file of
+    which this one is a copy."""
 
     file: Path
     segment: str | None = None
     sensor: str | None = None
     rate_hz: float | None = None
+    called: str | None = None
 
 
 def segment_of(name: str) -> str | None:
@@ -53,7 +55,7 @@ def segment_of(name: str) -> str | None:
     return "pelvis" if found == ["pelvis"] else f"{found[0]}_{sides[0]}"
 
 
-def worn_of(given: str) -> list[Worn]:
+def given_sensors(text: str) -> list[Given]:
     """What `SEGMENT=FILE`, `SEGMENT=FILE#SENSOR` or `FILE` on the command line means.
 
     A file without a segment is a list of sensors (`.toml`; `.csv` with the columns segment, file; OpenSense's `.xml`)
@@ -61,25 +63,23 @@ def worn_of(given: str) -> list[Worn]:
 
     Raises `PblError` USAGE for another segment, FILE_MISSING, FILE_FORMAT for a list that cannot be read.
     """
-    segment, equals, rest = given.partition("=")
+    segment, equals, rest = text.partition("=")
     if equals and "/" not in segment and "\\" not in segment:
         file, _, sensor = rest.partition("#") if not Path(rest).exists() else (rest, "", "")
-        return [Worn(Path(file), _known(segment), sensor or None)]
-    path = Path(given)
+        return [Given(Path(file), _known(segment), sensor or None)]
+    path = Path(text)
     try:
         if path.suffix.lower() == ".toml":
             rows = [(k, v if isinstance(v, dict) else {"file": v}) for k, v in bounded.read_toml(path).items()]
             return [_row(path, {"segment": k, **v}) for k, v in rows]
         if path.suffix.lower() == ".xml":
             return _opensense(path)
-        if path.suffix.lower() == ".csv" and bounded.read_start(path, 64).decode("utf-8-sig", "replace").startswith(
-            "segment"
-        ):
+        if path.suffix.lower() == ".csv" and b"segment" in bounded.read_start(path, 16):
             rows = pd.read_csv(io.StringIO(bounded.read_text(path)), dtype=str, keep_default_na=False)
             return [_row(path, {str(k).strip(): v.strip() for k, v in row.items()}) for row in rows.to_dict("records")]
     except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
         raise unread_file(error, "a list of sensors and their segments", "see docs/imu.md", path) from error
-    return [Worn(path)]
+    return [Given(path)]
 
 
 def _known(segment: str) -> str:
@@ -93,42 +93,46 @@ def _known(segment: str) -> str:
     return segment
 
 
-def _row(path: Path, row: dict[str, Any]) -> Worn:
+def _row(path: Path, row: dict[str, Any]) -> Given:
     hz = row.get("rate_hz") or None
-    return Worn(path.parent / row["file"], _known(row["segment"]), row.get("sensor") or None, float(hz) if hz else None)
+    return Given(
+        path.parent / row["file"], _known(row["segment"]), row.get("sensor") or None, float(hz) if hz else None
+    )
 
 
-def _opensense(path: Path) -> list[Worn]:
+def _opensense(path: Path) -> list[Given]:
     """The sensors of OpenSense's settings of a reader; those on other parts of the body are left out."""
     text = bounded.read_text(path)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a document type, which settings do not have")
     root = ElementTree.fromstring(text)  # noqa: S314  without entities
+    if root.find(".//trial_prefix") is None:
+        raise ValueError("no settings of a reader of Xsens, whose trial_prefix names the files")
     prefix, out = (root.findtext(".//trial_prefix") or "").strip(), []
     for sensor in root.iter("ExperimentalSensor"):
         segment = segment_of(sensor.findtext("name_in_model") or "")
         name = f"{prefix}{sensor.get('name', '')}.txt"
         if segment is not None:
             packed = path.parent / f"{name}.gz"
-            out.append(Worn(packed if packed.exists() else path.parent / name, segment))
+            out.append(Given(packed if packed.exists() else path.parent / name, segment))
     if not out:
         raise ValueError("no ExperimentalSensor on pelvis, thighs, shanks or feet")
     return out
 
 
-def read_worn(worn: Sequence[Worn]) -> tuple[SensorLog, ...]:
+def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
     """Read sensors of a visit and bring them to one clock, whose time 0 is the start of the first of them.
 
     Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples` and `checked`, and for logs that are not of one
     recording; USAGE: a segment or a sensor is named twice, or the one of a file is not known.
     """
-    files = {(w.file, w.rate_hz): read_samples(w.file, w.rate_hz) for w in worn}
-    found = [(*pair, w) for w in worn for pair in _chosen(w, files[w.file, w.rate_hz])]
-    for what, names in (("segment", [s for s, _, _ in found]), ("sensor", [x.name for _, x, _ in found])):
-        if twice := sorted({n for n in names if names.count(n) > 1}):
+    found = sensors_in(given)
+    measured = [b"".join(v.tobytes() for v in (x.acceleration, x.orientation) if v is not None) for _, x, _ in found]
+    for i, (segment, samples, _) in enumerate(found):
+        if segment in (s for s, _, _ in found[:i]) or measured[i] in measured[:i]:
             raise PblError(
                 "USAGE",
-                found=said("the {what} {name} twice", what=said(what), name=twice[0]),
+                found=said("the sensor {name} on {segment}: one of them twice", name=samples.name, segment=segment),
                 expected="each segment with one sensor of its own",
                 next_step="name each sensor once",
             )
@@ -139,7 +143,7 @@ def read_worn(worn: Sequence[Worn]) -> tuple[SensorLog, ...]:
             "sensors that were synchronised in one recording",
             key=found[0][2].file,
         )
-    begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if len(x.stamp)), default=0.0)
+    begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
     logs = tuple(checked(x, segment, w.file, begin) for segment, x, w in found)
     first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
     if logs and last - first < _OVERLAP * min(x.time[-1] - x.time[0] for x in logs):
@@ -151,23 +155,43 @@ def read_worn(worn: Sequence[Worn]) -> tuple[SensorLog, ...]:
     return logs
 
 
-def _chosen(worn: Worn, samples: Sequence[Samples]) -> list[tuple[str, Samples]]:
+def sensors_in(given: Sequence[Given]) -> list[tuple[str, Samples, Given]]:
+    """Read the files: segments, the sensors on them, and by what each was given. A file is read once.
+
+    Raises `PblError` FILE_MISSING, SENSOR_LOG as `read_samples`; USAGE: the sensor or segment of a file is not known.
+    """
+    wanted = {(g.file, g.rate_hz, g.called) for g in given}
+    files = {one: read_samples(*one) for one in sorted(wanted, key=str)}
+    return [(*pair, g) for g in given for pair in _chosen(g, files[g.file, g.rate_hz, g.called])]
+
+
+def named(one: Given) -> list[Given]:
+    """A file without a segment as its sensors whose names say one; itself where it cannot be read or none does."""
+    if one.segment is not None:
+        return [one]
+    try:
+        return [dataclasses.replace(one, segment=segment, sensor=x.name) for segment, x, _ in sensors_in([one])]
+    except PblError:
+        return [one]
+
+
+def _chosen(given: Given, samples: Sequence[Samples]) -> list[tuple[str, Samples]]:
     """Segments and sensors of a file that are named. Raises `PblError` USAGE."""
     by_name = [(segment_of(x.name), x) for x in samples]
-    if worn.segment is None:
+    if given.segment is None:
         pairs = [(s, x) for s, x in by_name if s is not None]
-    elif worn.sensor is not None:
-        pairs = [(worn.segment, x) for x in samples if x.name == worn.sensor]
+    elif given.sensor is not None:
+        pairs = [(given.segment, x) for x in samples if x.name == given.sensor]
     else:
-        ours = [x for s, x in by_name if s == worn.segment] if len(samples) > 1 else samples
-        pairs = [(worn.segment, x) for x in ours]
-    if not pairs or (worn.segment is not None and len(pairs) > 1):
+        ours = [x for s, x in by_name if s == given.segment] if len(samples) > 1 else samples
+        pairs = [(given.segment, x) for x in ours]
+    if not pairs or (given.segment is not None and len(pairs) > 1):
         names = ", ".join(x.name for x in samples)
         raise PblError(
             "USAGE",
-            found=said("sensors {names} in {file}", names=names[:200], file=worn.file.name),
-            expected=said("which of them is on {segment}", segment=worn.segment or "which segment"),
+            found=said("sensors {names} in {file}", names=names[:200], file=given.file.name),
+            expected=said("which of them is on {segment}", segment=given.segment or "which segment"),
             next_step="name it: --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE where the file has one sensor",
-            key=worn.file,
+            key=given.file,
         )
     return pairs

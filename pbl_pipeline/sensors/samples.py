@@ -45,16 +45,19 @@ class Samples:
 
 @dataclasses.dataclass(frozen=True)
 class LogFile:
-    """A file to read. `text` is empty for a folder or an archive; `rate_hz` is the rate that a person states."""
+    """A file to read. `text` is empty for a folder or an archive; `rate_hz` is the rate that a person states, `called`
+    the name of the file of which this one is a copy."""
 
     path: Path
     text: str
     rate_hz: float | None = None
+    called: str | None = None
 
     @property
     def stem(self) -> str:
         """Name of the file without its suffixes."""
-        return self.path.name.removesuffix(".gz").rpartition(".")[0] or self.path.name
+        name = self.called or self.path.name
+        return name.removesuffix(".gz").rpartition(".")[0] or name
 
     def refuse(self, found: str, expected: str) -> PblError:
         """The error SENSOR_LOG about this file."""
@@ -70,13 +73,13 @@ class Format:
     reads: Callable[[LogFile], Sequence[Samples]]
 
 
-def opened(path: Path, rate_hz: float | None = None) -> LogFile:
+def opened(path: Path, rate_hz: float | None = None, called: str | None = None) -> LogFile:
     """Read the text of a log. Raises `PblError` FILE_MISSING, SENSOR_LOG (no text, or too long)."""
     if path.is_dir() or path.suffix.lower() == ".zip":
-        return LogFile(path, "", rate_hz)
+        return LogFile(path, "", rate_hz, called)
     with os_errors_as("FILE_MISSING", "the log of a wearable sensor", "check the path", path):
         try:
-            return LogFile(path, bounded.read_text(path, MAX_LOG), rate_hz)
+            return LogFile(path, bounded.read_text(path, MAX_LOG), rate_hz, called)
         except ValueError as error:
             raise log_error(f"no text to read ({error})", "a log as docs/imu.md says", key=path) from error
 

@@ -272,16 +272,25 @@ class SessionFit(dj.Computed):
         table = None
         if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
             table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
-        return trials, table, height_m, method_row(FitMethod, key)
+        worn = _worn(key, {int(t[0]): t[1] for t in trials}) if rows else None
+        return trials, table, height_m, worn, method_row(FitMethod, key)
 
     @computes
     def make_compute(
-        self, key: dict, trials: Sequence[tuple], table: tuple | None, height_m: float | None, method: Mapping[str, Any]
+        self,
+        key: dict,
+        trials: Sequence[tuple],
+        table: tuple | None,
+        height_m: float | None,
+        worn: tuple | None,
+        method: Mapping[str, Any],
     ) -> tuple[lib.SessionFit, list[int], str]:
         from pbl_pipeline.fit import fit_session
 
-        session_input = self._loaded(trials, table, height_m)
+        session_input = self._loaded(trials, table, height_m, worn)
         stated = {"markers": session_input.markers, "height_m": height_m}
+        if worn is not None:
+            stated |= {"sensors": session_input.sensors, "sensor_clock_s": session_input.sensor_clock_s}
         result = fit_session(
             session_input.trials,
             session_input.names,
@@ -308,7 +317,7 @@ class SessionFit(dj.Computed):
             sessions, places = [], []
             for i in rows:
                 try:
-                    sessions.append(self._loaded(*fetched[i][:3]))
+                    sessions.append(self._loaded(*fetched[i][:4]))
                     places.append(i)
                 except PblError:
                     continue  # make_compute will say it
@@ -319,21 +328,38 @@ class SessionFit(dj.Computed):
                     out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
         return out
 
-    def _loaded(self, trials: Sequence[tuple], table: tuple | None, height_m: float | None) -> lib.SessionInput:
-        """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`."""
+    def _loaded(
+        self, trials: Sequence[tuple], table: tuple | None, height_m: float | None, worn: tuple | None
+    ) -> lib.SessionInput:
+        """Keypoints of one or several cameras or markers, names and camera motions of the trials of `make_fetch`, and
+        the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
+        from pbl_pipeline.sensors.checked import check_day
+        from pbl_pipeline.sensors.given import Given, read_given
 
         _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
-        own = None
+        own, more = None, {}
         with ExitStack() as stack:
             markers = video.NO_CAMERA in motions
             loaded = [_load_trial(stack, r, rig, markers) for r, rig in zip(refs, rigs, strict=True)]
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
+            if worn is not None:
+                files, recorded = worn
+                paths = [stack.enter_context(stored_file(ref)) for ref, *_ in files]
+                sensors = read_given(
+                    [
+                        Given(path, segment, sensor or None, rate, called)
+                        for path, (_, called, segments, rate) in zip(paths, files, strict=True)
+                        for segment, sensor in sorted(segments.items())
+                    ]
+                )
+                check_day(sensors, recorded)
+                more = {"sensors": sensors, "sensor_clock_s": [None] * len(trials)}
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
-        return SessionInput(loaded, names, motions, own, height_m)
+        return SessionInput(loaded, names, motions, own, height_m, **more)
 
     def make_insert(self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, origin: Origin) -> None:
         from pbl_pipeline.qc import worst
@@ -401,6 +427,19 @@ def _marker_recordings(sets: Any) -> Any:
 @MadeOnce
 def _people(sets: Any) -> Any:
     return sets.proj("session_id") * session.Session.proj("subject") * lab.Subject.proj("subject_height")
+
+
+def _worn(key: Mapping[str, Any], names: Mapping[int, str]) -> tuple | None:
+    """Logs of wearable sensors of a set's visit, (file, its name, segments, rate) of each, and the time of recording of
+    its trials by their names; None without sensors."""
+    of_visit = video.Video & (FitSet & {"fit_set": key["fit_set"]}).proj("session_id")
+    rows = (video.WearableImu & of_visit.proj()).to_dicts(order_by=("video_id", "imu"))
+    worn = [r for r in rows if r["imu_segments"]]
+    if not worn:
+        return None
+    files = [(file_ref(r["imu_file"]), r["imu_name"], dict(r["imu_segments"]), number(r["imu_rate"])) for r in worn]
+    recorded = (video.VideoInfo & inside("video_id", names)).proj("recorded_utc").to_dicts()
+    return files, {names[int(r["video_id"])]: r["recorded_utc"] for r in recorded}
 
 
 def session_of_set(key: Mapping[str, Any]) -> int:

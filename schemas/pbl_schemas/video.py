@@ -142,16 +142,18 @@ class PhoneAttitude(dj.Manual):
 @schema
 class WearableImu(dj.Manual):
     definition = """
-    # file of inertial sensors that the person wore in a video: kept, not read
+    # log of inertial sensors that the person wore at the visit of a video; the fit of the visit reads it
     -> Video
-    imu          : int16                       # number of the file, from 1
+    imu               : int16                  # number of the file, from 1
     ---
-    imu_name     : varchar(255)                # name of the file
-    imu_sha256   : char(64)                    # of its bytes
-    imu_size     : int64                       # (byte) length
-    imu_created  : datetime                    # when registered, UTC
-    imu_file     : <object@arrays>            # the file
-    """
+    imu_name          : varchar(255)           # name of the file
+    imu_segments=null : json                   # segment of the body, such as shank_r, to the name of its sensor in the file; null: kept, not read
+    imu_rate=null     : float64                # (1/s) samples a second, as a person stated; null: the file says it
+    imu_sha256        : char(64)               # of its bytes
+    imu_size          : int64                  # (byte) length
+    imu_created       : datetime               # when registered, UTC
+    imu_file          : <object@arrays>       # the file
+    """  # noqa: E501
 
 
 @schema

@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.sensors.checked import check_day
-from pbl_pipeline.sensors.given import Worn, read_worn, segment_of, worn_of
+from pbl_pipeline.sensors.given import Given, given_sensors, read_given, segment_of
 from pbl_pipeline.sensors.log import SensorLog
 from tests import worn_sensor
 from tests.worn_sensor import Swing
 
 
 def read(*given: Any) -> tuple[SensorLog, ...]:
-    return read_worn([w for g in given for w in worn_of(str(g))])
+    return read_given([w for g in given for w in given_sensors(str(g))])
 
 
 def refused(*given: Any) -> PblError:
@@ -85,7 +85,7 @@ def test_xsens_sensors_keep_the_clock_of_their_packets(tmp_path: Path):
     shank, thigh = read(tmp_path / "imu.xml")
     assert (shank.segment, thigh.segment) == ("shank_r", "thigh_r")
     assert (shank.time[0], thigh.time[0]) == pytest.approx((0.0, 0.5))
-    other = worn_sensor.xsens(late, tmp_path / "MT_1-001_00B42D4E.txt", first=100)
+    other = worn_sensor.xsens(Swing(phase=1), tmp_path / "MT_1-001_00B42D4E.txt", first=100)
     assert "different clocks" in refused(f"shank_r={other}", f"thigh_r={tmp_path / 'MT_1-000_00B42D4C.txt'}").found
 
 
@@ -151,9 +151,9 @@ def test_own_csv(tmp_path: Path):
     (log,) = read(f"shank_r={swing.write(tmp_path / 'b.csv', table)}")
     assert_is(log, swing)
     assert log.started_utc == pytest.approx(1772356530.0)
-    check_day([log], log.started_utc + 3600, "walk")
-    with pytest.raises(PblError, match="days from the video"):
-        check_day([log], log.started_utc + 3 * 86400, "walk")
+    check_day([log], {"walk": "2026-03-02T08:15:30Z", "other": None})
+    with pytest.raises(PblError, match=r"3\.0 days from the video"):
+        check_day([log], {"walk": "2026-03-04T09:15:36Z"})
     table["start_utc"] = "2026-03-01T09:15:30"
     assert "start_utc" in refused(f"shank_r={swing.write(tmp_path / 'c.csv', table)}").found
 
@@ -274,8 +274,9 @@ def test_a_heading_of_a_magnet_and_a_clock_that_drifts_are_said(tmp_path: Path):
 
 def test_a_sensor_or_a_segment_twice(tmp_path: Path):
     path = Swing().write(tmp_path / "a.csv")
-    assert "the segment shank_r twice" in refused(f"shank_r={path}", f"shank_r={path}").found
-    assert "the sensor a twice" in refused(f"shank_r={path}", f"shank_l={path}").found
+    other = Swing(phase=1).write(tmp_path / "other.csv")
+    assert "on shank_r: one of them twice" in refused(f"shank_r={path}", f"shank_r={other}").found
+    assert "the sensor a on shank_l: one of them twice" in refused(f"shank_r={path}", f"shank_l={path}").found
     assert "a sensor on knee" in refused(f"knee={path}").found
     assert refused(path).code == "USAGE"  # no name that says a segment
     assert refused(f"shank_r={tmp_path / 'none.csv'}").code == "FILE_MISSING"
@@ -313,11 +314,11 @@ def test_every_real_file_is_read(shared_data: Path):
     for path in sorted((folder / "imu-formats").glob("[MTai]*.*")):
         if path.name.startswith("MT2022_ACC_00B"):
             with pytest.raises(PblError, match="not both"):  # nothing but accelerations
-                read_worn([Worn(path, "shank_r", rate_hz=100.0)])
+                read_given([Given(path, "shank_r", rate_hz=100.0)])
             continue
         names = ["Upper"] if "imuData" in path.name else ["Lumbar", "Right Ankle"] if "apdm" in path.name else [""]
         for name in names:
-            (log,) = read_worn([Worn(path, "shank_r", name or None, 100.0)])
+            (log,) = read_given([Given(path, "shank_r", name or None, 100.0)])
             assert np.isfinite(log.time).all()
             assert len(log.time) >= 3
             n += 1
@@ -345,7 +346,7 @@ def test_the_real_walk_has_its_knee_peaks_and_strides(shared_data: Path):
 def test_the_real_foot_sensors_pass_as_own_csv(shared_data: Path, tmp_path: Path):
     table = pd.read_csv(shared_data / "real/imu/gaitmap-foot-mocap/imu_sample.csv.gz", header=[0, 1], index_col=0)
     for side in ("left", "right"):
-        own = table[f"{side}_sensor"].copy()
+        own = pd.DataFrame(table[f"{side}_sensor"])
         own.insert(0, "time_s", np.arange(len(own)) / 204.8)
         assert "as in deg/s" in refused(f"foot_{side[0]}={Swing().write(tmp_path / 'deg.csv', own)}").found
         own[GYR] = np.radians(own[GYR])

@@ -21,13 +21,15 @@ FORMATS = (
 )
 
 
-def read_samples(path: Path, rate_hz: float | None = None) -> list[Samples]:
-    """The sensors in a file, whose format is found by its content. `rate_hz`: for a file that does not state its own.
+def read_samples(path: Path, rate_hz: float | None = None, called: str | None = None) -> list[Samples]:
+    """The sensors in a file, whose format is found by its content.
+
+    `rate_hz`: for a file that does not state its own; `called`: name of the file of which this one is a copy.
 
     Raises `PblError` FILE_MISSING, SENSOR_LOG.
     """
     try:
-        file = opened(path, rate_hz)
+        file = opened(path, rate_hz, called)
         found = next((f for f in FORMATS if f.knows(file)), None)
         if found is None:
             raise file.refuse("a file of no known format", ", ".join(f.name for f in FORMATS))

@@ -84,10 +84,10 @@ _METHODS = ("tracking", "keypoint", "fit", "gdi", "norm", "kinetics")
 )
 @click.option(
     "--imu",
-    type=click.Path(path_type=Path),
     multiple=True,
-    metavar="FILE",
-    help="Files of wearable IMUs, of one video.",
+    metavar="[SEGMENT=]FILE",
+    help="Log of a wearable sensor, such as shank_r=FILE, or a list of sensors (docs/imu.md); of the whole visit; "
+    "'none' for no sensors.",
 )
 @click.option("--activity", help="What the person does, such as tug or sit_to_stand (else: walking).")
 @click.option(
@@ -119,7 +119,7 @@ def ingest(
     name_pattern: str | None,
     attitude: tuple[Path, ...],
     depth: tuple[Path, ...],
-    imu: tuple[Path, ...],
+    imu: tuple[str, ...],
     **stated: Any,
 ) -> None:
     """Register videos, with --rig the views of one trial by several calibrated cameras, or with --markers recordings of
@@ -164,6 +164,8 @@ def ingest(
     _one_kind(videos, markers, marker_set, bool(attitude or depth or imu), rig is not None)
     files = _files(len(videos), attitude, depth, imu)
     visits, results = _visits(videos or markers, name_pattern, stated)
+    if imu and len({visit for _, visit in visits}) > 1:
+        raise click.UsageError("--imu: all videos are of one visit, so their names must state the same.")
     if rig is not None and (results or len({visit for _, visit in visits}) > 1):
         raise click.UsageError("--rig: all videos are of one trial, so their names must state the same.")
     if videos and rig is None:
@@ -266,10 +268,13 @@ def _one_kind(
             raise click.UsageError(text)
 
 
-def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[Path, ...]) -> list[Sensors]:
-    """Sensor files of each of the n videos. Raises `PblError` USAGE where files and videos do not match."""
+def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[str, ...]) -> list[Sensors]:
+    """Sensor files of each of the n videos; the first has those that the person wore. Raises `PblError` USAGE where
+    files and videos do not match, what `given_sensors` raises."""
+    from pbl_pipeline.sensors.given import given_sensors, named
     from pbl_schemas.intake import Sensors
     from pbl_schemas.intake.records import usage
+    from pbl_schemas.intake.sensors import NONE
 
     for what, given in (("--attitude", attitude), ("--depth", depth)):
         if given and len(given) != n:
@@ -279,8 +284,9 @@ def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tup
                 next_step="name a file for each video"
                 + (", 'none' for one without a log" if what == "--attitude" else "; ingest the others in another call"),
             )
-    if imu and n > 1:
-        alone = "ingest that video in a separate call"
-        raise usage(f"--imu for {n} videos", "IMU files with one video", next_step=alone)
+    worn = [sensor for text in imu for one in given_sensors(text) for sensor in named(one)]
+    if n > 1 and (files := [one.file.name for one in worn if one.segment is None and str(one.file) != NONE]):
+        alone = "name the segment, such as --imu shank_r=FILE, or ingest that video in a separate call"
+        raise usage(f"--imu {files[0]} for {n} videos", "the segment of a sensor", next_step=alone)
     logs, depths = (list(given) or [None] * n for given in (attitude, depth))
-    return [Sensors(a, d, imu) for a, d in zip(logs, depths, strict=True)]
+    return [Sensors(a, d, worn if i == 0 else ()) for i, (a, d) in enumerate(zip(logs, depths, strict=True))]

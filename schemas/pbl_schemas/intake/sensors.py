@@ -1,4 +1,4 @@
-"""Files that belong to a video, copied to the store: the phone's sensor log, depth video, wearable IMUs."""
+"""Files that belong to a video, copied to the store: the phone's sensor log, depth video, logs of wearable sensors."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.temporary import new_folder
 
-from .. import keypoints, video
+from .. import fit, keypoints, video
 from ..rows import counted, delete_below, utc_now
 
 if TYPE_CHECKING:
+    from pbl_pipeline.sensors.given import Given
     from pbl_pipeline.video import PhoneLog
 
-#: As a path of `--attitude`: no log for this video, or no longer.
+#: As a path of `--attitude` or `--imu`: no log for this video, no sensors at its visit, or no longer.
 NONE = "none"
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`."""
+    """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; imu: sensors that the person
+    wore at its visit."""
 
     attitude: Path | None = None
     depth: Path | None = None
-    imu: Sequence[Path] = ()
+    imu: Sequence[Given] = ()
 
     def __bool__(self) -> bool:
         return self.attitude is not None or self.depth is not None or bool(self.imu)
@@ -41,13 +43,15 @@ class Sensors:
         return self.attitude is not None and str(self.attitude) != NONE
 
     def read(self) -> PhoneLog | None:
-        """Read the log, if there is one, and check that the other files exist. Raises `PblError` FILE_MISSING,
-        PHONE_LOG; FILE_FORMAT for a file without bytes."""
+        """Read the logs, if there are any, and check that the other files exist. Raises `PblError` FILE_MISSING,
+        PHONE_LOG; FILE_FORMAT for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
+        from pbl_pipeline.sensors.given import read_given
         from pbl_pipeline.video import read_phone_log
 
-        for path in (self.depth, *self.imu):
-            if path is not None:
+        for path in (self.depth, *(given.file for given in self.imu)):
+            if path is not None and str(path) != NONE and not path.is_dir():
                 _check_there(path)
+        read_given([given for given in self.imu if given.segment is not None])
         return read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
 
 
@@ -62,9 +66,7 @@ def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
         done += _attach_log(key, given.attitude, log)
     if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth)):
         done.append(f"depth video {given.depth.name} was {how}")
-    for path in given.imu:
-        done += _attach_imu(key, path)
-    return done
+    return done + _attach_sensors(key, given.imu)
 
 
 def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[str]:
@@ -92,13 +94,55 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
     ]
 
 
-def _attach_imu(key: dict[str, Any], path: Path) -> list[str]:
-    own = video.WearableImu & key
-    if own & {"imu_sha256": sha256_of(path)}:
-        return []
-    number = max((int(n) for n in own.to_arrays("imu")), default=0) + 1
-    _keep(video.WearableImu, "imu", {**key, "imu": number}, path)
-    return [f"wearable IMU file {path.name} was attached"]
+def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
+    """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them. A log
+    of a segment takes the place of the visit's older one."""
+    files: dict[tuple[Path, float | None], dict[str, str]] = {}
+    for one in given:
+        own = files.setdefault((one.file, one.rate_hz), {})
+        own |= {} if one.segment is None else {one.segment: one.sensor or ""}
+    visit = {"session_id": int((video.Video & key).fetch1("session_id"))}
+    of_visit = video.WearableImu & (video.Video & visit).proj()
+    done, worn = [], False
+    for (file, rate), own in files.items():
+        rows = of_visit.to_dicts()
+        sha256 = None if str(file) == NONE else _sha256(file)
+        same = next((r for r in rows if r["imu_sha256"] == sha256 and r["imu_rate"] == rate), {"imu_segments": None})
+        # Further sensors of a file that is there already.
+        own = {s: name for s, name in (same["imu_segments"] or {}).items() if name not in own.values()} | own
+        if sha256 and "imu" in same and (same["imu_segments"] or {}) == own:
+            continue
+        for row in rows:
+            this = {k: row[k] for k in video.WearableImu.primary_key}
+            segments = row["imu_segments"] or {}
+            left = {s: name for s, name in segments.items() if s not in own}
+            if sha256 in (None, row["imu_sha256"]) or (segments and not left):
+                (video.WearableImu & this).delete(prompt=False)
+            elif left != segments:
+                video.WearableImu.update1({**this, "imu_segments": left})
+            worn |= left != segments or (sha256 is None and bool(segments))
+        if sha256 is None:
+            done += ["the wearable sensors were removed"] if rows else []
+            continue
+        number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
+        about = {"imu_segments": own or None, "imu_rate": rate}
+        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, about)
+        where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
+        done.append(f"wearable IMU file {file.name} was attached, {where}")
+        worn |= bool(own)
+    if worn:
+        sets = fit.FitSet & visit & f"fit_set_kind <> '{fit.MARKERS}'"
+        if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
+            done.append(f"what was fitted without them was deleted: {rows}")
+    return done
+
+
+def _sha256(path: Path) -> str:
+    """Of a file's bytes, or of those of a folder's zip."""
+    if path.is_file():
+        return sha256_of(path)
+    with new_folder() as folder:
+        return sha256_of(_zipped(path, folder / "log.zip"))
 
 
 def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:

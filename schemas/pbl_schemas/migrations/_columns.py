@@ -7,13 +7,13 @@ from typing import Any
 
 from pbl_schemas import connection
 
-_SQL = {"float64": "DOUBLE", "bool": "TINYINT"}
+_SQL = {"float64": "DOUBLE", "bool": "TINYINT", "json": "JSON"}
 
 
 def added(conn: Any, stage: str, table: str, columns: Mapping[str, tuple[str, str, str]]) -> list[str]:
     """Return the statements that add nullable columns to a table, those that it has left out; none without the table.
 
-    columns: name -> type (`float64`, `bool`), comment, and the column after which it stands.
+    columns: name -> type (`float64`, `bool`, `json`), comment, and the column after which it stands.
     """
     schema = connection.schema_name(stage)
     rows = conn.query(
