@@ -146,3 +146,8 @@ def undo_0010(cursor: Any) -> None:
     for table, prefix in (("__g_d_i", "gdi"), ("__session_gdi", "session_gdi")):
         for column in (f"{prefix}_unshrunk", f"{prefix}_unshrunk_sd"):
             cursor.execute(f"ALTER TABLE pbl_gdi.{table} DROP COLUMN {column}")
+
+
+def undo_0012(cursor: Any) -> None:
+    """Forget the segments of wearable sensors."""
+    cursor.execute("ALTER TABLE pbl_video.wearable_imu DROP COLUMN imu_rate, DROP COLUMN imu_segments")

@@ -8,16 +8,19 @@ import pytest
 import pbl_pipeline.fit
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.sensors.log import SensorLog
 from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
+from tests import worn_sensor
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
 from tests.phone_film import as_zip, film, sensor_logger
 from tests.quicktime import insert, meta
 from tests.rows import outcomes, register
+from tests.worn_sensor import Swing
 
 pytestmark = pytest.mark.usefixtures("tables")
 
@@ -127,6 +130,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
         file.write_bytes(content)
     told = pbl("ingest", path, "--subject", "P001", "--depth", depth, "--imu", left, "--imu", right)
     assert told.code == 0, told.err
+    assert "kept and not read" in told.out
     told = pbl("ingest", path, "--subject", "P001", "--depth", depth, "--imu", right)
     assert "nothing was inserted" in told.out
     assert video.DepthVideo.fetch1("depth_name") == "depth.mov"
@@ -136,8 +140,65 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
         assert row["imu_sha256"] == sha256_of(left if number == 1 else right)
         with stored_file(file_ref(row["imu_file"])) as kept:
             assert kept.read_bytes() == content
+    assert set(video.WearableImu.to_arrays("imu_segments")) == {None}
+    two = pbl("ingest", path, depth, "--subject", "P001", "--imu", left)
+    assert (two.error_code, "--imu left.csv for 2 videos" in two.err) == ("USAGE", True)
     assert pbl("ingest", path, "--subject", "P001", "--imu", empty).error_code == "FILE_FORMAT"
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
+
+
+def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    given = []
+
+    def fit_session(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
+        given.append((len(trials), {log.segment: log for log in sensors}, sensor_clock_s))
+        return chain.fit_session(trials, names, paramset)
+
+    def fitted() -> tuple[int, dict[str, SensorLog], object]:
+        given.clear()
+        assert not errors(populate())
+        (one,) = given
+        return one
+
+    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+    videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
+    shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    thigh = worn_sensor.xsens(Swing(phase=1), tmp_path / "MT_1-000_00B42D4C.txt", rate=False)
+    (tmp_path / "worn.csv").write_text(f"segment,file,rate_hz\nthigh_r,{thigh.name},100\n")
+    told = pbl("ingest", *videos, "--subject", "P001", "--imu", f"shank_r={shank}")
+    assert told.code == 0, told.err
+    assert "sensors on shank_r" in told.out
+    assert len(video.WearableImu()) == 1
+    n, logs, clocks = fitted()
+    assert (n, list(logs), clocks) == (2, ["shank_r"], [None, None])
+    np.testing.assert_allclose(logs["shank_r"].rate, Swing().rate, atol=1e-5)  # type: ignore[arg-type]
+    # Another segment: the fit is computed again, with the clock of both.
+    told = pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv")
+    assert "what was fitted without them was deleted: 1 of `pbl_fit`.`__session_fit`" in told.out
+    _, logs, _ = fitted()
+    assert {k: log.name for k, log in logs.items()} == {"shank_r": "00B42D4B", "thigh_r": "00B42D4C"}
+    assert "nothing was inserted" in pbl("ingest", videos[1], "--subject", "P001", "--imu", tmp_path / "worn.csv").out
+    # A sensor was on the other side; a file with several sensors takes the place of one.
+    assert "sensors on shank_l" in pbl("ingest", videos[0], "--subject", "P001", "--imu", f"shank_l={shank}").out
+    assert set(fitted()[1]) == {"shank_l", "thigh_r"}
+    several = worn_sensor.apdm({"Left Ankle": Swing(phase=2), "Lumbar": Swing(phase=3)}, tmp_path / "apdm.csv")
+    told = pbl("ingest", videos[0], "--subject", "P001", "--imu", several, "--imu", "none")
+    assert told.code == 0, told.err
+    pbl("ingest", videos[0], "--subject", "P001", "--imu", several)
+    assert set(fitted()[1]) == {"pelvis", "shank_l"}
+    assert [r["imu_segments"] for r in video.WearableImu.to_dicts()] == [{"pelvis": "Lumbar", "shank_l": "Left Ankle"}]
+    assert "were removed" in pbl("ingest", videos[0], "--subject", "P001", "--imu", "none").out
+    assert len(video.WearableImu()) == 0
+    assert fitted()[1:] == ({}, None)
+
+
+def test_a_sensor_log_that_cannot_be_read_registers_nothing(tmp_path: Path):
+    path = chain.small_video(tmp_path, "a")
+    table = Swing().own()
+    table[["acc_x", "acc_y", "acc_z"]] /= 9.81
+    told = pbl("ingest", path, "--subject", "P001", "--imu", f"shank_r={Swing().write(tmp_path / 'g.csv', table)}")
+    assert (told.code, told.error_code) == (1, "SENSOR_LOG")
+    assert len(video.Video()) == 0
 
 
 def test_the_lens_of_the_file_and_slow_motion(tmp_path: Path):
