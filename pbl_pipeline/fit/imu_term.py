@@ -75,13 +75,16 @@ def _residual(at: At, z: Float[Array, "F m 17"]) -> Float[Array, "F m 3"]:
     worn = at.problem.wearables
     assert worn is not None
     here = error_rad(at, worn, z[..., :3], z[..., 6:])
-    ahead = at._replace(
-        problem=_next_frames(at.problem), segments=Segments(*(later(a) for a in at.segments or ()))
-    )
+    ahead = at._replace(problem=_next_frames(at.problem), segments=Segments(*(later(a) for a in at.segments or ())))
     assert ahead.problem.wearables is not None
     there = error_rad(ahead, ahead.problem.wearables, z[..., 3:6], z[..., 6:])
     follows = worn.follows[..., None]
     return (here - follows * there) / (jnp.sqrt(1 - follows**2) * worn.sd_rad[:, None])
+
+
+def error_of_sensors(at: At) -> Float[Array, "F m 3"]:
+    """Each frame's error less what the next one's tells of it, in standard deviations."""
+    return _residual(at, _variables(at))
 
 
 def _next_frames(p: Problem) -> Problem:

@@ -58,7 +58,7 @@ class Wearables:
     frames that were measured; `follows`: correlation of the error there with that of the next frame, 0 if that was not.
     `mount`, `world`: start of the rotations from sensor to segment and from a sensor's world to that of a trial.
     `sd_rad`: of a sensor on its segment; `level_sd_rad`: of the vertical of a sensor's world; `tilt_sd_rad`: of that of
-    a trial's world, 0 where it was measured. `middle_s`: of the trials. `dispersion`: of the keypoints (`Linearised`).
+    a trial's world, 0 where it was measured. `middle_s`: of the trials; `clock_s`: start of the clock. `dispersion`: of the keypoints (`Linearised`).
     """
 
     body_index: Int[Array, " m"]
@@ -72,6 +72,7 @@ class Wearables:
     level_sd_rad: Float[Array, "N m"]
     tilt_sd_rad: Float[Array, " N"]
     middle_s: Float[Array, " N"]
+    clock_s: Float[Array, " N"]
     dispersion: Float[Array, ""]
 
 

@@ -21,7 +21,11 @@ from .orientation import SAMPLE_S, Orientation, rate_of
 #: Segment -> body of the model. A foot's sensor sits on the shoe, over the midfoot.
 BODY_OF = {
     "pelvis": "pelvis",
-    **{f"{ours}_{side}": f"{body}_{side}" for ours, body in (("thigh", "femur"), ("shank", "tibia"), ("foot", "calcn")) for side in "rl"},
+    **{
+        f"{ours}_{side}": f"{body}_{side}"
+        for ours, body in (("thigh", "femur"), ("shank", "tibia"), ("foot", "calcn"))
+        for side in "rl"
+    },
 }
 #: Low pass of rates and accelerations (s, standard deviation of a Gaussian): a video's are noise above 5 Hz.
 SMOOTH_S, SMOOTH_SLOW_S = 0.03, 0.06
@@ -52,7 +56,10 @@ def moved(
     turned = {k: Slerp(time, Rotation.from_matrix(R))(even) for k, R in rotation.items()}
     rates = {k: _smooth(rate_of(r.as_quat(scalar_first=True))) for k, r in turned.items()}
     places = {k: np.stack([np.interp(even, time, v) for v in x.T], axis=1) for k, x in position.items()}
-    second = {k: np.gradient(np.gradient(_smooth(x, SMOOTH_SLOW_S), SAMPLE_S, axis=0), SAMPLE_S, axis=0) for k, x in places.items()}
+    second = {
+        k: np.gradient(np.gradient(_smooth(x, SMOOTH_SLOW_S), SAMPLE_S, axis=0), SAMPLE_S, axis=0)
+        for k, x in places.items()
+    }
     return Moved(even, {k: r.as_matrix() for k, r in turned.items()}, rates, second)
 
 

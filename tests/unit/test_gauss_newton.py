@@ -269,7 +269,9 @@ def small_session(kind: str) -> Session:
         seen = jnp.asarray(np.random.default_rng(5).random(p.contact.shape) * p.weight[:, None])
         session = dataclasses.replace(session, problem=dataclasses.replace(p, contact=seen))
     if "sensors" in kind:
-        session = dataclasses.replace(session, problem=dataclasses.replace(session.problem, wearables=wearables(session)))
+        session = dataclasses.replace(
+            session, problem=dataclasses.replace(session.problem, wearables=wearables(session))
+        )
     return session
 
 
@@ -292,6 +294,7 @@ def wearables(session: Session) -> Wearables:
         "level_sd_rad": np.full((trials, 2), 0.1),
         "tilt_sd_rad": np.linspace(0, 0.2, trials),
         "middle_s": np.full(trials, 0.4),
+        "clock_s": np.zeros(trials),
         "dispersion": 0.3,
     }
     index = values.pop("body_index")
@@ -332,7 +335,9 @@ def at_state(session: Session, w: Weights, state: State) -> At:
     return At(p, w, state, markers, soles, phone_at(p, state), segments_at(session.body, p, state))
 
 
-@pytest.mark.parametrize("kind", ["views", "world", "floor pelvis", "moving floor", "moving detector", "moving sensors", "detector sensors"])
+@pytest.mark.parametrize(
+    "kind", ["views", "world", "floor pelvis", "moving floor", "moving detector", "moving sensors", "detector sensors"]
+)
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
     params = dataclasses.replace(PARAMS, weight_pelvis=0.5) if "pelvis" in kind else PARAMS
