@@ -28,8 +28,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.resources import processes_at_once, shared_cores
-from pbl_pipeline.sensors.checked import check_day
-from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors import SensorLog, check_day
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pbl_pipeline.fit import Params, Points
     from pbl_pipeline.keypoints import KeypointParams
     from pbl_pipeline.methods import Method
-    from pbl_pipeline.sensors.log import SensorLog
+    from pbl_pipeline.sensors import SensorLog
     from pbl_pipeline.tracking import TrackingParams
     from pbl_pipeline.visit import Visit
 
@@ -64,7 +64,7 @@ PEOPLE = click.option(
 
 def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     """Read the sensors of `--imu`, and print what was left out of them. Raises the `PblError`s of `read_given`."""
-    from pbl_pipeline.sensors.given import given_sensors, read_given
+    from pbl_pipeline.sensors import given_sensors, read_given
 
     logs = read_given([one for text in given for one in given_sensors(text)])
     for log in logs:

@@ -17,7 +17,7 @@ from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError, said, unread_file
 
 from .checked import checked
-from .formats import read_samples
+from .formats.read import read_samples
 from .log import SEGMENTS, SensorLog
 from .samples import Samples, log_error
 

@@ -335,8 +335,7 @@ class SessionFit(dj.Computed):
         the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
-        from pbl_pipeline.sensors.checked import check_day
-        from pbl_pipeline.sensors.given import Given, read_given
+        from pbl_pipeline.sensors import Given, check_day, read_given
 
         _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
         own, more = None, {}

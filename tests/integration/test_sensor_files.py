@@ -8,7 +8,7 @@ import pytest
 import pbl_pipeline.fit
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
-from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors import SensorLog
 from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.stored_files import file_ref, stored_file

@@ -13,9 +13,8 @@ from scipy.signal import find_peaks
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.sensors.checked import check_day
-from pbl_pipeline.sensors.given import Given, given_sensors, read_given, segment_of
-from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors import Given, SensorLog, check_day, given_sensors, read_given
+from pbl_pipeline.sensors.given import segment_of
 from tests import worn_sensor
 from tests.worn_sensor import Swing
 

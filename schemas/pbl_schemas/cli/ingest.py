@@ -271,7 +271,7 @@ def _one_kind(
 def _files(n: int, attitude: tuple[Path, ...], depth: tuple[Path, ...], imu: tuple[str, ...]) -> list[Sensors]:
     """Sensor files of each of the n videos; the first has those that the person wore. Raises `PblError` USAGE where
     files and videos do not match, what `given_sensors` raises."""
-    from pbl_pipeline.sensors.given import given_sensors, named
+    from pbl_pipeline.sensors import given_sensors, named
     from pbl_schemas.intake import Sensors
     from pbl_schemas.intake.records import usage
     from pbl_schemas.intake.sensors import NONE

@@ -18,7 +18,7 @@ from .. import fit, keypoints, video
 from ..rows import counted, delete_below, utc_now
 
 if TYPE_CHECKING:
-    from pbl_pipeline.sensors.given import Given
+    from pbl_pipeline.sensors import Given
     from pbl_pipeline.video import PhoneLog
 
 #: As a path of `--attitude` or `--imu`: no log for this video, no sensors at its visit, or no longer.
@@ -45,7 +45,7 @@ class Sensors:
     def read(self) -> PhoneLog | None:
         """Read the logs, if there are any, and check that the other files exist. Raises `PblError` FILE_MISSING,
         PHONE_LOG; FILE_FORMAT for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
-        from pbl_pipeline.sensors.given import read_given
+        from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
         for path in (self.depth, *(given.file for given in self.imu)):
