@@ -17,8 +17,8 @@ from pbl_pipeline.sampling import interval_of
 from .log import SensorLog
 from .samples import Samples, log_error
 
-#: Rates of sampling (Hz), median length (m/s2) of an acceleration with gravity, and the angular speed (rad/s) of the
-#: 1000th fastest sample: a foot reaches 15 in walking, 25 in a sprint.
+#: Rates of sampling (Hz), median length (m/s2) of an acceleration with gravity, and the angular speed (rad/s) that one
+#: sample in a hundred exceeds: a foot reaches 15 in walking, 25 in a sprint.
 _HZ, _GRAVITY, _FASTEST = (20.0, 2000.0), (7.5, 13.0), 40.0
 #: Most stamps that repeat the one before, most samples at the end of a sensor's range, as shares.
 _MOST_REPEATS, _MOST_CLIPPED = 0.1, 0.05
@@ -165,7 +165,7 @@ def _turning(time: np.ndarray, turns: np.ndarray) -> np.ndarray:
 def _check_rate(
     time: np.ndarray, rate: np.ndarray, acceleration: np.ndarray | None, turns: np.ndarray | None, refuse: Refuse
 ) -> None:
-    fastest = float(np.nanquantile(np.linalg.norm(rate, axis=1), 0.999))
+    fastest = float(np.nanquantile(np.linalg.norm(rate, axis=1), 0.99))
     factor = np.nan
     if turns is not None:
         factor = _slope(rate, _turning(time, turns))
