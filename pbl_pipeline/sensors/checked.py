@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import said
+from pbl_pipeline.errors import as_said, said
 from pbl_pipeline.sampling import interval_of
 
 from .log import SensorLog
@@ -45,7 +45,7 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     notes: list[str] = []
 
     def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
-        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=segment, found=found)
+        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=segment, found=as_said(found))
         more = {"next_step": next_step} if next_step else {}
         raise log_error(about, expected, key=path, **more)
 
@@ -55,10 +55,9 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
         None if x is None else np.where(np.isfinite(x[kept]).all(axis=1, keepdims=True), x[kept], np.nan)
         for x in (samples.rate, samples.acceleration, samples.orientation)
     )
-    if (
-        acceleration is not None and (none := np.asarray(~acceleration.any(axis=1))).any()
-    ):  # a sample that is missing, as zeros
-        rate, acceleration = (None if x is None else np.where(none[:, None], np.nan, x) for x in (rate, acceleration))
+    if acceleration is not None:  # a sample that is missing may be zeros
+        none = ~np.asarray(acceleration.any(axis=1))[:, None]
+        rate, acceleration = (None if x is None else np.where(none, np.nan, x) for x in (rate, acceleration))
     if turns is None and (rate is None or acceleration is None):
         refuse(
             "no orientation, and not both an angular rate and an acceleration",
@@ -230,7 +229,7 @@ def _check_upright(turns: np.ndarray, acceleration: np.ndarray, refuse: Refuse) 
         "from the sensor's axes to a world whose z points up; an acceleration that is +9.81 upwards at rest",
         "turn the quaternion around: it is from the world to the sensor"
         if inverse <= _TILT_DEG
-        else f"in this file up is {sign}{axis}: turn the world, or the sign of the accelerations",
+        else said("in this file up is {axis}: turn the world, or the sign of the accelerations", axis=sign + axis),
     )
 
 
