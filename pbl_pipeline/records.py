@@ -2,7 +2,7 @@
 
     @dataclasses.dataclass(frozen=True)
     class GaitEvent:
-        time_s: Annotated[float, Column("event_time", "float64", "(s) time of the trial")]
+        time_s: float = column("event_time", "(s) time of the trial")
 
 `definition` returns the lines of a DataJoint table, `to_row` the values of one record, `from_row` the record of a row.
 Names, types and comments are DataJoint's; "{}" in a name or a comment stands for the prefix of the table, where several
@@ -29,9 +29,9 @@ class Column(NamedTuple):
     """Column of a field."""
 
     name: str
-    type: str  # of DataJoint, such as float64 or varchar(64)
     comment: str = ""  # (unit) meaning
-    null: bool = False  # NULL for None, "" and what is not finite
+    type: str = "float64"  # of DataJoint, such as varchar(64)
+    null: bool = False  # NULL for None, "" and what is not finite; always so where the field may be None
     empty: bool = False  # '' in the rows that were there when it was added
     key: bool = False  # in the primary key of the table
     before: str = ""  # field before whose column it stands; "": in the order of the fields, "(end)": after all
@@ -47,11 +47,25 @@ class Declared(NamedTuple):
     missing: Any = None  # value of the field for NULL
 
 
-def stored(name: str, type: str, comment: str = "", *, before: str) -> Callable[[F], F]:
+def column(
+    name: str,
+    comment: str = "",
+    type: str = "float64",
+    *,
+    default: Any = dataclasses.MISSING,
+    default_factory: Any = dataclasses.MISSING,
+    **how: Any,
+) -> Any:
+    """Return a field of a dataclass with a `Column`; `how`: its other attributes."""
+    own = {"column": Column(name, comment, type, **how)}
+    return dataclasses.field(default=default, default_factory=default_factory, metadata=own)
+
+
+def stored(name: str, comment: str = "", type: str = "float64", **how: Any) -> Callable[[F], F]:
     """Decorate the function of a property that has a column too, which is written and not read."""
 
     def mark(function: F) -> F:
-        function.__dict__["column"] = Column(name, type, comment, before=before)
+        function.__dict__["column"] = Column(name, comment, type, **how)
         return function
 
     return mark
@@ -60,12 +74,11 @@ def stored(name: str, type: str, comment: str = "", *, before: str) -> Callable[
 @functools.cache
 def declared(cls: type) -> tuple[Declared, ...]:
     """Return the columns of a class in order."""
-    hints = typing.get_type_hints(cls, include_extras=True)
     found: list[Declared] = []
     for field in dataclasses.fields(cls):
-        hint = hints[field.name]
-        kind, *more = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
-        if own := next((m for m in more if isinstance(m, Column)), None):
+        kind = _hints(cls)[field.name]
+        if own := field.metadata.get("column"):
+            own = own._replace(null=own.null or isinstance(kind, types.UnionType))
             found.append(Declared((field.name,), own, _writer(own), *_reader(kind)))
         elif dataclasses.is_dataclass(kind):
             found += [d._replace(path=(field.name, *d.path)) for d in declared(typing.cast("type", kind))]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated, Any
+from typing import Any
 
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column
 
 #: Half of a 90 % interval in standard deviations.
 WIDTH_SD = 1.645
@@ -22,33 +22,19 @@ class KineticMeasure:
     `compute.MAX_ASYMMETRY_SD`.
     """
 
-    left: Annotated[float | None, Column("{}_left", "float64", "in the unit (see {0}_measure)", null=True)]
-    right: Annotated[float | None, Column("{}_right", "float64", "in the unit (see {0}_measure)", null=True)]
-    mean: Annotated[
-        float, Column("{}_mean", "float64", "in the unit (see {0}_measure): both sides", null=True, before="left")
-    ]
-    sd_left: Annotated[float | None, Column("{}_sd_left", "float64", "in the unit (see {0}_measure)", null=True)]
-    sd_right: Annotated[float | None, Column("{}_sd_right", "float64", "in the unit (see {0}_measure)", null=True)]
-    sd: Annotated[
-        float | None,
-        Column(
-            "{}_sd",
-            "float64",
-            "in the unit (see {0}_measure): standard deviation of the error of {0}_mean",
-            null=True,
-            before="sd_left",
-        ),
-    ]
-    n: Annotated[int, Column("{}_n", "int16", "values", before="(end)")]
-    asymmetry_percent: Annotated[
-        float | None,
-        Column(
-            "{}_asymmetry", "float64", "(percent) right minus left, of their mean; null where too uncertain", null=True
-        ),
-    ] = None
-    asymmetry_sd: Annotated[
-        float | None, Column("{}_asymmetry_sd", "float64", "(percent) standard deviation of its error", null=True)
-    ] = None
+    left: float | None = column("{}_left", "in the unit (see {0}_measure)")
+    right: float | None = column("{}_right", "in the unit (see {0}_measure)")
+    mean: float = column("{}_mean", "in the unit (see {0}_measure): both sides", null=True, before="left")
+    sd_left: float | None = column("{}_sd_left", "in the unit (see {0}_measure)")
+    sd_right: float | None = column("{}_sd_right", "in the unit (see {0}_measure)")
+    sd: float | None = column(
+        "{}_sd", "in the unit (see {0}_measure): standard deviation of the error of {0}_mean", before="sd_left"
+    )
+    n: int = column("{}_n", "values", "int16", before="(end)")
+    asymmetry_percent: float | None = column(
+        "{}_asymmetry", "(percent) right minus left, of their mean; null where too uncertain", default=None
+    )
+    asymmetry_sd: float | None = column("{}_asymmetry_sd", "(percent) standard deviation of its error", default=None)
 
     @property
     def interval(self) -> tuple[float, float] | None:

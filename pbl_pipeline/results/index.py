@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column
 
 from .events import RIGHT, SIDES
 from .measures import Z90
@@ -30,12 +29,9 @@ NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrun
 class VariableScore:
     """Gait Variable Score (deg) of an angle, None for a side without cycles."""
 
-    angle: Annotated[str, Column("{}_angle", "varchar(32)", "name", key=True)]
-    left: Annotated[
-        float | None,
-        Column("{}_score_left", "float64", "(deg) root mean square distance from the normative mean curve", null=True),
-    ]
-    right: Annotated[float | None, Column("{}_score_right", "float64", "(deg)", null=True)]
+    angle: str = column("{}_angle", "name", "varchar(32)", key=True)
+    left: float | None = column("{}_score_left", "(deg) root mean square distance from the normative mean curve")
+    right: float | None = column("{}_score_right", "(deg)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,18 +45,11 @@ class MovementProfile:
 
     left: dict[str, float]
     right: dict[str, float]
-    gps_left: Annotated[float | None, Column("{}_gps_left", "float64", "(deg)", null=True)]
-    gps_right: Annotated[float | None, Column("{}_gps_right", "float64", "(deg)", null=True)]
-    gps: Annotated[
-        float | None,
-        Column(
-            "{}_gps",
-            "float64",
-            "(deg) Gait Profile Score of the person; null unless the norm has nine angles",
-            null=True,
-            before="gps_left",
-        ),
-    ]
+    gps_left: float | None = column("{}_gps_left", "(deg)")
+    gps_right: float | None = column("{}_gps_right", "(deg)")
+    gps: float | None = column(
+        "{}_gps", "(deg) Gait Profile Score of the person; null unless the norm has nine angles", before="gps_left"
+    )
 
     def of_side(self, side: str) -> dict[str, float]:
         """The scores of "left" or "right"."""
@@ -86,11 +75,9 @@ class GdiCycle:
     trial: str
     number: int
     side: str
-    gdi: Annotated[float, Column("cycle_gdi", "float64", "(-)")]
-    z: Annotated[float, Column("cycle_z", "float64", "(-) standardised log distance to the normative mean")]
-    explained: Annotated[
-        float, Column("cycle_explained", "float64", "(0..1) share of the deviation that the index sees")
-    ]
+    gdi: float = column("cycle_gdi", "(-)")
+    z: float = column("cycle_z", "(-) standardised log distance to the normative mean")
+    explained: float = column("cycle_explained", "(0..1) share of the deviation that the index sees")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +92,12 @@ class Gdi:
     either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
     """
 
-    status: Annotated[str, Column("{}_status", "enum('PASS', 'EMPTY')")]
-    reason: Annotated[str, Column("{}_reason", "varchar(1000)", "why there is no index")]
-    left: Annotated[float | None, Column("{}_left", "float64", "(-)", null=True)]
-    right: Annotated[float | None, Column("{}_right", "float64", "(-)", null=True)]
-    mean: Annotated[float | None, Column("{}", "float64", "(-) mean over all used cycles", null=True, before="left")]
-    n: Annotated[int, Column("{}_n", "int16", "cycles with an index", before="(end)")]
+    status: str = column("{}_status", type="enum('PASS', 'EMPTY')")
+    reason: str = column("{}_reason", "why there is no index", "varchar(1000)")
+    left: float | None = column("{}_left", "(-)")
+    right: float | None = column("{}_right", "(-)")
+    mean: float | None = column("{}", "(-) mean over all used cycles", before="left")
+    n: int = column("{}_n", "cycles with an index", "int16", before="(end)")
     n_left: int
     n_right: int
     norm: str
@@ -119,31 +106,16 @@ class Gdi:
     cycles: tuple[GdiCycle, ...]
     qc: tuple[Check, ...]
     profile: MovementProfile | None = None
-    sd: Annotated[float | None, Column("{}_sd", "float64", "(-) standard deviation of the error of {}", null=True)] = (
-        None
+    sd: float | None = column("{}_sd", "(-) standard deviation of the error of {}", default=None)
+    minimal_change: float | None = column(
+        "{}_minimal_change", "(-) minimal detectable change (90 percent) between two such visits", default=None
     )
-    minimal_change: Annotated[
-        float | None,
-        Column(
-            "{}_minimal_change",
-            "float64",
-            "(-) minimal detectable change (90 percent) between two such visits",
-            null=True,
-        ),
-    ] = None
-    unshrunk: Annotated[
-        float | None,
-        Column(
-            "{}_unshrunk",
-            "float64",
-            "(-) not drawn towards the mean of people: for correlations and means over people",
-            null=True,
-        ),
-    ] = None
-    unshrunk_sd: Annotated[
-        float | None,
-        Column("{}_unshrunk_sd", "float64", "(-) standard deviation of the error of {}_unshrunk", null=True),
-    ] = None
+    unshrunk: float | None = column(
+        "{}_unshrunk", "(-) not drawn towards the mean of people: for correlations and means over people", default=None
+    )
+    unshrunk_sd: float | None = column(
+        "{}_unshrunk_sd", "(-) standard deviation of the error of {}_unshrunk", default=None
+    )
 
     @property
     def interval(self) -> tuple[float, float] | None:
