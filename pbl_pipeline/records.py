@@ -21,6 +21,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from pbl_pipeline.paramset import structured
+
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable)
 
@@ -34,6 +36,7 @@ class Column(NamedTuple):
     null: bool = False  # NULL for None, "" and what is not finite; always so where the field may be None
     empty: bool = False  # '' in the rows that were there when it was added
     key: bool = False  # in the primary key of the table
+    digits: int | None = None  # decimals of the numbers of a json column
     before: str = ""  # field before whose column it stands; "": in the order of the fields, "(end)": after all
 
 
@@ -82,7 +85,7 @@ def declared(cls: type) -> tuple[Declared, ...]:
             found.append(Declared((field.name,), own, _writer(own), *_reader(kind)))
         elif dataclasses.is_dataclass(kind):
             found += [d._replace(path=(field.name, *d.path)) for d in declared(typing.cast("type", kind))]
-    for name, member in vars(cls).items():
+    for name, member in (item for base in reversed(cls.__mro__) for item in vars(base).items()):
         if isinstance(member, property) and (own := getattr(member.fget, "column", None)):
             found.append(Declared((name,), own, _writer(own), None))
     for d in [d for d in found if len(d.path) == 1 and d.column.before]:
@@ -133,16 +136,31 @@ def from_row(cls: type[T], row: Mapping[str, Any], prefix: str = "", **others: A
     row
         Values by column. A field whose column is not there keeps its default: a table may hold fewer of them.
     others
-        Values of the fields without a column.
+        Values of the fields without a column, or instead of its value.
     """
-    own, nested = dict(others), dict[str, dict[str, Any]]()
+    own, nested = dict[str, Any](), dict[str, dict[str, Any]]()
     for path, c, _, read, missing in declared(cls):
         name = c.name.format(prefix) if prefix else c.name
         if read is not None and name in row:
             group = own if len(path) == 1 else nested.setdefault(path[0], {})
             value = row[name]
             group[path[-1]] = missing if value is None else read(value)
-    return cls(**own, **{name: _hints(cls)[name](**of) for name, of in nested.items()})
+    return cls(**own | {name: _hints(cls)[name](**of) for name, of in nested.items()} | others)
+
+
+def from_json(cls: type[T], values: Mapping[str, Any], **others: Any) -> T:
+    """Return the record of JSON that `plain` made of its fields; `others`: fields that stand elsewhere.
+
+    Raises `ValueError` as `paramset.structured`, TypeError, AttributeError.
+    """
+    own = dict(values)
+    for path, c, _, read, missing in declared(cls):
+        value = own.get(path[0], "")
+        if value is None and c.null:
+            own[path[0]] = missing
+        elif isinstance(value, Mapping) and read is not None and len(path) == 1:
+            own[path[0]] = read(value)
+    return structured({**own, **others}, cls)
 
 
 @functools.cache
@@ -151,7 +169,11 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _reader(kind: Any) -> tuple[Callable[[Any], Any], Any]:
-    """Return the type of a field, and what NULL means there: None if it may be that, else NaN, 0 or ""."""
+    """Return the function that reads a field, and what NULL means there: None if it may be that, else NaN, 0 or ""."""
+    if kind is np.ndarray:
+        return np.asarray, None
+    if kind == dict[int, float]:
+        return lambda stored: {int(k): math.nan if v is None else float(v) for k, v in stored.items()}, None
     optional = isinstance(kind, types.UnionType)
     if optional:
         kind = next(a for a in typing.get_args(kind) if a is not type(None))
@@ -164,21 +186,28 @@ def number(value: Any) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def plain(value: Any) -> Any:
-    """Return mappings and tuples as dicts and lists of plain numbers, for a json column."""
+def plain(value: Any, digits: int | None = None) -> Any:
+    """Return a value for JSON: records and mappings as dicts, tuples and arrays as lists, NaN and infinity as None.
+
+    digits: decimals of floats, None for all.
+    """
+    if dataclasses.is_dataclass(value):
+        value = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): plain(v, digits) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    return value.item() if isinstance(value, np.generic) else value
+        return [plain(v, digits) for v in value]
+    if not isinstance(value, float):
+        return value
+    return None if not math.isfinite(value) else value if digits is None else round(value, digits)
 
 
 def _writer(c: Column) -> Callable[[Any], Any]:
     """Return the function that makes the value of a column."""
     if c.type == "json":
-        return plain
+        return functools.partial(plain, digits=c.digits)
     if c.type.startswith("float"):
         return number if c.null else float
     kind: Callable[[Any], Any] = {"int": int, "bool": bool}.get(c.type.rstrip("0123456789"), _same)

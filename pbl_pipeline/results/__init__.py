@@ -2,7 +2,9 @@
 
 from .cycles import BODY_ANGLES, NO_POSITIONS, Exclusion, GaitCycle, Lengths
 from .events import EVENTS, FOOT_DOWN, FOOT_UP, LEFT, RIGHT, SIDES, GaitEvent, GaitEvents
+from .fits import Solution
 from .forces import KineticMeasure
 from .index import Gdi, GdiCycle, MovementProfile, VariableScore
 from .measures import OF_VISIT, Z90, Measure
+from .people import PersonTrack, SubjectChoice
 from .video_facts import FirstPicture, VideoInfo

@@ -16,6 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, from_row, number, to_row
+from pbl_pipeline.results.fits import Solution
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
@@ -201,17 +202,13 @@ class SessionFit(dj.Computed):
     ---
     -> session.Session
     -> BodyModel
-    solver               : varchar(32)
-    fit_loss             : float64             # (-) total loss at the end
+    {definition(Solution, only=("solver", "loss"))}
     fit_residual_2d=null : float64             # (px) median distance of body and keypoints in the picture
     fit_residual_3d=null : float64             # (cm) median distance of body and 3D keypoints
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
-    fit_iterations=null  : int32               # steps of the solver, null for fits of before it was recorded
-    fit_converged=null   : bool                # ended at a minimum, not at its bound on iterations or steps; null too
-    fit_scale            : json                # multiplier (-) of each scale group, 1 = the unscaled body
+    {definition(Solution, only=("iterations", "converged", "scale"))}
     fit_height=null      : float64             # (m) body height of the person that the fit was told, null: not known
-    compile_seconds      : float64             # (s) of the duration, spent compiling
-    compute_device       : varchar(64)         # what JAX computed on
+    {definition(Solution, only=("compile_seconds", "device"))}
     session_file         : <object@arrays>     # npz: scale (8), site_offset_m (J,3) m, loss_trace (K,2)
     {origin_columns("fit")}
     """
@@ -353,17 +350,11 @@ class SessionFit(dj.Computed):
                     **key,
                     "session_id": session_of_set(key),
                     "body_model": one(BodyModel & {"body_sha256": body_sha}, "body_model"),
-                    "solver": result.solver,
-                    "fit_loss": float(result.trials[0].loss),
+                    **to_row(result),
                     "fit_residual_2d": median(residual_2d),
                     "fit_residual_3d": median(100 * residual_3d),
                     "fit_outcome": worst(result.qc),
-                    "fit_iterations": int(result.iterations),
-                    "fit_converged": bool(result.converged),
-                    "fit_scale": [round(float(s), 5) for s in result.scale],
                     "fit_height": number(result.trials[0].height_m),
-                    "compile_seconds": result.compile_seconds,
-                    "compute_device": result.device[:64],
                     "session_file": folder / "session.npz",
                     **origin.row("fit", method_hash=sha, model_sha256=body_sha),
                 }

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbl_pipeline.records import from_row, number
-from pbl_pipeline.results import Gdi, GdiCycle, KineticMeasure
+from pbl_pipeline.results import Gdi, GdiCycle, KineticMeasure, Solution
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
-from ..rows import Rows, or_nan, row_of, stored_rows
+from ..rows import Rows, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pbl_pipeline.keypoints import Keypoints
     from pbl_pipeline.kinetics import CycleKinetics, Kinetics, TrialKinetics
     from pbl_pipeline.qc import Check
-    from pbl_pipeline.visit import Solution
 
 
 def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
@@ -56,24 +55,20 @@ def _keys(key: Any) -> Any:
 
 def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     """The library's `Solution` of one row of SessionFit: how its body was fitted, without the fitted movements."""
-    from pbl_pipeline.visit import Solution
-
     row = row_of(fit.SessionFit, key, rows)
     with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         scale, trace = f["scale"], f["loss_trace"]
-    return Solution(
-        solver=row["solver"],
+    found = from_row(
+        Solution,
+        row,
         params_hash=row["fit_method_hash"],
-        # NULL for fits older than these columns: the trace ends with the last step, convergence is unknown
-        iterations=int(trace[-1, 0] if row["fit_iterations"] is None else row["fit_iterations"]),
-        converged=None if row["fit_converged"] is None else bool(row["fit_converged"]),
         scale=scale,
         loss_trace=trace,
         seconds=float(row["fit_seconds"]),
-        compile_seconds=float(row["compile_seconds"]),
-        device=row["compute_device"],
         software=row["fit_code_version"],
     )
+    # NULL for fits older than this column: the trace ends with the last step
+    return found if found.iterations is not None else dataclasses.replace(found, iterations=int(trace[-1, 0]))
 
 
 def load_fit_checks(key: Any, rows: Rows = stored_rows) -> list[Check]:
@@ -87,20 +82,6 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
     with stored_file(file_ref(row["tracks"])) as path:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
-
-
-def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
-    from pbl_pipeline.tracking import SubjectChoice
-
-    return SubjectChoice(
-        status=row["choice_status"],
-        person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
-        score=or_nan(row["choice_score"]),
-        runner_up_id=None if row["runner_up_id"] is None else int(row["runner_up_id"]),
-        runner_up_score=or_nan(row["runner_up_score"]),
-        scores={int(k): or_nan(v) for k, v in row["choice_scores"].items()},
-        reason=row["choice_reason"],
-    )
 
 
 def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
