@@ -14,9 +14,10 @@ from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
 from pbl_pipeline.gait.metrics_file import curve_table, known_curves
 from pbl_pipeline.paramset import structured
+from pbl_pipeline.results import CycleKinetics, Kinetics, Series, TrialKinetics
 
 from .joints import MOMENTS
-from .types import CURVES, CycleKinetics, Kinetics, Series, TrialKinetics
+from .types import CURVES
 
 _SERIES = tuple(f.name for f in dataclasses.fields(Series))
 _OF_CYCLES = ("cycle_no", "names", "percent", "curve", "curve_sd")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbl_pipeline.records import from_row, number
-from pbl_pipeline.results import Gdi, GdiCycle, KineticMeasure, Solution
+from pbl_pipeline.records import from_row
+from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, KineticMeasure, Kinetics, Solution, TrialKinetics
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pbl_pipeline import tracking as tracking_lib
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.keypoints import Keypoints
-    from pbl_pipeline.kinetics import CycleKinetics, Kinetics, TrialKinetics
     from pbl_pipeline.qc import Check
 
 
@@ -215,14 +214,11 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
             reasons[name] = own["force_missing"]
             continue
         measures[name] = from_row(KineticMeasure, own, "force")
-    return lib.Kinetics(
-        status=row["forces_status"],
-        code=row["forces_code"],
-        reason=row["forces_reason"],
+    return from_row(
+        Kinetics,
+        row,
         measures=measures,
         reasons=reasons,
-        mass_kg=number(row["forces_mass"]),
-        residual_bw=number(row["forces_residual"]),
         method=row["kinetics_method"],
         params_hash=row["forces_method_hash"],
         trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
@@ -244,7 +240,7 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
     def cycle(own: Mapping[str, Any]) -> CycleKinetics:
         number_of = int(own["cycle_no"])
         about = gait.cycle_of_row(cycles[number_of], "")
-        return lib.CycleKinetics(
+        return CycleKinetics(
             number_of,
             about.side,
             about.used,
@@ -254,13 +250,12 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
         )
 
     of_trial = {**_of(kinetics.Kinetics, row), "video_id": row["video_id"]}
-    return lib.TrialKinetics(
-        row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, row), rows)["trial_name"],
-        row["trial_forces_status"],
-        row["trial_forces_code"],
-        row["trial_forces_reason"],
-        tuple(cycle(r) for r in rows(kinetics.Kinetics.Cycle, of_trial)),
-        series,
+    return from_row(
+        TrialKinetics,
+        row,
+        name=row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, row), rows)["trial_name"],
+        cycles=tuple(cycle(r) for r in rows(kinetics.Kinetics.Cycle, of_trial)),
+        series=series,
     )
 
 
