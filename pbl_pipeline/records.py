@@ -37,6 +37,7 @@ class Column(NamedTuple):
     empty: bool = False  # '' in the rows that were there when it was added
     key: bool = False  # in the primary key of the table
     digits: int | None = None  # decimals of the numbers of a json column
+    meaning: str = ""  # in words, for files
     before: str = ""  # field before whose column it stands; "": in the order of the fields, "(end)": after all
 
 
@@ -100,14 +101,24 @@ def definition(cls: type, prefix: str = "", without: Collection[str] = (), only:
 
     `without`, `only`: names of fields that this table does not have, and that are asked for.
     """
-    own = [d.column for d in declared(cls) if d.path[0] not in without and (not only or d.path[0] in only)]
+    own = _picked(cls, without, only)
     keys, values = ([_line(c, prefix) for c in own if c.key == key] for key in (True, False))
     return "\n".join([*keys, "---", *values] if keys else values)
 
 
-def names(cls: type, prefix: str = "", without: Collection[str] = ()) -> list[str]:
-    """Return the names of the columns of a class, as `to_row` writes them."""
-    return [d.column.name.format(prefix) for d in declared(cls) if d.path[0] not in without]
+def names(cls: type, prefix: str = "", without: Collection[str] = (), only: Collection[str] = ()) -> list[str]:
+    """Return the names of the columns of a class, as `to_row` writes them; `without`, `only` as in `definition`."""
+    return [c.name.format(prefix) for c in _picked(cls, without, only)]
+
+
+def _picked(cls: type, without: Collection[str], only: Collection[str]) -> list[Column]:
+    return [d.column for d in declared(cls) if d.path[0] not in without and (not only or d.path[0] in only)]
+
+
+def meanings(cls: type) -> dict[str, str]:
+    """Return field -> meaning in words, of those fields that state one, in their order."""
+    columns = {f.name: f.metadata["column"] for f in dataclasses.fields(cls) if "column" in f.metadata}
+    return {name: c.meaning for name, c in columns.items() if c.meaning}
 
 
 def _line(c: Column, prefix: str) -> str:

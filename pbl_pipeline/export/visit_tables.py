@@ -14,18 +14,19 @@ from pbl_pipeline.fit.angles_file import angles_table
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, NUMBERS, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
 from pbl_pipeline.kinetics import CURVES, CycleKinetics, Kinetics
+from pbl_pipeline.records import meanings
+from pbl_pipeline.results import Measure
 from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.words import KINETICS, unit_of
 
 from .columns import Column, Labels, Table, joined
 from .trial import ExportTrial
 
-_MEANINGS = json.loads(shipped_text("export/meanings.json"))
 #: Positive direction of a joint value, by the joint's name without its side.
-JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
+JOINT_SIGNS: dict[str, str] = json.loads(shipped_text("export/joint_signs.json"))
 _SIDES = {"r": "right", "l": "left"}
-_STATISTICS: dict[str, str] = _MEANINGS["statistics"]
-_OF_INDEX: dict[str, str] = _MEANINGS["index_statistics"]
+_STATISTICS = dict(sorted(meanings(Measure).items(), key=lambda named: named[0] != "mean"))
+_ONLY_LONG = ("variability", "cv_percent", "asymmetry_percent")
 _TRIAL = "name of the trial"
 
 
@@ -300,14 +301,14 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
 def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
     names = dict.fromkeys((*MEASURES, *(m for part in parts for m in part[2].of_task)))
-    wanted = [(m, s) for m in names for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
+    wanted = [(m, s) for m in names for s in _STATISTICS if s not in _ONLY_LONG]
     wanted += [("gdi", s) for s in (*NUMBERS, "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     wanted += [(m, s) for m in KINETICS for s in _OF_FORCES]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])
     for measure, statistic in wanted:
         values = _floats(row.get((measure, statistic), np.nan) for row in rows)
-        text = (_STATISTICS | _OF_INDEX).get(statistic, statistic.replace("_", " "))
+        text = (_STATISTICS | meanings(Gdi)).get(statistic, statistic.replace("_", " "))
         columns.append(Column(f"{measure}_{statistic}", values, _unit(measure, statistic), text))
     return Table("measures_wide", tuple(columns))
 

@@ -14,6 +14,7 @@ from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
 from pbl_pipeline.gait.metrics_file import curve_table, known_curves
 from pbl_pipeline.paramset import structured
+from pbl_pipeline.records import plain
 from pbl_pipeline.results import CycleKinetics, Kinetics, Series, TrialKinetics
 
 from .joints import MOMENTS
@@ -30,7 +31,7 @@ def content_of(kinetics: Kinetics) -> dict[str, Any]:
         **_own(kinetics, *own),
         "measures": {name: m.to_dict() for name, m in kinetics.measures.items()},
         "reasons": dict(kinetics.reasons),
-        "qc": [c.to_dict() for c in kinetics.qc],
+        "qc": plain(kinetics.qc),
         "trials": [
             {**_own(t, "name", "status", "code", "reason"), "cycles": [_cycle(c) for c in t.cycles]}
             for t in kinetics.trials

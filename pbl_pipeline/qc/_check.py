@@ -28,9 +28,6 @@ class Check:
         if self.outcome not in OUTCOMES:
             raise ValueError(f"outcome {self.outcome!r} is not one of {OUTCOMES}")
 
-    def to_dict(self) -> dict:
-        return dataclasses.asdict(self)
-
 
 def warn_if(bad: object, check: str, value: float | None, threshold: float | None, advice: str) -> Check:
     """Return a check that warns with `advice` if `bad`, else passes."""

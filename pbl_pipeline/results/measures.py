@@ -26,27 +26,47 @@ class Measure:
     None if the error was not measured.
     """
 
-    left: float | None = column("{}_left", "in the unit (see {})")
-    right: float | None = column("{}_right", "in the unit (see {})")
-    mean: float = column("{}_mean", "in the unit (see {}): both sides", null=True, before="left")
-    sd: float | None = column("{}_sd", "in the unit (see {}): n - 1, null for one value")
-    n: int = column("{}_n", "values", "int16", before="error_sd")
-    variability: float | None = column(
-        "{}_variability", "in the unit (see {}): sd within a side, null below two values of a side", default=None
+    left: float | None = column("{}_left", "in the unit (see {})", meaning="mean of the left side")
+    right: float | None = column("{}_right", "in the unit (see {})", meaning="mean of the right side")
+    mean: float = column(
+        "{}_mean", "in the unit (see {}): both sides", null=True, before="left", meaning="mean over both sides"
     )
-    cv_percent: float | None = column("{}_cv", "(percent) variability of the mean", default=None)
+    sd: float | None = column(
+        "{}_sd", "in the unit (see {}): n - 1, null for one value", meaning="standard deviation over both sides (n - 1)"
+    )
+    n: int = column("{}_n", "values", "int16", before="error_sd", meaning="number of values")
+    variability: float | None = column(
+        "{}_variability",
+        "in the unit (see {}): sd within a side, null below two values of a side",
+        meaning="standard deviation within a side",
+        default=None,
+    )
+    cv_percent: float | None = column(
+        "{}_cv", "(percent) variability of the mean", meaning="variability in percent of the mean", default=None
+    )
     asymmetry_percent: float | None = column(
-        "{}_asymmetry", "(percent) right minus left, of their mean; null where it means nothing", default=None
+        "{}_asymmetry",
+        "(percent) right minus left, of their mean; null where it means nothing",
+        meaning="100 (right - left) / mean of both",
+        default=None,
     )
     error_sd: float | None = column(
-        "{}_error", "in the unit (see {}): standard deviation of the error of the mean", default=None
+        "{}_error",
+        "in the unit (see {}): standard deviation of the error of the mean",
+        meaning="standard deviation of the error of the mean",
+        default=None,
     )
     minimal_change: float | None = column(
-        "{}_minimal_change", "in the unit (see {}): minimal detectable change (90 percent)", default=None
+        "{}_minimal_change",
+        "in the unit (see {}): minimal detectable change (90 percent)",
+        meaning="minimal detectable change (90 %) between two visits filmed alike",
+        default=None,
     )
 
-    def to_dict(self) -> dict:
-        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
+    @property
+    def errors(self) -> tuple[float | None, float | None]:
+        """Standard deviation of the error and minimal detectable change."""
+        return self.error_sd, self.minimal_change
 
     @property
     def interval(self) -> tuple[float, float] | None:

@@ -85,7 +85,7 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
         "orientation_source": {n: f.orientation_source for n, f in fits.items()},
         "phone_clock_offset_s": {n: plain(round(f.phone_clock_offset_s, 4)) for n, f in fits.items()},
         "height_m": next((plain(round(f.height_m, 4)) for f in fits.values()), None),
-        "qc": [c.to_dict() for c in visit.fit_checks],
+        "qc": plain(visit.fit_checks),
     }
     if visit.solution is not None:
         s = visit.solution
