@@ -127,7 +127,7 @@ def check_scores(rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def important_change(instrument: Mapping[str, Any], before: float) -> float | None:
-    """Return the minimal important change of a score (row of its instrument) that was `before`; None if there is none."""
+    """Return the minimal important change of a score that was `before`, by the row of its instrument; None without."""
     from pbl_pipeline.study import minimal_change_at
 
     return minimal_change_at(before, instrument["minimal_change"], instrument["minimal_change_classes"])

@@ -23,7 +23,7 @@ from pbl_pipeline.paramset import canonical_json
 from pbl_pipeline.records import number
 
 from .. import keypoints, lab, video
-from ..jobs import forget_errors
+from ..queues import forget_errors
 from ..rows import delete_below, utc_now
 from ..transactions import in_transaction, next_id
 
