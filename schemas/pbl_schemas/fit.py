@@ -15,7 +15,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import definition, from_row, number, to_row
+from pbl_pipeline.records import definition, number, to_row
 from pbl_pipeline.results.fits import Solution
 from pbl_pipeline.temporary import new_folder
 
@@ -48,6 +48,7 @@ from .fit_sets import (  # noqa: F401  one schema: `fit.FitSet` and the others
 from .method_rows import method_row
 from .origin import Origin, computes, origin_columns
 from .plan import plan_fit_sets
+from .record_parts import part_of
 from .rows import InputChanged, MadeOnce, one
 from .stored_files import file_ref, stored_file
 
@@ -90,12 +91,7 @@ class SessionFit(dj.Computed):
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of the fit
-        -> master
-        {definition(Quality, "fit")}
-        """
+    Check = part_of("Check", Quality, "fit", "quality checks of the fit")
 
     @property
     def key_source(self) -> Any:
@@ -233,7 +229,7 @@ class SessionFit(dj.Computed):
                         "trial_file": path,
                     }
                 )
-        self.Check.insert({**key, **to_row(check, "fit")} for check in result.qc)
+        self.Check.insert_records(key, result.qc)
 
 
 @MadeOnce
@@ -269,8 +265,8 @@ def trial_key(video_id: int) -> dict[str, Any] | None:
 
 def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
     """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
-    rows = (SessionFit.Check & {k: key[k] for k in SessionFit.primary_key}).to_dicts(order_by="fit_check")
-    return [dataclasses.astuple(from_row(Quality, row, "fit")) for row in rows]
+    found = SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
+    return [dataclasses.astuple(check) for check in found]
 
 
 def median(values: np.ndarray) -> float | None:

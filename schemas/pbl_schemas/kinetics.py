@@ -18,6 +18,7 @@ from . import capture, fit, gait, gdi, session, study, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import InputChanged
 from .stored_files import file_ref
 
@@ -101,12 +102,7 @@ class Kinetics(dj.Computed):
         forces_missing                            : varchar(100)  # why they are null
         """
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of the forces
-        -> master
-        {definition(Quality, "forces")}
-        """
+    Check = part_of("Check", Quality, "forces", "quality checks of the forces")
 
     @property
     def key_source(self) -> Any:
@@ -193,7 +189,7 @@ class Kinetics(dj.Computed):
             for v, trial in zip(ids, found.trials, strict=True)
             for c in trial.cycles
         )
-        self.Check.insert({**key, **to_row(check, "forces")} for check in found.qc)
+        self.Check.insert_records(key, found.qc)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,6 +20,7 @@ from . import video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import delete_below, inside, one, utc_now
 from .stored_files import file_ref, stored_file
 
@@ -85,12 +86,7 @@ class Tracking(dj.Computed):
     {origin_columns("tracking")}
     """  # noqa: E501
 
-    class Person(dj.Part):
-        definition = f"""
-        # one person's track in figures
-        -> master
-        {definition(TrackFigures)}
-        """
+    Person = part_of("Person", TrackFigures, comment="one person's track in figures")
 
     @property
     def key_source(self) -> Any:
@@ -126,7 +122,7 @@ class Tracking(dj.Computed):
                     **origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256),
                 }
             )
-        self.Person.insert({**key, **to_row(p.figures(tracking.time_s))} for p in tracking.persons)
+        self.Person.insert_records(key, (p.figures(tracking.time_s) for p in tracking.persons))
 
 
 @schema

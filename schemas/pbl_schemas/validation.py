@@ -11,6 +11,7 @@ from pbl_pipeline.results import JointError, TrialError
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import one, or_nan
 from .stored_files import file_ref, stored_file
 
@@ -58,11 +59,7 @@ class KinematicError(dj.Computed):
     {origin_columns("error")}
     """  # noqa: E501
 
-    class Joint(dj.Part):
-        definition = f"""
-        -> master
-        {definition(JointError)}
-        """
+    Joint = part_of("Joint", JointError)
 
     @property
     def key_source(self) -> Any:
@@ -96,7 +93,7 @@ class KinematicError(dj.Computed):
                 **origin.row("error"),
             }
         )
-        self.Joint.insert({**key, **to_row(joint)} for joint in errors.joints)
+        self.Joint.insert_records(key, errors.joints)
 
 
 def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> lib.KinematicErrors:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pbl_pipeline.qc import in_order
 from pbl_pipeline.records import from_row
 from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, KineticMeasure, Kinetics, Solution, TrialKinetics
 
@@ -70,9 +71,9 @@ def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     return found if found.iterations is not None else dataclasses.replace(found, iterations=int(trace[-1, 0]))
 
 
-def load_fit_checks(key: Any, rows: Rows = stored_rows) -> list[Check]:
+def load_fit_checks(key: Any, rows: Rows = stored_rows) -> tuple[Check, ...]:
     """The library's `Check`s of one row of SessionFit."""
-    return _checks(rows(fit.SessionFit.Check, key), "fit")
+    return in_order(fit.SessionFit.Check.records(key, rows))
 
 
 def load_tracking(key: Any) -> tracking_lib.Tracking:
@@ -81,12 +82,6 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
     with stored_file(file_ref(row["tracks"])) as path:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
-
-
-def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
-    from pbl_pipeline.qc import Check, in_order
-
-    return list(in_order(from_row(Check, row, prefix) for row in rows))
 
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
@@ -106,7 +101,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     )
     pooled = [t for t in trials if t.pooled]
     norm_name, model, params_hash = _index_of(row_key, rows)
-    checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
+    checks = in_order(gdi.SessionGdi.Check.records(row_key, rows))
     index = from_row(
         Gdi,
         row,
@@ -119,7 +114,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         params_hash=params_hash,
         cycles=tuple(c for t in pooled for c in t.gdi.cycles),
         qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
-        profile=gdi.profile_of_rows(rows(gdi.SessionGdi.Profile, row_key), row, "session"),
+        profile=gdi.load_profile(gdi.SessionGdi.Profile, row_key, row, rows),
     )
     measures = _spatiotemporal(
         rows(gdi.SessionGdi.Measure, row_key),
@@ -191,8 +186,8 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> Gdi:
         model=model,
         params_hash=params_hash,
         cycles=cycles,
-        qc=tuple(_checks(rows(gdi.GDI.Check, key), "index")),
-        profile=gdi.profile_of_rows(rows(gdi.GDI.Profile, key), row, "gdi"),
+        qc=in_order(gdi.GDI.Check.records(key, rows)),
+        profile=gdi.load_profile(gdi.GDI.Profile, key, row, rows),
     )
 
 
@@ -222,7 +217,7 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
         method=row["kinetics_method"],
         params_hash=row["forces_method_hash"],
         trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
-        qc=tuple(_checks(rows(kinetics.Kinetics.Check, row_key), "forces")),
+        qc=in_order(kinetics.Kinetics.Check.records(row_key, rows)),
     )
 
 

@@ -248,7 +248,7 @@ def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Row
     visit = Visit(
         tuple(recordings),
         load_solution(fit_key, rows),
-        tuple(load_fit_checks(fit_key, rows)),
+        load_fit_checks(fit_key, rows),
         kind=kind,
         methods=methods_of(key, rows),
         key=key,
