@@ -26,7 +26,7 @@ class FirstPicture:
         Focal length (mm) of the same view on 35 mm film, or None.
     """
 
-    path: str = column("video_path", type="varchar(1000)")
+    path: str = column("video_path", "where the file lies, absolute", "varchar(1000)")
     width_px: int = column("width", "(px) of the upright frame", "int32", before="fps")
     height_px: int = column("height", "(px) of the upright frame", "int32", before="fps")
     rotation_deg: int = column("rotation", "(deg) rotation flag of the file", "int16", before="fps")
@@ -69,8 +69,8 @@ class VideoInfo(FirstPicture):
         Remarks for the reader: frames hidden by an edit list, repeated stamps, a mirrored picture.
     """
 
-    sha256: str = column("video_sha256", type="char(64)")
-    size_bytes: int = column("video_size", type="int64")
+    sha256: str = column("video_sha256", "of its bytes: the same file is never registered twice", "char(64)")
+    size_bytes: int = column("video_size", "(byte) length of the file", "int64")
     container: str = column("container", type="varchar(64)")
     codec: str = column("codec", type="varchar(32)")
     pixel_format: str = column("pixel_format", type="varchar(32)")

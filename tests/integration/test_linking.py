@@ -106,7 +106,7 @@ def test_a_database_is_linked_with_the_same_tables_only(mylab: Any):
 
 
 def test_migrations_find_nothing_to_do(mylab: Any):
-    assert migrations.migrate(dry_run=True) == migrations.Outcome([], [], [])
+    assert migrations.migrate(dry_run=True) == migrations.Migrated([], [], [])
 
 
 @pytest.mark.parametrize(

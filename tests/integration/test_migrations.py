@@ -617,7 +617,7 @@ def test_an_empty_server_gets_the_tables_as_they_are_defined(put: Put, add: Call
     assert "`pbl_lab`.`subject`: the table is created" in outcome.created
     assert [a.number for a in migrations.applied()] == [*range(1, OWN + 1)]  # with nothing to do
     assert len(lab.Subject()) == len(video.Video()) == 0
-    assert migrations.migrate() == migrations.Outcome([], [], [])
+    assert migrations.migrate() == migrations.Migrated([], [], [])
 
 
 def test_a_new_database_needs_nothing(database: Path):

@@ -33,7 +33,7 @@ from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
-from pbl_schemas.intake.protocols import Step, add_protocol, read_protocol, steps_of
+from pbl_schemas.intake.protocols import ProtocolStep, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading import usable as module_usable
 from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
@@ -438,7 +438,7 @@ def drawn_take(rng: random.Random) -> tuple[str, Usable]:
 
 def test_drawn_mixes_of_takes_are_complete_by_usable_ones_alone(visit: int):
     wanted = {"1": ("walking", 2), "2": ("tug", 1), "3": ("sit_to_stand", 1)}
-    add_protocol("drawn", [Step(int(n), activity, "", "any", k) for n, (activity, k) in wanted.items()])
+    add_protocol("drawn", [ProtocolStep(int(n), activity, "", "any", k) for n, (activity, k) in wanted.items()])
     link_of(visit, protocol="drawn")
     rng, complete = random.Random(65), 0
     for _ in range(200):
