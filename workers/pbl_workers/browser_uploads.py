@@ -34,7 +34,7 @@ class Place:
 
 @dataclasses.dataclass(frozen=True)
 class Received:
-    """Received for a file: its name as it was sent; status as in `Registered`."""
+    """Outcome of a file: its name as it was sent; status as in `Registered`."""
 
     name: str
     status: str

@@ -85,7 +85,7 @@ class Migration:
 
 @dataclasses.dataclass(frozen=True)
 class Migrated:
-    """Migrated of a run, or of a dry run. open: differences that no migration removes, as text. touched: visits, slices
+    """Result of a run, or of a dry run. open: differences that no migration removes, as text. touched: visits, slices
     and accepted checks whose results change, in words."""
 
     steps: list[tuple[str, list[str]]]
