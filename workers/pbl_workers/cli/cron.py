@@ -101,18 +101,24 @@ def refresh(everything: bool) -> None:
 
 @cron.command()
 def release() -> None:
-    """Put the jobs of dead workers back into the queue, and remove parts of recordings that did not go on for a week.
+    """Put the jobs of dead workers back into the queue, and remove recordings that were begun and never registered.
+
+    That is: parts that did not go on for a week, and recordings of the archive of which a process was killed before
+    they had a row. `pbl status` shows how many wait for it.
 
     Example: pbl cron release
     """
     import pbl_schemas
-    from pbl_schemas.operations.archive import archive_dir, remove_unfinished
+    from pbl_schemas import video, worker
+    from pbl_schemas.operations.archive import LOCK, archive_dir, remove_unfinished
     from pbl_workers.recover import free_dead
 
     pbl_schemas.activate(methods=False)
     freed = {t.__name__: n for t in pbl_schemas.computed_tables() if (n := free_dead(t))}
     click.echo(", ".join(f"{n} of {name}" for name, n in freed.items()) or "no dead reservations")
-    if removed := remove_unfinished(archive_dir()):
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
+        removed = remove_unfinished(archive_dir()) if obtained else []  # else the next run
+    if removed:
         n_bytes = sum(one.n_bytes for one in removed)
         click.echo(f"removed {len(removed)} recordings that were begun and did not go on ({n_bytes / 1e6:.0f} MB)")
 
