@@ -13,6 +13,7 @@ import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_schemas import connection, lab, session, tracking, video
+from pbl_schemas.datajoint_setup import full_path
 from pbl_schemas.intake import VisitRecord, uploads
 from pbl_schemas.intake import register as register_all
 from pbl_schemas.operations.archive import PHONE, folder_of
@@ -232,6 +233,22 @@ def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp
     assert remove(left, older_than_s=1e6) == 0
     assert remove(left, older_than_s=0.0) == len(left.orphans)
     assert orphans(young_s=0.0).orphans == []
+
+
+def test_a_file_that_a_killed_process_was_writing_is_removed(tables: None):
+    before = len(orphans(young_s=0.0).orphans)
+    store = connection.store_backend()
+    paths = [f"{connection.store_root()}/pbl_tracking/tracking/{n}.npy{end}" for n, end in ((1, ".saving"), (2, ""))]
+    for path in paths:
+        file = Path(full_path(store, path))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"0")
+        os.utime(file, times=2 * (time.time() - 8 * 86_400,))
+    done = pbl("cron", "disk", "--least-free", 0)
+    assert "removed 1 that a killed process was writing" in done.out
+    assert [f.path for f in orphans(young_s=0.0).orphans if f.path in paths] == paths[1:]
+    assert remove(orphans(), 86_400.0) == 1
+    assert len(orphans(young_s=0.0).orphans) == before
 
 
 def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(tables: None, tmp_path: Path, archive: Path):

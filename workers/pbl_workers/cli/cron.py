@@ -189,13 +189,14 @@ def summary(hours: float, out: Path | None) -> None:
 @click.option("--least-free", "least_gb", type=click.FloatRange(min=0), default=10.0, show_default=True,
               metavar="GB", help="Less free space is an error.")  # fmt: skip
 def disk(days: float | None, least_gb: float) -> None:
-    """Report free space, the store's size, files without a row and rows without their file.
+    """Report free space, the store's size, files without a row and rows without their file; remove files of the store
+    that a killed process was writing a week ago.
 
     Example: pbl cron disk --remove-older-than 30
     """
     import pbl_schemas
-    from pbl_schemas.operations.archive import disks
-    from pbl_schemas.operations.orphans import orphans, remove
+    from pbl_schemas.operations.archive import UNFINISHED_DAYS, disks
+    from pbl_schemas.operations.orphans import WRITING, orphans, remove
 
     pbl_schemas.activate(methods=False)
     found = orphans()
@@ -203,6 +204,8 @@ def disk(days: float | None, least_gb: float) -> None:
     click.echo(f"files without a row: {len(found.orphans)}, {sum(f.size for f in found.orphans) / 1e9:.2f} GB")
     for file in found.orphans[:20]:
         click.echo(f"  {file.path}  {file.age_s / 86400:.1f} days")
+    if n := remove(found, UNFINISHED_DAYS * 86400, WRITING):
+        click.echo(f"removed {n} that a killed process was writing")
     if days is not None:
         click.echo(f"removed: {remove(found, days * 86400)}")
     for name, free, total in disks():
