@@ -29,6 +29,7 @@ from pbl_schemas.session import UNLABELLED
 from . import site
 from .access import HEADERS, HOURS, Session
 from .address import JSON
+from .remedies import remedies, remedies_of_path
 
 #: Fields of a form that no one has filled in, and their errors.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -118,6 +119,8 @@ def _environment() -> jinja2.Environment:
     )
     found.globals.update(
         number=number,
+        remedies=remedies,
+        remedies_of_path=remedies_of_path,
         has_text=lambda name: name in texts.catalogue(),
         significant=significant,
         check_words=check_words,
