@@ -132,7 +132,7 @@ def test_what_an_error_or_a_check_asks_for_is_a_link_to_where_it_is_done(clinic:
             assert not anchor or f'id="{anchor}"' in browser.get(place).text
         if "film.back" not in dict(links):
             assert texts.text(language, "error.click") not in "".join(s for s in said if "problem" in s), page
-        if "/visits/1" != page:
+        if page != "/visits/1":
             assert not any(f'{a}">{texts.text(language, w)}</a></p>' in shown[reader] for w, a in links)
 
 
