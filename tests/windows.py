@@ -40,7 +40,7 @@ class Window(Protocol):
     def choose_file(self, selector: str, path: Path) -> None: ...
 
 
-def until(found: Callable[[], Any], what: object, seconds: float = 120.0) -> Any:
+def until(found: Callable[[], Any], what: object, seconds: float = 300.0) -> Any:
     """Wait for something that is true; a page that is just being replaced answers nothing."""
     end, last = time.monotonic() + seconds, None
     while time.monotonic() < end:

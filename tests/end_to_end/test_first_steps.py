@@ -134,7 +134,7 @@ class Browser:
         fields = dict(re.findall(r'name="([\w:]+)" value="([^"]*)"', boxes.sub("", form)))
         answer = self.client.post(action[1], data={**fields, **typed}, files=files)
         self.show(answer)
-        end = time.monotonic() + 120
+        end = time.monotonic() + 300
         while name == "Compute now" and RESULT not in self.text:
             assert time.monotonic() < end, self.text
             time.sleep(0.5)
