@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests import SHARED, compiled
+from tests import SHARED, Environment, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
 
@@ -95,6 +95,20 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         # Where no test asks for a database, a command that wants one finds none running.
         patch.setenv("PBL_HOME", str(tmp_path_factory.mktemp("home")))
         yield
+
+
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
+    """Variables of the environment for a test, by their names; None removes one."""
+
+    def set_for_the_test(**values: object) -> None:
+        for name, value in values.items():
+            if value is None:
+                monkeypatch.delenv(name, raising=False)
+            else:
+                monkeypatch.setenv(name, str(value))
+
+    return set_for_the_test
 
 
 @pytest.fixture(scope="session", autouse=True)

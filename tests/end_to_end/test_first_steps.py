@@ -28,7 +28,7 @@ import pytest
 
 from pbl_schemas.operations import embedded
 from pbl_workers.web import certificates
-from tests import database, pages
+from tests import Environment, database, pages
 from tests.source import ROOT
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -214,7 +214,7 @@ class Reader:
 
 
 @pytest.fixture
-def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Reader]]:
+def reader(tmp_path: Path, environment: Environment) -> Iterator[Callable[[str], Reader]]:
     folder, home = tmp_path / "empty", database.new_home()
     for made in (folder, tmp_path / "bin"):
         made.mkdir()
@@ -223,7 +223,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     write_video(folder / "walk.mp4", numbered_frames(240, 360, 640), constant_rate(240))
     (sheet,) = (b.code for b in pages.blocks("docs/capture.md") if b.language == "text")
     (folder / "clinic.csv").write_text(sheet)
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "institution"))
+    environment(PBL_HOME=tmp_path / "institution")
     cert, key = certificates.server_certificate(("gait.example.org", "127.0.0.1"))
     for path, name in ((cert, "cert.pem"), (key, "key.pem"), (certificates.authority(), "authority.pem")):
         shutil.copy(path, folder / name)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import pbl_schemas
+from tests import Environment
 from tests.rows import Saved, remove_all
 
 from . import chain
@@ -61,18 +62,18 @@ def module_tables(
 
 
 @pytest.fixture
-def drop(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def drop(tables: None, tmp_path: Path, environment: Environment) -> Path:
     """An empty drop folder, which PBL_INCOMING names."""
     folder = tmp_path / "uploads"
     folder.mkdir()
-    monkeypatch.setenv("PBL_INCOMING", str(folder))
+    environment(PBL_INCOMING=folder)
     return folder
 
 
 @pytest.fixture
-def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def archive(tmp_path: Path, environment: Environment) -> Path:
     """The folder of the archive, which PBL_ARCHIVE names; whoever writes first makes it."""
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     return tmp_path / "archive"
 
 

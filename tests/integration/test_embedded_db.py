@@ -23,7 +23,7 @@ from pbl_schemas.cli.db import db
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import binaries, process, server
 from pbl_schemas.operations.embedded.folder import UNPRIVILEGED, server_account
-from tests import refused
+from tests import Environment, refused
 from tests.command import PBL, program
 from tests.database import new_home, remove_home
 
@@ -369,9 +369,9 @@ def test_no_server_and_no_apt_points_to_docker(monkeypatch: pytest.MonkeyPatch, 
     assert "docker compose" in caught.value.next_step
 
 
-def test_offline_fetches_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_offline_fetches_nothing(monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path):
     without_server(monkeypatch, tmp_path, "exit 1\n")
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+    environment(PBL_OFFLINE="1")
     with pytest.raises(PblError, match="PBL_OFFLINE"):
         embedded.get_server()
 
@@ -400,8 +400,8 @@ def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.Monk
     assert found.environment()["LD_LIBRARY_PATH"] == str(library.parent)
 
 
-def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("DJ_PASS", "secret")
+def test_the_servers_environment_holds_none_of_ours(environment: Environment):
+    environment(DJ_PASS="secret")
     assert "secret" not in embedded.Binaries(Path("a"), Path("b"), Path("c")).environment().values()
     assert binaries.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
 

@@ -24,7 +24,7 @@ from pbl_schemas.method_rows import insert_methods, resolve_method
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
-from tests import dot_models
+from tests import Environment, dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
 
@@ -48,10 +48,10 @@ def track_people(video_path, params=None, info=None) -> Tracking:
 
 
 @pytest.fixture
-def tables(database: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+def tables(database: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path) -> Iterator[None]:
     """Empty tables, a registry of its own, the people where they are."""
     pbl_schemas.activate()
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    environment(PBL_MODELS=tmp_path / "models")
     monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     yield
     remove_all()

@@ -37,7 +37,7 @@ from pbl_schemas.plan import plan_fit_sets
 from pbl_schemas.reading import frames
 from pbl_schemas.reading.status import pipeline_status
 from pbl_workers.populate import populate
-from tests import not_none
+from tests import Environment, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.rows import register, remove_all
@@ -296,9 +296,9 @@ def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path
         ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], VisitRecord("P001", person=2))
 
 
-def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, environment: Environment):
     """Its parameters freeze the hashes of graph and spec; another spec under its name is another version."""
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    environment(PBL_MODELS=tmp_path / "models")
     folder = tmp_path / "models" / "crowd"
     folder.mkdir(parents=True)
     entry = {"name": "images", "width": 416, "height": 416, "layout": "NCHW", "mean": [0, 0, 0], "std": [1, 1, 1]}

@@ -17,6 +17,7 @@ from pbl_pipeline.resources import keep_large_blocks
 from pbl_schemas.operations.embedded import process
 from pbl_workers import supervisor
 from pbl_workers.process import Options
+from tests import Environment
 from tests.command import pbl
 from tests.ended_process import Ended
 
@@ -34,10 +35,9 @@ def groups(folder: Path, patch: pytest.MonkeyPatch, own: str, files: dict[str, s
 
 
 @pytest.fixture
-def sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
+def sixteen(monkeypatch: pytest.MonkeyPatch, environment: Environment) -> None:
     """A process that is bound to 16 cores of a machine with 64 GB."""
-    for name in (resources.CORES, *resources._THREADS):
-        monkeypatch.delenv(name, raising=False)
+    environment(**dict.fromkeys((resources.CORES, *resources._THREADS)))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
     monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 16 * 2**20}.__getitem__)
 
@@ -69,10 +69,10 @@ def test_limits_of_control_groups_count(sixteen, tmp_path: Path, monkeypatch, ow
     assert (resources.cores(), resources.memory_bytes()) == expected
 
 
-def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: Path, monkeypatch):
+def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: Path, monkeypatch, environment):
     groups(tmp_path, monkeypatch, "0::/", {"cpu.max": "400000 100000"})
     for stated, expected in (("3", 3), ("64", 4), ("0", 1), ("many", 4)):
-        monkeypatch.setenv(resources.CORES, stated)
+        environment(**{resources.CORES: stated})
         assert resources.cores() == expected
 
 
@@ -84,10 +84,12 @@ def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: P
         (("--processes", "auto"), [*["1"] * 16, "16"]),  # the last one is for phones
     ],
 )
-def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, monkeypatch, asked: tuple, shares: list):
+def test_a_worker_divides_the_cores_by_its_processes(
+    sixteen, tmp_path: Path, monkeypatch, environment, asked: tuple, shares: list
+):
     groups(tmp_path, monkeypatch, "0::/", {})
     monkeypatch.setattr("pbl_schemas.activate", lambda **_: None)
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
+    environment(OMP_NUM_THREADS="7")  # who sets it means it
     seen: list[dict[str, str]] = []
     names = (resources.CORES, *resources._THREADS)
 
