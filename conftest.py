@@ -113,11 +113,12 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
 
 @pytest.fixture(scope="session", autouse=True)
 def phases_predicted_once() -> Iterator[None]:
-    """The event network looks at each walk once: tests have few, and every report and export is of one."""
+    """Network and filter of events look at each walk once: tests have few, and every report and export is of one."""
     from pbl_pipeline.gait.events import phase
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(phase, "predict", remembered(phase.predict))
+        for function in (phase.predict, phase.smooth_phases):
+            patch.setattr(phase, function.__name__, remembered(function))
         yield
 
 

@@ -220,7 +220,7 @@ def reader(tmp_path: Path, environment: Environment) -> Iterator[Callable[[str],
         made.mkdir()
     (tmp_path / "bin" / "pbl").write_text(STAND_IN)
     (tmp_path / "bin" / "pbl").chmod(0o755)
-    write_video(folder / "walk.mp4", numbered_frames(240, 360, 640), constant_rate(240))
+    write_video(folder / "walk.mp4", numbered_frames(240, 72, 128), constant_rate(240))
     (sheet,) = (b.code for b in pages.blocks("docs/capture.md") if b.language == "text")
     (folder / "clinic.csv").write_text(sheet)
     environment(PBL_HOME=tmp_path / "institution")
