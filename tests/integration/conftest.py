@@ -1,5 +1,6 @@
 """The tables as most tests of this folder want them."""
 
+import functools
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -21,9 +22,20 @@ def declared(database: Path) -> None:
 
 
 @pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Empty tables with the method rows, and stand-ins for the slow stages."""
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins for the slow stages (`chain`)."""
     chain.install(monkeypatch)
+
+
+@pytest.fixture
+def change_fits(stand_ins: None, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Lets the library fit what a function makes of the fits of the stand-in (`chain.change_fits`)."""
+    return functools.partial(chain.change_fits, monkeypatch)
+
+
+@pytest.fixture
+def tables(declared: None, stand_ins: None) -> Iterator[None]:
+    """Empty tables with the method rows, and stand-ins for the slow stages."""
     yield
     remove_all()
 

@@ -34,10 +34,9 @@ def stored() -> set[str]:
 
 
 @pytest.fixture
-def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[dict, set[str], list[Path]]]:
+def two(database: Path, tmp_path: Path, stand_ins: None) -> Iterator[tuple[dict, set[str], list[Path]]]:
     """P001 alone through the chain; then P017 as well, with everything a person can have. What was there before P017,
     the files, and P017's videos."""
-    chain.install(monkeypatch)
     declare_all()
     shutil.rmtree(Path(connection.store_backend().spec["location"]) / "_schema", ignore_errors=True)
     shared, own = camera(tmp_path, "shared", 900), camera(tmp_path, "own", 905)

@@ -81,8 +81,7 @@ def refused(sql: str) -> bool:
     return False
 
 
-def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    chain.install(monkeypatch)
+def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, stand_ins: None):
     login("worker")
     pbl_schemas.activate()
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
@@ -219,8 +218,8 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     server_before: dict[str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    stand_ins: None,
 ):
-    chain.install(monkeypatch)
     own = (*ROLES, "--role", "analyst", "--user", "maria", "--schema", "mylab", "--secrets", secrets)
     done = pbl(*own)
     assert done.code == 0, done.err
