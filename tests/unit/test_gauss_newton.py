@@ -37,7 +37,7 @@ from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual
 from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
-from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
+from pbl_pipeline.fit.solvers.gauss_newton import LevenbergMarquardt, Limits
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import At, Term, Unknowns
@@ -160,7 +160,8 @@ def test_a_curvature_that_is_wrong_neither_creeps_nor_swings(over):
 
     start = jnp.array([[0.1], [0.1]]), jnp.zeros(1)
     limits = Limits(jnp.asarray(1e-5), jnp.asarray(-1.0), jnp.asarray(50))
-    end = minimise(evaluate, move, before_first(evaluate, start), jnp.ones(2), limits)
+    solver = LevenbergMarquardt(evaluate, move, jnp.ones(2))
+    end = solver.iterate(solver.init(start), limits)
     assert int(end.result) == Result.SMALL_STEP
     assert int(end.iteration) <= 15
     assert float(jnp.max(jnp.abs(end.state[0]))) < 1e-4
