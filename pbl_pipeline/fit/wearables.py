@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
@@ -16,7 +18,7 @@ from pbl_pipeline.sensors.orientation import Orientation
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
 from pbl_pipeline.sensors.worn import SensorFit, input_error
 
-from .imu_term import MINUTE_S, error_of_sensors, segments_at
+from .imu_term import MINUTE_S, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
 from .session import LEVEL, Session
 from .term import At
@@ -26,7 +28,7 @@ from .term import At
 WOBBLE_DEG = {"pelvis": 2.0, "thigh": 2.7, "shank": 2.0, "foot": 2.5}
 MEMORY = 0.8
 #: Standard deviations (deg) of the vertical of a sensor's world, and of a camera's that was taken as level.
-LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 10.0
+LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
 #: Change of velocity (m/s) by which the mean acceleration of a short log tilts the vertical.
 SPEED_M_PER_S = {"pelvis": 0.3, "thigh": 0.7, "shank": 1.5, "foot": 2.5}
 #: Time (s) around a frame in which a sensor must have been measured: the clock's start may be off by so much.
@@ -40,7 +42,7 @@ def with_wearables(session: Session, p: Problem, start: State, dispersion: float
     """
     assert session.worn is not None
     sensors, body = session.worn.sensors, session.body
-    seen = [_moved(body, session, i, start, sensors) for i in range(len(session.arrays))]
+    seen = [_moved(body, session, i, start) for i in range(len(session.arrays))]
     clocks = [_clock(session, i, s) for i, s in enumerate(seen)]
     mounts = [wahba(_all_vectors(seen, clocks, sensor)) for sensor in sensors]
     m, frames, n = len(sensors), len(p.weight), len(p.has_phone)
@@ -97,13 +99,13 @@ def all_around(grid: np.ndarray, known: np.ndarray, time: np.ndarray) -> np.ndar
     return at(time - AROUND_S) & at(time + AROUND_S)
 
 
-def _moved(body: Body, session: Session, i: int, state: State, sensors: Sequence[Orientation]) -> Moved:
-    """The segments with sensors of a trial, from its first to its last frame that counts."""
+def _moved(body: Body, session: Session, i: int, state: State) -> Moved:
+    """The segments of a trial, from its first to its last frame that counts."""
     arrays, at = session.arrays[i], session.frames(i)
     first, last = np.flatnonzero(arrays.used)[[0, -1]]
     qpos = np.asarray(state.qpos, float)[at][first : last + 1]
     frames = body_frames(body, qpos, np.asarray(scale_multipliers(np.asarray(state.s, float))))
-    index = {s.log.segment: body.body_names.index(BODY_OF[s.log.segment]) for s in sensors}
+    index = {k: body.body_names.index(name) for k, name in BODY_OF.items()}
     return moved(
         arrays.time_s[first : last + 1],
         {k: frames.rotation[:, b] for k, b in index.items()},
@@ -148,15 +150,19 @@ def _speed_error(sensor: Orientation) -> float:
     return SPEED_M_PER_S[sensor.log.segment.split("_")[0]] / (9.81 * (sensor.span[1] - sensor.span[0]))
 
 
+@functools.partial(jax.jit, static_argnames="body")
+def _whitened(body: Body, p: Problem, end: State) -> Array:
+    none: Any = None
+    return whitened(At(p, none, end, none, none, None, segments_at(body, p, end)))[0]
+
+
 def sensor_fits(session: Session, p: Problem, end: State, width: float) -> tuple[SensorFit, ...]:
     """What a solution says of its sensors."""
     if session.worn is None:
         return ()
     worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
     assert worn is not None
-    empty: Any = None
-    at = At(p, empty, end, empty, empty, None, segments_at(session.body, p, end))
-    z = np.linalg.norm(np.asarray(error_of_sensors(at)), axis=-1)
+    z = np.linalg.norm(np.asarray(_whitened(session.body, p, end)), axis=-1)
     turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
     out = []
     for j, sensor in enumerate(session.worn.sensors):

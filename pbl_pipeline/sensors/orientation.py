@@ -38,12 +38,16 @@ class Orientation:
     runs: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     def at(self, time: Float[np.ndarray, " T"]) -> tuple[Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
-        """Quaternions at times (s of the log), and which of them were measured: those in the run that holds most."""
+        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in the run that holds
+        most of them."""
         inside = [(time >= t[0]) & (time <= t[-1]) for t, _ in self.runs]
         best = max(range(len(inside)), key=lambda i: int(inside[i].sum()))
         t, quat = self.runs[best]
         turns = Slerp(t, Rotation.from_quat(quat, scalar_first=True))(np.clip(time, t[0], t[-1]))
-        return turns.as_quat(scalar_first=True), inside[best]
+        quat = turns.as_quat(scalar_first=True)
+        jumps = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0, -1.0, 1.0)
+        quat[1:] *= np.cumprod(jumps)[:, None]
+        return quat, inside[best]
 
     @property
     def span(self) -> tuple[float, float]:
