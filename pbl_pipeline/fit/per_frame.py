@@ -124,19 +124,22 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
     if suspicious(session, found.end.state.qpos):
         turned = yield Task(p, _with_detector(start_of(session, flip=True), params), last=not twice)
         found = min(found, turned, key=lambda f: float(f.end.cost))
-    trace, told = found.trace, None
+    trace, told, moves_with = found.trace, None, ()
     if twice:
         p, start = _on_floor(session, found)
         if params.weight_pelvis > 0:
             p = with_augmented_pelvis(session, p, np.asarray(start.qpos), np.asarray(scale_multipliers(start.s)))
             told = np.asarray(p.c_pelvis)
         if session.worn is not None:
-            p, start = with_wearables(session, p, start, float(found.dispersion))
+            p, start, moves_with = with_wearables(session, p, start, float(found.dispersion))
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
-    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor)
-    return dataclasses.replace(_solution(session, params, found, trace, told), sensors=sensors)
+    solution = _solution(session, params, found, trace, told)
+    if session.worn is None:
+        return solution
+    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
+    return dataclasses.replace(solution, sensors=sensors)
 
 
 def start_of(session: Session, flip: bool = False) -> State:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import said
 from pbl_pipeline.sensors.orientation import Orientation
+from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
 from pbl_pipeline.sensors.worn import SensorFit, input_error
 
@@ -29,14 +30,18 @@ WOBBLE_DEG = {"pelvis": 2.0, "thigh": 2.7, "shank": 2.0, "foot": 2.5}
 MEMORY = 0.8
 #: Standard deviations (deg) of the vertical of a sensor's world, and of a camera's that was taken as level.
 LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
+#: Standard deviation (deg/s) of a gyroscope's bias, before and after a filter found it.
+BIAS_SD_DEG_S = 1.0, 0.4
 #: Change of velocity (m/s) by which the mean acceleration of a short log tilts the vertical.
 SPEED_M_PER_S = {"pelvis": 0.3, "thigh": 0.7, "shank": 1.5, "foot": 2.5}
 #: Time (s) around a frame in which a sensor must have been measured: the clock's start may be off by so much.
 AROUND_S = 0.05
 
 
-def with_wearables(session: Session, p: Problem, start: State, dispersion: float) -> tuple[Problem, State]:
-    """Add sensors to a problem, with their start by a solution without them.
+def with_wearables(
+    session: Session, p: Problem, start: State, dispersion: float
+) -> tuple[Problem, State, tuple[str, ...]]:
+    """Add sensors to a problem, with their start by a solution without them; and the segments they move with.
 
     Raises `PblError` FIT_INPUT: a log does not reach a trial.
     """
@@ -79,6 +84,7 @@ def with_wearables(session: Session, p: Problem, start: State, dispersion: float
         "mount": Rotation.from_matrix(mounts).as_quat(scalar_first=True),
         "world": world,
         "sd_rad": np.deg2rad([WOBBLE_DEG[k] for k in kinds]),
+        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[s.settled] for s in sensors]),
         "level_sd_rad": level,
         "tilt_sd_rad": np.pad(
             [np.deg2rad(TILT_SD_DEG) * (o == LEVEL) for o in session.orientation], (0, n - len(clocks))
@@ -90,7 +96,9 @@ def with_wearables(session: Session, p: Problem, start: State, dispersion: float
     index: Any = np.asarray([body.body_names.index(BODY_OF[s.log.segment]) for s in sensors], np.int32)
     zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
     wearables = Wearables(index, **{k: np.asarray(v, np.float32) for k, v in values.items()})
-    return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros))
+    longest = max(range(len(seen)), key=lambda i: len(seen[i].time))
+    moves_with = better_pairing(seen[longest], clocks[longest], sensors)
+    return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
 
 
 def all_around(grid: np.ndarray, known: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -156,10 +164,11 @@ def _whitened(body: Body, p: Problem, end: State) -> Array:
     return whitened(At(p, none, end, none, none, None, segments_at(body, p, end)))[0]
 
 
-def sensor_fits(session: Session, p: Problem, end: State, width: float) -> tuple[SensorFit, ...]:
+def sensor_fits(
+    session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
+) -> tuple[SensorFit, ...]:
     """What a solution says of its sensors."""
-    if session.worn is None:
-        return ()
+    assert session.worn is not None
     worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
     assert worn is not None
     z = np.linalg.norm(np.asarray(_whitened(session.body, p, end)), axis=-1)
@@ -177,6 +186,7 @@ def sensor_fits(session: Session, p: Problem, end: State, width: float) -> tuple
             SensorFit(
                 name=sensor.log.name,
                 segment=sensor.log.segment,
+                moves_with=moves_with[j],
                 mounting=turn(state.mount[j], worn.mount[j]).as_quat(scalar_first=True),
                 bias_rad_s=state.bias[j],
                 heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),

@@ -50,6 +50,11 @@ class Orientation:
         return quat, inside[best]
 
     @property
+    def settled(self) -> bool:
+        """True if the gyroscope's bias was found: by the filter, or by the sensor's own."""
+        return self.log.rate is None or min(t[-1] - t[0] for t, _ in self.runs) >= SETTLES_S
+
+    @property
     def span(self) -> tuple[float, float]:
         """First and last time (s of the log)."""
         return self.runs[0][0][0], self.runs[-1][0][-1]
@@ -98,6 +103,8 @@ def _filtered(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     if even[-1] - even[0] < SETTLES_S:
         turns = _strapdown(rate, acceleration, step)
     else:
+        # The filter turns by each rate over the time before its sample.
+        rate[1:] = 0.5 * (rate[:-1] + rate[1:])
         turns = Rotation.from_quat(offlineVQF(rate, acceleration, None, step)["quat6D"], scalar_first=True)
     return Slerp(even, turns)(time).as_quat(scalar_first=True)
 

@@ -25,6 +25,7 @@ class Worn:
 class SensorFit:
     """What a fit of N trials found of a sensor.
 
+    `moves_with`: the segment whose motion it shows, the stated one unless another is much more likely.
     `mounting`: rotation from its axes to the segment's (quaternion, scalar first); `bias_rad_s` (3,) of its gyroscope,
     beyond what its own filter took off; `heading_rad`, `tilt_rad` (N,): of its world in that of the trial's camera;
     `clock_s` (N,): its time at the video's time 0, and `gain` (N,): how much faster it runs, as a share; `z` (N,): root
@@ -34,6 +35,7 @@ class SensorFit:
 
     name: str
     segment: str
+    moves_with: str
     mounting: np.ndarray
     bias_rad_s: np.ndarray
     heading_rad: np.ndarray

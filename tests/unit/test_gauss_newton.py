@@ -291,6 +291,7 @@ def wearables(session: Session) -> Wearables:
         "mount": quats(2),
         "world": quats(trials, 2),
         "sd_rad": [0.3, 0.5],
+        "bias_sd_rad_s": [0.02, 0.05],
         "level_sd_rad": np.full((trials, 2), 0.1),
         "tilt_sd_rad": np.linspace(0, 0.2, trials),
         "middle_s": np.full(trials, 0.4),
