@@ -51,11 +51,12 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """End of an iteration, on the host; with the points there or, for the last one, the variances (F, U) of the frames'
+    """End of an iteration, on the host; with the keypoints' dispersion (`Linearised`) and the points there or, for the last one, the variances (F, U) of the frames'
     unknowns and the outcome."""
 
     end: Progress
     x: np.ndarray | None  # (F, P, 3)
+    dispersion: np.ndarray
     variance: np.ndarray | None = None
     outcome: Outcome | None = None
 
@@ -101,7 +102,8 @@ _finish_one = jax.jit(finish)
 
 def fetch(p: Problem, end: Progress, last: bool) -> Found:
     """Fetch the end of an iteration to the host."""
-    rest = (None, *_finish_one(p, end.latest, end.state.R_nc)) if last else (end.latest.x,)
+    rest = (None, end.latest.dispersion, *_finish_one(p, end.latest, end.state.R_nc))
+    rest = rest if last else (end.latest.x, end.latest.dispersion)
     return Found(*jax.device_get((_kept(end), *rest)))
 
 
@@ -227,13 +229,15 @@ def _round(
 @jax.jit
 def _finished(p: Problem, end: Progress) -> tuple[Any, ...]:
     """The fields of `Found` of last ends: copies, because the arrays of `end` are given away."""
-    return jax.tree.map(jnp.copy, (_kept(end), None, *jax.vmap(finish)(p, end.latest, end.state.R_nc)))
+    return jax.tree.map(
+        jnp.copy, (_kept(end), None, end.latest.dispersion, *jax.vmap(finish)(p, end.latest, end.state.R_nc))
+    )
 
 
 @jax.jit
 def _reached(end: Progress, at: Any) -> tuple[Any, ...]:
     """The fields of `Found` of some lanes whose ends are not the last."""
-    return _some((_kept(end), end.latest.x), at)
+    return _some((_kept(end), end.latest.x, end.latest.dispersion), at)
 
 
 @jax.jit
