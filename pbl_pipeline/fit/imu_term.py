@@ -121,6 +121,12 @@ def whitened(at: At) -> tuple[Float[Array, "F m 3"], Float[Array, "F m 3 17"]]:
     return size * here.r - tells * there.r, jnp.concatenate(by, axis=-1)
 
 
+def on_segments(at: At) -> Float[Array, "F m 3"]:
+    """The errors as rotation vectors in the axes of the segments (rad)."""
+    assert at.segments is not None
+    return jnp.einsum("fmij,fmi->fmj", at.segments.rotation, _errors(at).r)
+
+
 def _residual(at: At, z: Float[Array, "F m 17"]) -> Float[Array, "F m 3"]:
     """The whitened error after small changes z of what it depends on."""
     r, by = whitened(at)

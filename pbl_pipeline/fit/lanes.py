@@ -51,8 +51,8 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """End of an iteration, on the host; with the keypoints' dispersion (`Linearised`) and the points there or, for the last one, the variances (F, U) of the frames'
-    unknowns and the outcome."""
+    """End of an iteration, on the host; with the keypoints' dispersion (`Linearised`) and the points there or, for the
+    last one, the variances (F, U) of the frames' unknowns and the outcome."""
 
     end: Progress
     x: np.ndarray | None  # (F, P, 3)

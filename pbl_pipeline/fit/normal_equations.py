@@ -346,7 +346,7 @@ def _add_rows(sum_: _Blocks, rows: Rows, unknowns: Unknowns, at: At, soles: _Sol
 def _of_wearing(D: Float[Array, "F m E 11"], trials: Float[Array, "F N"]) -> Float[Array, "F m E _"]:
     """Derivatives by a sensor's mounting, world, bias and clock as those by the fields of `Wearing`."""
     frames, m, e, _ = D.shape
-    own, n = jnp.eye(m, dtype=D.dtype), trials.shape[1]
+    own = jnp.eye(m, dtype=D.dtype)
     mount, bias = (jnp.einsum("fmek,mj->fmejk", D[..., i : i + 3], own) for i in (0, 6))
     world = jnp.einsum("fmek,mj,fn->fmenjk", D[..., 3:6], own, trials)
     clock = jnp.einsum("fmek,fn->fmenk", D[..., 9:], trials)

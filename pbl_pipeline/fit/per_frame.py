@@ -56,7 +56,8 @@ def solve_per_frame(
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
     floor or the augmenter's pelvis, or sensors are worn, a first solution shows when each foot stands, what the
-    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available, its error takes the place of the solution.
+    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available,
+    its error takes the place of the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """

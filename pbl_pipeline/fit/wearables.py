@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import said
-from pbl_pipeline.sensors.orientation import Orientation
+from pbl_pipeline.sensors.orientation import Orientation, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
 from pbl_pipeline.sensors.worn import SensorFit, input_error
 
-from .imu_term import MINUTE_S, segments_at, whitened
+from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
 from .session import LEVEL, Session
 from .term import At
@@ -84,7 +84,7 @@ def with_wearables(
         "mount": Rotation.from_matrix(mounts).as_quat(scalar_first=True),
         "world": world,
         "sd_rad": np.deg2rad([WOBBLE_DEG[k] for k in kinds]),
-        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[s.settled] for s in sensors]),
+        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[int(s.settled)] for s in sensors]),
         "level_sd_rad": level,
         "tilt_sd_rad": np.pad(
             [np.deg2rad(TILT_SD_DEG) * (o == LEVEL) for o in session.orientation], (0, n - len(clocks))
@@ -159,9 +159,11 @@ def _speed_error(sensor: Orientation) -> float:
 
 
 @functools.partial(jax.jit, static_argnames="body")
-def _whitened(body: Body, p: Problem, end: State) -> Array:
+def _errors(body: Body, p: Problem, end: State) -> tuple[Array, Array]:
+    """Errors of the sensors (F, m, 3): whitened, and as turns on their segments."""
     none: Any = None
-    return whitened(At(p, none, end, none, none, None, segments_at(body, p, end)))[0]
+    at = At(p, none, end, none, none, None, segments_at(body, p, end))
+    return whitened(at)[0], on_segments(at)
 
 
 def sensor_fits(
@@ -171,17 +173,28 @@ def sensor_fits(
     assert session.worn is not None
     worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
     assert worn is not None
-    z = np.linalg.norm(np.asarray(_whitened(session.body, p, end)), axis=-1)
+    errors, turned = (np.asarray(a) for a in _errors(session.body, p, end))
+    z = np.linalg.norm(errors, axis=-1)
     turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
-    out = []
+    trials, out = range(len(session.arrays)), []
+
+    def of_trial(i: int, j: int) -> tuple[float, ...]:
+        """z, share dropped, slip and rate."""
+        at, used = session.frames(i), session.arrays[i].used
+        measured = np.asarray(worn.count)[at, j] > 0
+        size, off = z[at, j][measured], turned[at, j][measured]
+        if not len(size):
+            return np.nan, 1.0, np.nan, np.nan
+        third = -(-len(off) // 3)
+        slip = np.linalg.norm(off[-third:].mean(axis=0) - off[:third].mean(axis=0))
+        first, last = (int((t + CLOCK_RANGE_S) / SAMPLE_S) for t in (0.0, 2 * float(worn.middle_s[i])))
+        rate = rate_of(np.asarray(worn.quat_wxyz, float)[i, j, first : last + 1])
+        dropped = 1 - np.sum(size < width) / np.sum(used)
+        return np.sqrt(np.mean(size**2) / 3), dropped, slip, np.sqrt(np.mean(np.sum(rate**2, axis=1)))
+
     for j, sensor in enumerate(session.worn.sensors):
-        trials = range(len(session.arrays))
-        worlds = [turn(state.world[i, j], worn.world[i, j]) for i in trials]
-        R = np.stack([w.as_matrix() for w in worlds])
-        frames = [session.frames(i) for i in trials]
-        measured = [np.asarray(worn.count)[f, j] > 0 for f in frames]
-        used = [session.arrays[i].used for i in trials]
-        good = [m & (z[f, j] < width) for f, m in zip(frames, measured, strict=True)]
+        R = np.stack([turn(state.world[i, j], worn.world[i, j]).as_matrix() for i in trials])
+        each = np.array([of_trial(i, j) for i in trials])
         out.append(
             SensorFit(
                 name=sensor.log.name,
@@ -191,15 +204,12 @@ def sensor_fits(
                 bias_rad_s=state.bias[j],
                 heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),
                 tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1, 1)),
-                clock_s=np.asarray([worn.clock_s[i] + state.clock[i, 0] for i in trials]),
-                gain=np.asarray([state.clock[i, 1] / MINUTE_S for i in trials]),
-                z=np.asarray(
-                    [
-                        np.sqrt(np.mean(z[f, j][k] ** 2) / 3) if k.any() else np.nan
-                        for f, k in zip(frames, measured, strict=True)
-                    ]
-                ),
-                dropped=np.asarray([1 - np.sum(g & u) / np.sum(u) for g, u in zip(good, used, strict=True)]),
+                clock_s=worn.clock_s[: len(trials)] + state.clock[: len(trials), 0],
+                gain=state.clock[: len(trials), 1] / MINUTE_S,
+                z=each[:, 0],
+                dropped=each[:, 1],
+                slip_rad=each[:, 2],
+                rate_rad_s=each[:, 3],
             )
         )
     return tuple(out)

@@ -38,8 +38,8 @@ class Orientation:
     runs: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     def at(self, time: Float[np.ndarray, " T"]) -> tuple[Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
-        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in the run that holds
-        most of them."""
+        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in the run that
+        holds most of them."""
         inside = [(time >= t[0]) & (time <= t[-1]) for t, _ in self.runs]
         best = max(range(len(inside)), key=lambda i: int(inside[i].sum()))
         t, quat = self.runs[best]
@@ -64,7 +64,7 @@ def oriented(log: SensorLog) -> Orientation:
     """Return the orientation of a sensor: from rate and acceleration by a filter that runs over the log in both
     directions and estimates the gyroscope's bias (VQF, Laidig and Seel, Information Fusion 91, 2023), else its own.
 
-    Raises `PblError` SENSOR_LOG: neither is there, or no run of samples is long enough.
+    Raises `PblError` FIT_INPUT: neither is there, or no run of samples is long enough.
     """
     inertial = log.rate is not None and log.acceleration is not None
     if not inertial and log.orientation is None:
@@ -125,7 +125,7 @@ def _without_jumps(quat: np.ndarray) -> np.ndarray:
 
 def _log_error(log: SensorLog, found: str, expected: str) -> PblError:
     return PblError(
-        "SENSOR_LOG",
+        "FIT_INPUT",
         found=said("sensor {name} on {segment}: {found}", name=log.name, segment=log.segment, found=found),
         expected=expected,
         next_step="see docs/imu.md for what a log holds",

@@ -9,12 +9,13 @@ recording's mean in brackets) of hip flexion, adduction and rotation, knee and a
 of the video's; the share of samples in 90 % intervals; the largest error of the clock; the ratio of the times.
 Then pairings: shares of exchanged and wrong segments that are named, and of right ones.
 
-The wobble of the sensors is the fit's own idea of soft tissue (`research/walker/sensors.py`). Exit code 1 where a bar is
-missed.
+The wobble of the sensors is the fit's own idea of soft tissue (`research/walker/sensors.py`). Exit code 1 where a bar
+is missed.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Mapping
@@ -80,8 +81,6 @@ def pairings(fit: SessionFit, truth: Truth, seed: int, wobble: float) -> tuple[l
 
     def found(names: Mapping[str, str]) -> bool:
         """True if sensors, by true segment, that are stated to be elsewhere are found on their own."""
-        import dataclasses
-
         stated = [
             dataclasses.replace(sensors[k], log=dataclasses.replace(sensors[k].log, segment=v))
             for k, v in names.items()
@@ -142,7 +141,7 @@ def main(seeds: int, first: int, wobble: float, views: str, params: str) -> None
             worst = float(np.max(np.abs(clocks[name])))
             numbers = " ".join(
                 f"{r:5.1f} ({s:4.1f}) {q:4.2f} {100 * i:3.0f} %"
-                for r, s, q, i in zip(rms[name], of_shape, ratio, share)
+                for r, s, q, i in zip(rms[name], of_shape, ratio, share, strict=True)
             )
             click.echo(f"{view:9s}{name:15s}{numbers}  clock {1000 * worst:4.1f} ms  time {slower:4.2f}")
             for angle, q, i in zip(ANGLES, ratio, share, strict=True):

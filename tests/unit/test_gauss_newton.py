@@ -371,7 +371,9 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     pairs["floor"] = (at.h[k : k + 6], want_h[k : k + 6])
     if state.wearing is not None:
         end = -sum(a.size for a in jax.tree.leaves(state.wearing))
-        pairs |= {f.name: (a, b) for f, a, b in zip(dataclasses.fields(Wearing), *map(parts, (at.h, want_h)))}
+        pairs |= {
+            f.name: (a, b) for f, a, b in zip(dataclasses.fields(Wearing), parts(at.h), parts(want_h), strict=True)
+        }
         at, want_h = dataclasses.replace(at, h=at.h[:end]), want_h[:end]
     if detector:
         own, want = (h[k + 6 :].reshape(2, -1) for h in (at.h, want_h))
