@@ -36,7 +36,7 @@ from .session import Session
 from .solution import Solution
 from .solvers.gauss_newton import Limits, Progress
 from .solvers.result import Result
-from .wearables import sensor_fits, with_wearables
+from .wearables import floor_shares, sensor_fits, with_wearables
 from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -226,6 +226,8 @@ def _solution(
     """The solution, without the time it took."""
     state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
+    if session.worn is not None:
+        floor = floor * floor_shares(names, [s.log.segment for s in session.worn.sensors])
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
@@ -36,6 +36,25 @@ BIAS_SD_DEG_S = 1.0, 0.4
 SPEED_M_PER_S = {"pelvis": 0.3, "thigh": 0.7, "shank": 1.5, "foot": 2.5}
 #: Time (s) around a frame in which a sensor must have been measured: the clock's start may be off by so much.
 AROUND_S = 0.05
+
+
+#: Joints by the beginning of their names -> the segments on their two sides, "_r" and "_l" left out.
+SEGMENTS_OF = {"hip_": ("pelvis", "thigh"), "knee_": ("thigh", "shank"), "ankle_": ("shank", "foot")}
+#: Share of a joint's least standard deviation that is left where sensors are on none, one and both of its segments:
+#: about the share of the error that a prototype left on four synthetic persons from the front and the side.
+FLOOR_SHARES = 1.0, 0.85, 0.65
+
+
+def floor_shares(joint_names: Sequence[str], segments: Sequence[str]) -> Float[np.ndarray, " Q"]:
+    """Shares of the joints' least standard deviations that are left with sensors on some segments: a detector's errors
+    change over a trial, and sensors show how the angles change."""
+    out = np.ones(len(joint_names))
+    for i, name in enumerate(joint_names):
+        for start, sides in SEGMENTS_OF.items():
+            if name.startswith(start):
+                n = sum(k in segments or f"{k}{name[-2:]}" in segments for k in sides)
+                out[i] = FLOOR_SHARES[n]
+    return out
 
 
 def with_wearables(

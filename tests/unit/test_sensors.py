@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import body_frames, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit.checks import _sensors
+from pbl_pipeline.fit.wearables import floor_shares
 from pbl_pipeline.qc import FAIL, PASS, WARN
 from pbl_pipeline.sensors.log import SEGMENTS, SensorLog
 from pbl_pipeline.sensors.orientation import oriented
@@ -145,3 +146,9 @@ def test_what_is_wrong_is_said(more, check, outcome):
         assert checks[check].outcome == outcome
         assert "shank_r" in checks[check].advice or check == "sensor_rate_rad_s"
     assert _sensors(()) == []
+
+
+def test_least_standard_deviations_fall_where_both_segments_have_sensors():
+    names = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "ankle_angle_r", "lumbar_bending")
+    shares = floor_shares(names, ["pelvis", "thigh_r", "shank_r"])
+    assert shares.tolist() == [0.65, 0.85, 0.65, 0.85, 1.0]
