@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
+from pbl_pipeline.sensors.worn import SensorFit
 
 from .augmented_pelvis import folds
 from .initial_pose import pelvis_path
@@ -30,6 +31,10 @@ LIMIT_MARGIN_RAD, LIMIT_SHARE = np.deg2rad(1.0), 0.2
 #: to 0.14 were within 1 deg (median) of those after three times the steps, after 0.16 to 0.28 within 2 deg.
 FALL_WARN, TRACE_NEEDED = 0.2, 8
 CLOCK_WARN_S = 0.3
+#: Of wearable sensors: error in standard deviations, share of frames, turn on the segment, bias, and the least angular
+#: velocity (rad/s, root mean square) that shows how a sensor sits: people who walk have 1 and more.
+SENSOR_Z_WARN, SENSOR_DROPPED_WARN, SENSOR_SLIP_WARN_DEG = 1.7, 0.2, 6.0
+SENSOR_BIAS_WARN_DEG_S, SENSOR_RATE_WARN = 3.0, 0.3
 #: Standard deviation of the focal length as a share of it, which is also that of depth and of the person's size.
 FOCAL_SD_WARN = 0.02
 
@@ -67,8 +72,72 @@ def check_fit(
         checks += _pelvis_told(session, trials, solution.pelvis_told)
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
+    checks += _sensors(solution.sensors)
     # Only a check that did not pass has advice.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
+
+
+def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
+    """Checks of wearable sensors; empty if there are none."""
+    if not sensors:
+        return []
+    elsewhere = ", ".join(f"{s.segment} (moves like {s.moves_with})" for s in sensors if s.moves_with != s.segment)
+    n = sum(s.moves_with != s.segment for s in sensors)
+    moved = max(float(np.nanmax(s.rate_rad_s)) for s in sensors)
+
+    def each(values: Sequence[np.ndarray], most: float) -> tuple[float, str]:
+        """The largest value, and the sensors whose value is above the most."""
+        worst = [float(np.max(np.where(np.isnan(v), np.inf, v))) for v in values]
+        return max(worst), ", ".join(s.segment for s, w in zip(sensors, worst, strict=True) if w > most)
+
+    z, loose = each([s.z for s in sensors], SENSOR_Z_WARN)
+    dropped, lost = each([s.dropped for s in sensors], SENSOR_DROPPED_WARN)
+    slip, slipped = each([np.rad2deg(s.slip_rad) for s in sensors], SENSOR_SLIP_WARN_DEG)
+    bias, drifting = each([np.rad2deg(np.abs(s.bias_rad_s)) for s in sensors], SENSOR_BIAS_WARN_DEG_S)
+    return [
+        Check(
+            "sensors_on_another_segment",
+            FAIL if n else PASS,
+            float(n),
+            0.0,
+            f"sensors move like other segments than stated, or sides were exchanged: {elsewhere}",
+        ),
+        warn_if(
+            loose,
+            "sensor_misfit_sd",
+            z,
+            SENSOR_Z_WARN,
+            f"sensors move otherwise than their segments: {loose}; loose, on another person, or of another recording",
+        ),
+        warn_if(
+            slipped,
+            "sensor_slip_deg",
+            slip,
+            SENSOR_SLIP_WARN_DEG,
+            f"sensors turned on their segments during the recording: {slipped}; fix them and record again",
+        ),
+        warn_if(
+            lost,
+            "sensor_share_dropped",
+            dropped,
+            SENSOR_DROPPED_WARN,
+            f"sensors did not measure in many of the frames, or do not fit there: {lost}",
+        ),
+        warn_if(
+            drifting,
+            "sensor_bias_deg_s",
+            bias,
+            SENSOR_BIAS_WARN_DEG_S,
+            f"gyroscopes drift: {drifting}; let the sensors lie still for some seconds before they are put on",
+        ),
+        warn_if(
+            moved < SENSOR_RATE_WARN,
+            "sensor_rate_rad_s",
+            moved,
+            SENSOR_RATE_WARN,
+            "a person who hardly moves does not show how the sensors sit, nor their clock: they add next to nothing",
+        ),
+    ]
 
 
 def _median(values: np.ndarray) -> np.ndarray:

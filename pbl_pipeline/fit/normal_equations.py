@@ -30,7 +30,7 @@ from .feet_terms import later
 from .imu_term import segments_at
 from .joint_terms import shift
 from .keypoint_terms import mean_weights
-from .linearised import times
+from .linearised import cross_matrix, times
 from .objective import TERMS
 from .phone_term import phone_at
 from .problem import Problem, State, frames_at
@@ -213,7 +213,7 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     p, x, U = at.problem, jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
-        by_frame.append(_cross_matrix(x))  # a camera that turns sees every point turn the other way
+        by_frame.append(cross_matrix(x))  # a camera that turns sees every point turn the other way
     A = jnp.concatenate([*by_frame, jac.per_scale], axis=-1)
     n_s, n = jac.per_scale.shape[-1], A.shape[-1]
     q = n - n_s
@@ -296,12 +296,6 @@ def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Ar
     return jnp.concatenate([*parts, zeros(size - end)], axis=-1)
 
 
-def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
-    zero = jnp.zeros_like(x[..., 0])
-    a, b, c = x[..., 0], x[..., 1], x[..., 2]
-    return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
-
-
 # --- all other terms
 
 
@@ -352,7 +346,7 @@ def _add_rows(sum_: _Blocks, rows: Rows, unknowns: Unknowns, at: At, soles: _Sol
 def _of_wearing(D: Float[Array, "F m E 11"], trials: Float[Array, "F N"]) -> Float[Array, "F m E _"]:
     """Derivatives by a sensor's mounting, world, bias and clock as those by the fields of `Wearing`."""
     frames, m, e, _ = D.shape
-    own, n = jnp.eye(m, dtype=D.dtype), trials.shape[1]
+    own = jnp.eye(m, dtype=D.dtype)
     mount, bias = (jnp.einsum("fmek,mj->fmejk", D[..., i : i + 3], own) for i in (0, 6))
     world = jnp.einsum("fmek,mj,fn->fmenjk", D[..., 3:6], own, trials)
     clock = jnp.einsum("fmek,fn->fmenk", D[..., 9:], trials)

@@ -147,10 +147,9 @@ class GaussNewtonParams:
     #: Wearable sensors (`imu_term.py`): half squares in standard deviations, as many keypoint residuals' as they are.
     weight_sensor: float = later(1.0)
     huber_sensor: float = later(3.0)
-    #: Standard deviations of a sensor's position on its segment when these are found from the video (deg), the
-    #: gyroscope's bias (deg/s), and the clock's start (s) and gain in a minute (s).
+    #: Standard deviations of how a sensor sits on its segment, found from the video (deg), and of the clock's start (s)
+    #: and gain in a minute (s).
     mount_sd_deg: float = later(20.0)
-    bias_sd_deg_s: float = later(1.0)
     sensor_clock_sd_s: float = later(0.2)
     sensor_gain_sd_s: float = later(0.006)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR

@@ -36,7 +36,7 @@ from .session import Session
 from .solution import Solution
 from .solvers.gauss_newton import Limits, Progress
 from .solvers.result import Result
-from .wearables import sensor_fits, with_wearables
+from .wearables import floor_shares, sensor_fits, with_wearables
 from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -56,7 +56,8 @@ def solve_per_frame(
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
     floor or the augmenter's pelvis, or sensors are worn, a first solution shows when each foot stands, what the
-    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available, its error takes the place of the solution.
+    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available,
+    its error takes the place of the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
@@ -124,19 +125,22 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
     if suspicious(session, found.end.state.qpos):
         turned = yield Task(p, _with_detector(start_of(session, flip=True), params), last=not twice)
         found = min(found, turned, key=lambda f: float(f.end.cost))
-    trace, told = found.trace, None
+    trace, told, moves_with = found.trace, None, ()
     if twice:
         p, start = _on_floor(session, found)
         if params.weight_pelvis > 0:
             p = with_augmented_pelvis(session, p, np.asarray(start.qpos), np.asarray(scale_multipliers(start.s)))
             told = np.asarray(p.c_pelvis)
         if session.worn is not None:
-            p, start = with_wearables(session, p, start, float(found.dispersion))
+            p, start, moves_with = with_wearables(session, p, start, float(found.dispersion))
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
-    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor)
-    return dataclasses.replace(_solution(session, params, found, trace, told), sensors=sensors)
+    solution = _solution(session, params, found, trace, told)
+    if session.worn is None:
+        return solution
+    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
+    return dataclasses.replace(solution, sensors=sensors)
 
 
 def start_of(session: Session, flip: bool = False) -> State:
@@ -222,6 +226,8 @@ def _solution(
     """The solution, without the time it took."""
     state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
+    if session.worn is not None:
+        floor = floor * floor_shares(names, [s.log.segment for s in session.worn.sensors])
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)

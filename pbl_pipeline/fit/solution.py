@@ -40,8 +40,8 @@ class Solution:
     qpos in m and rad; R_nc: camera to world; s: the paper's scale parameters; scale: their multipliers; clock_s: sensor
     time minus video time of each trial, 0 where not estimated; loss_trace: (step, loss) of K steps; qpos_sd: standard
     deviations, None if the solver computes none; pelvis_told: 1 in frames with the augmenter's tilt of the pelvis, None
-    if the method does not use it; metre: metres of the solution in one of the fit; sensors: what was found of those that
-    are worn; result: reason why the solver ended.
+    if the method does not use it; metre: metres of the solution in one of the fit; sensors: what was found of those
+    worn; result: reason why the solver ended.
     """
 
     qpos: Float[np.ndarray, "F Q"]

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import said
-from pbl_pipeline.sensors.orientation import Orientation
+from pbl_pipeline.sensors.orientation import Orientation, rate_of
+from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
 from pbl_pipeline.sensors.worn import SensorFit, input_error
 
-from .imu_term import MINUTE_S, error_of_sensors, segments_at
+from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
 from .session import LEVEL, Session
 from .term import At
@@ -26,21 +29,44 @@ from .term import At
 WOBBLE_DEG = {"pelvis": 2.0, "thigh": 2.7, "shank": 2.0, "foot": 2.5}
 MEMORY = 0.8
 #: Standard deviations (deg) of the vertical of a sensor's world, and of a camera's that was taken as level.
-LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 10.0
+LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
+#: Standard deviation (deg/s) of a gyroscope's bias, before and after a filter found it.
+BIAS_SD_DEG_S = 1.0, 0.4
 #: Change of velocity (m/s) by which the mean acceleration of a short log tilts the vertical.
 SPEED_M_PER_S = {"pelvis": 0.3, "thigh": 0.7, "shank": 1.5, "foot": 2.5}
 #: Time (s) around a frame in which a sensor must have been measured: the clock's start may be off by so much.
 AROUND_S = 0.05
 
 
-def with_wearables(session: Session, p: Problem, start: State, dispersion: float) -> tuple[Problem, State]:
-    """Add sensors to a problem, with their start by a solution without them.
+#: Joints by the beginning of their names -> the segments on their two sides, "_r" and "_l" left out.
+SEGMENTS_OF = {"hip_": ("pelvis", "thigh"), "knee_": ("thigh", "shank"), "ankle_": ("shank", "foot")}
+#: Share of a joint's least standard deviation that is left where sensors are on none, one and both of its segments:
+#: about the share of the error that a prototype left on four synthetic persons from the front and the side.
+FLOOR_SHARES = 1.0, 0.85, 0.65
+
+
+def floor_shares(joint_names: Sequence[str], segments: Sequence[str]) -> Float[np.ndarray, " Q"]:
+    """Shares of the joints' least standard deviations that are left with sensors on some segments: a detector's errors
+    change over a trial, and sensors show how the angles change."""
+    out = np.ones(len(joint_names))
+    for i, name in enumerate(joint_names):
+        for start, sides in SEGMENTS_OF.items():
+            if name.startswith(start):
+                n = sum(k in segments or f"{k}{name[-2:]}" in segments for k in sides)
+                out[i] = FLOOR_SHARES[n]
+    return out
+
+
+def with_wearables(
+    session: Session, p: Problem, start: State, dispersion: float
+) -> tuple[Problem, State, tuple[str, ...]]:
+    """Add sensors to a problem, with their start by a solution without them; and the segments they move with.
 
     Raises `PblError` FIT_INPUT: a log does not reach a trial.
     """
     assert session.worn is not None
     sensors, body = session.worn.sensors, session.body
-    seen = [_moved(body, session, i, start, sensors) for i in range(len(session.arrays))]
+    seen = [_moved(body, session, i, start) for i in range(len(session.arrays))]
     clocks = [_clock(session, i, s) for i, s in enumerate(seen)]
     mounts = [wahba(_all_vectors(seen, clocks, sensor)) for sensor in sensors]
     m, frames, n = len(sensors), len(p.weight), len(p.has_phone)
@@ -77,6 +103,7 @@ def with_wearables(session: Session, p: Problem, start: State, dispersion: float
         "mount": Rotation.from_matrix(mounts).as_quat(scalar_first=True),
         "world": world,
         "sd_rad": np.deg2rad([WOBBLE_DEG[k] for k in kinds]),
+        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[int(s.settled)] for s in sensors]),
         "level_sd_rad": level,
         "tilt_sd_rad": np.pad(
             [np.deg2rad(TILT_SD_DEG) * (o == LEVEL) for o in session.orientation], (0, n - len(clocks))
@@ -88,7 +115,9 @@ def with_wearables(session: Session, p: Problem, start: State, dispersion: float
     index: Any = np.asarray([body.body_names.index(BODY_OF[s.log.segment]) for s in sensors], np.int32)
     zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
     wearables = Wearables(index, **{k: np.asarray(v, np.float32) for k, v in values.items()})
-    return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros))
+    longest = max(range(len(seen)), key=lambda i: len(seen[i].time))
+    moves_with = better_pairing(seen[longest], clocks[longest], sensors)
+    return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
 
 
 def all_around(grid: np.ndarray, known: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -97,13 +126,13 @@ def all_around(grid: np.ndarray, known: np.ndarray, time: np.ndarray) -> np.ndar
     return at(time - AROUND_S) & at(time + AROUND_S)
 
 
-def _moved(body: Body, session: Session, i: int, state: State, sensors: Sequence[Orientation]) -> Moved:
-    """The segments with sensors of a trial, from its first to its last frame that counts."""
+def _moved(body: Body, session: Session, i: int, state: State) -> Moved:
+    """The segments of a trial, from its first to its last frame that counts."""
     arrays, at = session.arrays[i], session.frames(i)
     first, last = np.flatnonzero(arrays.used)[[0, -1]]
     qpos = np.asarray(state.qpos, float)[at][first : last + 1]
     frames = body_frames(body, qpos, np.asarray(scale_multipliers(np.asarray(state.s, float))))
-    index = {s.log.segment: body.body_names.index(BODY_OF[s.log.segment]) for s in sensors}
+    index = {k: body.body_names.index(name) for k, name in BODY_OF.items()}
     return moved(
         arrays.time_s[first : last + 1],
         {k: frames.rotation[:, b] for k, b in index.items()},
@@ -148,42 +177,58 @@ def _speed_error(sensor: Orientation) -> float:
     return SPEED_M_PER_S[sensor.log.segment.split("_")[0]] / (9.81 * (sensor.span[1] - sensor.span[0]))
 
 
-def sensor_fits(session: Session, p: Problem, end: State, width: float) -> tuple[SensorFit, ...]:
+@functools.partial(jax.jit, static_argnames="body")
+def _errors(body: Body, p: Problem, end: State) -> tuple[Array, Array]:
+    """Errors of the sensors (F, m, 3): whitened, and as turns on their segments."""
+    none: Any = None
+    at = At(p, none, end, none, none, None, segments_at(body, p, end))
+    return whitened(at)[0], on_segments(at)
+
+
+def sensor_fits(
+    session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
+) -> tuple[SensorFit, ...]:
     """What a solution says of its sensors."""
-    if session.worn is None:
-        return ()
+    assert session.worn is not None
     worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
     assert worn is not None
-    empty: Any = None
-    at = At(p, empty, end, empty, empty, None, segments_at(session.body, p, end))
-    z = np.linalg.norm(np.asarray(error_of_sensors(at)), axis=-1)
+    errors, turned = (np.asarray(a) for a in _errors(session.body, p, end))
+    z = np.linalg.norm(errors, axis=-1)
     turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
-    out = []
+    trials, out = range(len(session.arrays)), []
+
+    def of_trial(i: int, j: int) -> tuple[float, ...]:
+        """z, share dropped, slip and rate."""
+        at, used = session.frames(i), session.arrays[i].used
+        measured = np.asarray(worn.count)[at, j] > 0
+        size, off = z[at, j][measured], turned[at, j][measured]
+        if not len(size):
+            return np.nan, 1.0, np.nan, np.nan
+        third = -(-len(off) // 3)
+        slip = np.linalg.norm(off[-third:].mean(axis=0) - off[:third].mean(axis=0))
+        first, last = (int((t + CLOCK_RANGE_S) / SAMPLE_S) for t in (0.0, 2 * float(worn.middle_s[i])))
+        rate = rate_of(np.asarray(worn.quat_wxyz, float)[i, j, first : last + 1])
+        dropped = 1 - np.sum(size < width) / np.sum(used)
+        return np.sqrt(np.mean(size**2) / 3), dropped, slip, np.sqrt(np.mean(np.sum(rate**2, axis=1)))
+
     for j, sensor in enumerate(session.worn.sensors):
-        trials = range(len(session.arrays))
-        worlds = [turn(state.world[i, j], worn.world[i, j]) for i in trials]
-        R = np.stack([w.as_matrix() for w in worlds])
-        frames = [session.frames(i) for i in trials]
-        measured = [np.asarray(worn.count)[f, j] > 0 for f in frames]
-        used = [session.arrays[i].used for i in trials]
-        good = [m & (z[f, j] < width) for f, m in zip(frames, measured, strict=True)]
+        R = np.stack([turn(state.world[i, j], worn.world[i, j]).as_matrix() for i in trials])
+        each = np.array([of_trial(i, j) for i in trials])
         out.append(
             SensorFit(
                 name=sensor.log.name,
                 segment=sensor.log.segment,
+                moves_with=moves_with[j],
                 mounting=turn(state.mount[j], worn.mount[j]).as_quat(scalar_first=True),
                 bias_rad_s=state.bias[j],
                 heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),
                 tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1, 1)),
-                clock_s=np.asarray([worn.clock_s[i] + state.clock[i, 0] for i in trials]),
-                gain=np.asarray([state.clock[i, 1] / MINUTE_S for i in trials]),
-                z=np.asarray(
-                    [
-                        np.sqrt(np.mean(z[f, j][k] ** 2) / 3) if k.any() else np.nan
-                        for f, k in zip(frames, measured, strict=True)
-                    ]
-                ),
-                dropped=np.asarray([1 - np.sum(g & u) / np.sum(u) for g, u in zip(good, used, strict=True)]),
+                clock_s=worn.clock_s[: len(trials)] + state.clock[: len(trials), 0],
+                gain=state.clock[: len(trials), 1] / MINUTE_S,
+                z=each[:, 0],
+                dropped=each[:, 1],
+                slip_rad=each[:, 2],
+                rate_rad_s=each[:, 3],
             )
         )
     return tuple(out)

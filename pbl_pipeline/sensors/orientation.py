@@ -38,12 +38,21 @@ class Orientation:
     runs: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     def at(self, time: Float[np.ndarray, " T"]) -> tuple[Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
-        """Quaternions at times (s of the log), and which of them were measured: those in the run that holds most."""
+        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in the run that
+        holds most of them."""
         inside = [(time >= t[0]) & (time <= t[-1]) for t, _ in self.runs]
         best = max(range(len(inside)), key=lambda i: int(inside[i].sum()))
         t, quat = self.runs[best]
         turns = Slerp(t, Rotation.from_quat(quat, scalar_first=True))(np.clip(time, t[0], t[-1]))
-        return turns.as_quat(scalar_first=True), inside[best]
+        quat = turns.as_quat(scalar_first=True)
+        jumps = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0, -1.0, 1.0)
+        quat[1:] *= np.cumprod(jumps)[:, None]
+        return quat, inside[best]
+
+    @property
+    def settled(self) -> bool:
+        """True if the gyroscope's bias was found: by the filter, or by the sensor's own."""
+        return self.log.rate is None or min(t[-1] - t[0] for t, _ in self.runs) >= SETTLES_S
 
     @property
     def span(self) -> tuple[float, float]:
@@ -55,7 +64,7 @@ def oriented(log: SensorLog) -> Orientation:
     """Return the orientation of a sensor: from rate and acceleration by a filter that runs over the log in both
     directions and estimates the gyroscope's bias (VQF, Laidig and Seel, Information Fusion 91, 2023), else its own.
 
-    Raises `PblError` SENSOR_LOG: neither is there, or no run of samples is long enough.
+    Raises `PblError` FIT_INPUT: neither is there, or no run of samples is long enough.
     """
     inertial = log.rate is not None and log.acceleration is not None
     if not inertial and log.orientation is None:
@@ -94,6 +103,8 @@ def _filtered(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     if even[-1] - even[0] < SETTLES_S:
         turns = _strapdown(rate, acceleration, step)
     else:
+        # The filter turns by each rate over the time before its sample.
+        rate[1:] = 0.5 * (rate[:-1] + rate[1:])
         turns = Rotation.from_quat(offlineVQF(rate, acceleration, None, step)["quat6D"], scalar_first=True)
     return Slerp(even, turns)(time).as_quat(scalar_first=True)
 
@@ -114,7 +125,7 @@ def _without_jumps(quat: np.ndarray) -> np.ndarray:
 
 def _log_error(log: SensorLog, found: str, expected: str) -> PblError:
     return PblError(
-        "SENSOR_LOG",
+        "FIT_INPUT",
         found=said("sensor {name} on {segment}: {found}", name=log.name, segment=log.segment, found=found),
         expected=expected,
         next_step="see docs/imu.md for what a log holds",

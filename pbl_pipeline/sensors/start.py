@@ -29,10 +29,12 @@ BODY_OF = {
 }
 #: Low pass of rates and accelerations (s, standard deviation of a Gaussian): a video's are noise above 5 Hz.
 SMOOTH_S, SMOOTH_SLOW_S = 0.03, 0.06
+#: Beside the ends of a recording, second differences of smoothed places are wrong (s).
+EDGE_S = 0.2
 #: Search around a stated clock (s), and finer steps around the best.
 RANGE_S, FINE_S = 0.5, 0.15
 #: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
-RATE_SD, UP_SD, ACCELERATION_SD = 0.8, np.deg2rad(6.0), 2.0
+RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,16 +56,17 @@ def moved(
     """Resample the segments of a recording to even times."""
     even = np.arange(time[0], time[-1], SAMPLE_S)
     turned = {k: Slerp(time, Rotation.from_matrix(R))(even) for k, R in rotation.items()}
-    rates = {k: _smooth(rate_of(r.as_quat(scalar_first=True))) for k, r in turned.items()}
+    rates = {k: smooth(rate_of(r.as_quat(scalar_first=True))) for k, r in turned.items()}
     places = {k: np.stack([np.interp(even, time, v) for v in x.T], axis=1) for k, x in position.items()}
     second = {
-        k: np.gradient(np.gradient(_smooth(x, SMOOTH_SLOW_S), SAMPLE_S, axis=0), SAMPLE_S, axis=0)
+        k: np.gradient(np.gradient(smooth(x, SMOOTH_SLOW_S), SAMPLE_S, axis=0), SAMPLE_S, axis=0)
         for k, x in places.items()
     }
     return Moved(even, {k: r.as_matrix() for k, r in turned.items()}, rates, second)
 
 
-def _smooth(x: np.ndarray, sd_s: float = SMOOTH_S) -> np.ndarray:
+def smooth(x: np.ndarray, sd_s: float = SMOOTH_S) -> np.ndarray:
+    """Low pass of values at every `SAMPLE_S`."""
     return gaussian_filter1d(x, sd_s / SAMPLE_S, axis=0, mode="nearest")
 
 
@@ -101,7 +104,7 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
 
 def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
     quat, known = sensor.at(time)
-    return np.where(known[:, None], _smooth(rate_of(quat)), 0.0)
+    return np.where(known[:, None], smooth(rate_of(quat)), 0.0)
 
 
 def _correlation(long: np.ndarray, short: np.ndarray) -> np.ndarray:
@@ -129,17 +132,25 @@ def vectors(seen: Moved, clock: float, sensor: Orientation, segment: str) -> lis
     """Pairs of vectors (T, 3) over their errors, in the axes of the segment and of the sensor: rates and verticals."""
     quat, known = sensor.at(seen.time + clock)
     up = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]
-    pairs = [(seen.rate[segment], _smooth(rate_of(quat)), RATE_SD), (seen.rotation[segment][:, 2], up, UP_SD)]
+    pairs = [(seen.rate[segment], smooth(rate_of(quat)), RATE_SD), (seen.rotation[segment][:, 2], up, UP_SD)]
     if segment == "pelvis" and sensor.log.acceleration is not None:
-        felt = _level_acceleration(sensor, seen.time + clock)
-        ours = seen.acceleration[segment] * [1, 1, 0]
-        ours = np.einsum("tji,tj->ti", seen.rotation[segment], ours)
-        pairs.append((ours, Rotation.from_quat(quat, scalar_first=True).inv().apply(felt), ACCELERATION_SD))
+        turn = Rotation.from_rotvec([0.0, 0.0, _heading(seen, sensor, seen.time + clock, known)])
+        ahead = (turn * Rotation.from_quat(quat, scalar_first=True)).as_matrix()[:, 0]
+        pairs.append((seen.rotation[segment][:, 0], ahead, HEADING_SD))
     return [(a[known] / sd, b[known] / sd) for a, b, sd in pairs]
 
 
-def _level_acceleration(sensor: Orientation, time: np.ndarray) -> np.ndarray:
-    """Acceleration (T, 3) in the sensor's world without its vertical part, smoothed."""
+def _heading(seen: Moved, sensor: Orientation, time: np.ndarray, known: np.ndarray) -> float:
+    """Angle (rad) about the vertical from a sensor's world to the video's: that which makes the level accelerations
+    most equal, each axis of the video's counted by its spread, which is the depth's noise in a view from the front."""
+    assert sensor.log.acceleration is not None
     felt = np.stack([np.interp(time, sensor.log.time, v) for v in sensor.log.acceleration.T], axis=1)
-    felt = Rotation.from_quat(sensor.at(time)[0], scalar_first=True).apply(felt)
-    return _smooth(felt, SMOOTH_SLOW_S) * [1, 1, 0]
+    felt = smooth(Rotation.from_quat(sensor.at(time)[0], scalar_first=True).apply(felt), SMOOTH_SLOW_S)
+    inner = known.copy()
+    inner[: int(EDGE_S / SAMPLE_S)] = inner[-int(EDGE_S / SAMPLE_S) :] = False
+    ours, felt = (a[inner, :2] - a[inner, :2].mean(axis=0) for a in (seen.acceleration[sensor.log.segment], felt))
+    angles = np.deg2rad(np.arange(360.0))
+    turned = (felt @ [1, 1j]) * np.exp(1j * angles)[:, None]
+    error = ours - np.stack([turned.real, turned.imag], axis=-1)
+    costs = np.einsum("ati,ij,atj->a", error, np.linalg.inv(np.cov(ours.T)), error)
+    return float(angles[np.argmin(costs)])

@@ -25,15 +25,18 @@ class Worn:
 class SensorFit:
     """What a fit of N trials found of a sensor.
 
-    `mounting`: rotation from its axes to the segment's (quaternion, scalar first); `bias_rad_s` (3,) of its gyroscope,
-    beyond what its own filter took off; `heading_rad`, `tilt_rad` (N,): of its world in that of the trial's camera;
-    `clock_s` (N,): its time at the video's time 0, and `gain` (N,): how much faster it runs, as a share; `z` (N,): root
-    mean square of its error in standard deviations, 1 if it moves on its segment as people's do; `dropped` (N,): share
-    of the frames in which it was not measured or errs by more than the Huber width.
+    `moves_with`: the segment whose motion it shows, the stated one unless another is much more likely. `mounting`:
+    rotation from its axes to the segment's (quaternion, scalar first); `bias_rad_s` (3,) of its gyroscope, beyond what
+    its own filter took off; `heading_rad`, `tilt_rad` (N,): of its world in that of the trial's camera; `clock_s` (N,):
+    its time at the video's time 0, and `gain` (N,): how much faster it runs, as a share; `z` (N,): root mean square of
+    its error in standard deviations, 1 if it moves on its segment as people's do; `dropped` (N,): share of the frames
+    in which it was not measured or errs by more than the Huber width; `slip_rad` (N,): how far it turned on its segment
+    from the first to the last third; `rate_rad_s` (N,): root mean square of its angular velocity.
     """
 
     name: str
     segment: str
+    moves_with: str
     mounting: np.ndarray
     bias_rad_s: np.ndarray
     heading_rad: np.ndarray
@@ -42,6 +45,8 @@ class SensorFit:
     gain: np.ndarray
     z: np.ndarray
     dropped: np.ndarray
+    slip_rad: np.ndarray
+    rate_rad_s: np.ndarray
 
 
 def worn(logs: Sequence[SensorLog], clock_s: Sequence[float | None] | None, n_trials: int) -> Worn | None:

@@ -22,8 +22,8 @@ from pbl_pipeline.body import (
 )
 from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide_cm, slide_contact
-from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.imu_term import segments_at
+from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
     project_px,
@@ -38,7 +38,7 @@ from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual
 from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, Wearables, Wearing, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
-from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
+from pbl_pipeline.fit.solvers.gauss_newton import LevenbergMarquardt, Limits
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import At, Term, Unknowns
@@ -161,7 +161,8 @@ def test_a_curvature_that_is_wrong_neither_creeps_nor_swings(over):
 
     start = jnp.array([[0.1], [0.1]]), jnp.zeros(1)
     limits = Limits(jnp.asarray(1e-5), jnp.asarray(-1.0), jnp.asarray(50))
-    end = minimise(evaluate, move, before_first(evaluate, start), jnp.ones(2), limits)
+    solver = LevenbergMarquardt(evaluate, move, jnp.ones(2))
+    end = solver.iterate(solver.init(start), limits)
     assert int(end.result) == Result.SMALL_STEP
     assert int(end.iteration) <= 15
     assert float(jnp.max(jnp.abs(end.state[0]))) < 1e-4
@@ -291,6 +292,7 @@ def wearables(session: Session) -> Wearables:
         "mount": quats(2),
         "world": quats(trials, 2),
         "sd_rad": [0.3, 0.5],
+        "bias_sd_rad_s": [0.02, 0.05],
         "level_sd_rad": np.full((trials, 2), 0.1),
         "tilt_sd_rad": np.linspace(0, 0.2, trials),
         "middle_s": np.full(trials, 0.4),
@@ -369,7 +371,9 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     pairs["floor"] = (at.h[k : k + 6], want_h[k : k + 6])
     if state.wearing is not None:
         end = -sum(a.size for a in jax.tree.leaves(state.wearing))
-        pairs |= {f.name: (a, b) for f, a, b in zip(dataclasses.fields(Wearing), *map(parts, (at.h, want_h)))}
+        pairs |= {
+            f.name: (a, b) for f, a, b in zip(dataclasses.fields(Wearing), parts(at.h), parts(want_h), strict=True)
+        }
         at, want_h = dataclasses.replace(at, h=at.h[:end]), want_h[:end]
     if detector:
         own, want = (h[k + 6 :].reshape(2, -1) for h in (at.h, want_h))

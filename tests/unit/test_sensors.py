@@ -1,0 +1,154 @@
+"""Wearable sensors: their orientation, where a fit with them starts, and what is said of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import body_frames, load_body
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.fit.checks import _sensors
+from pbl_pipeline.fit.wearables import floor_shares
+from pbl_pipeline.qc import FAIL, PASS, WARN
+from pbl_pipeline.sensors.log import SEGMENTS, SensorLog
+from pbl_pipeline.sensors.orientation import oriented
+from pbl_pipeline.sensors.pairing import better_pairing
+from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
+from pbl_pipeline.sensors.worn import SensorFit, worn
+from pbl_pipeline.synthetic import SynthSpec, Truth, synthesise
+from research.walker import sensors as synthetic
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return synthesise(SynthSpec(seed=21, seconds=2.5)).truth
+
+
+@pytest.fixture(scope="module")
+def seen(truth) -> Moved:
+    """The segments as a camera that errs nowhere sees them."""
+    body = load_body()
+    frames = body_frames(body, truth.qpos, truth.scale)
+    index = {k: body.body_names.index(b) for k, b in BODY_OF.items()}
+    rotation, position = ({k: a[:, i] for k, i in index.items()} for a in (frames.rotation, frames.position_m))
+    return moved(truth.time_s, rotation, position)
+
+
+def turning(seconds: float, gap: slice = slice(0), bias=(0.0, 0.0, 0.0)) -> tuple[SensorLog, Rotation]:
+    """A sensor that swings about two axes, and its rotations."""
+    time = np.arange(0, seconds, 0.01)
+    angle = np.stack([0.4 * np.sin(3 * time), 0.3 * np.sin(2 * time), 0 * time], axis=1)
+    turns = Rotation.from_euler("xyz", angle)
+    rate = (turns[:-2].inv() * turns[2:]).as_rotvec() / 0.02
+    rate = np.concatenate([rate[:1], rate, rate[-1:]]) + np.deg2rad(bias)
+    rate[gap] = np.nan
+    return SensorLog("a", "thigh_r", time, rate, turns.inv().apply([0, 0, 9.81]), None), turns
+
+
+@pytest.mark.parametrize("seconds", [4.0, 20.0])
+def test_orientation_is_that_of_the_sensor_but_for_its_heading(seconds):
+    log, turns = turning(seconds)
+    found = Rotation.from_quat(oriented(log).at(log.time)[0], scalar_first=True)
+    off = (found * turns.inv()).as_matrix()
+    assert np.rad2deg(np.arccos(np.clip(off[:, 2, 2], -1, 1))).max() < 1.0
+    heading = np.unwrap(np.arctan2(off[:, 1, 0], off[:, 0, 0]))
+    assert np.rad2deg(np.ptp(heading)) < 1.0
+
+
+def test_a_short_gap_is_bridged_and_a_long_one_splits():
+    whole, split = (oriented(turning(20.0, gap)[0]) for gap in (slice(500, 504), slice(500, 550)))
+    assert len(whole.runs) == 1
+    assert [len(t) for t, _ in split.runs] == [500, 1450]
+    known = split.at(np.arange(0, 20, 0.1))[1]
+    assert (known.sum(), known[:55].sum()) == (145, 0)
+
+
+def test_a_log_without_samples_is_refused_and_a_segment_twice_too():
+    log, _ = turning(4.0, slice(None))
+    with pytest.raises(PblError, match="FIT_INPUT"):
+        oriented(log)
+    log, _ = turning(4.0)
+    for logs in ([log, log], [dataclasses.replace(log, segment="knee")]):
+        with pytest.raises(PblError, match="FIT_INPUT"):
+            worn(logs, None, 1)
+    with pytest.raises(PblError, match="FIT_INPUT"):
+        worn([log], [0.0, 0.0], 1)
+    assert worn([], None, 1) is None
+
+
+@pytest.mark.parametrize("stated", [0.0, None])
+def test_clock_and_mounting_are_found(truth, seen, stated):
+    logs, mounts = synthetic.worn(truth, 3, clock_s=0.21)
+    sensors = [oriented(log) for log in logs]
+    clock, agreement = clock_of(seen, sensors, stated)
+    assert clock == pytest.approx(0.21, abs=0.005)
+    assert agreement > 0.9
+    for sensor in sensors:
+        found = Rotation.from_matrix(wahba(vectors(seen, clock, sensor, sensor.log.segment)))
+        assert np.rad2deg((found * mounts[sensor.log.segment].inv()).magnitude()) < 12
+
+
+def test_orientation_alone_is_enough(truth, seen):
+    logs, _ = synthetic.worn(truth, 3, ("shank_r",), clock_s=0.1)
+    given = oriented(logs[0]).at(logs[0].time)[0]
+    alone = dataclasses.replace(logs[0], rate=None, acceleration=None, orientation=2 * given)
+    assert clock_of(seen, [oriented(alone)], 0.0)[0] == pytest.approx(0.1, abs=0.01)
+
+
+def test_another_log_is_refused(truth, seen):
+    log = synthetic.worn(truth, 3, ("shank_r",), clock_s=500.0)[0][0]
+    with pytest.raises(ValueError, match="does not reach"):
+        clock_of(seen, [oriented(log)], 0.0)
+
+
+@pytest.mark.parametrize("exchanged", [(), ("shank_r", "shank_l"), ("thigh_r", "thigh_l"), ("shank_l", "foot_l")])
+def test_exchanged_sensors_are_named(truth, seen, exchanged):
+    to = dict(zip(exchanged, reversed(exchanged), strict=True))
+    logs, _ = synthetic.worn(truth, 5)
+    sensors = [oriented(dataclasses.replace(log, segment=to.get(log.segment, log.segment))) for log in logs]
+    clock = clock_of(seen, sensors, 0.0)[0]
+    assert better_pairing(seen, clock, sensors) == SEGMENTS
+
+
+def fitted(**more) -> SensorFit:
+    one = lambda x: np.array([x])  # noqa: E731
+    values = {
+        **{k: one(0.0) for k in ("heading_rad", "tilt_rad", "clock_s", "gain", "dropped", "slip_rad")},
+        "name": "a",
+        "segment": "shank_r",
+        "moves_with": "shank_r",
+        "mounting": np.array([1.0, 0, 0, 0]),
+        "bias_rad_s": np.zeros(3),
+        "z": one(0.8),
+        "rate_rad_s": one(2.0),
+    }
+    return SensorFit(**{**values, **more})
+
+
+@pytest.mark.parametrize(
+    ("more", "check", "outcome"),
+    [
+        ({}, "", PASS),
+        ({"moves_with": "shank_l"}, "sensors_on_another_segment", FAIL),
+        ({"z": np.array([0.8, 2.5])}, "sensor_misfit_sd", WARN),
+        ({"slip_rad": np.array([0.2])}, "sensor_slip_deg", WARN),
+        ({"dropped": np.array([0.5])}, "sensor_share_dropped", WARN),
+        ({"bias_rad_s": np.array([0.0, -0.1, 0.0])}, "sensor_bias_deg_s", WARN),
+        ({"rate_rad_s": np.array([0.1])}, "sensor_rate_rad_s", WARN),
+        ({"z": np.array([np.nan]), "dropped": np.array([1.0])}, "sensor_misfit_sd", WARN),
+    ],
+)
+def test_what_is_wrong_is_said(more, check, outcome):
+    checks = {c.check: c for c in _sensors((fitted(**more),))}
+    assert all(c.outcome == PASS for name, c in checks.items() if name not in (check, "sensor_share_dropped"))
+    if check:
+        assert checks[check].outcome == outcome
+        assert "shank_r" in checks[check].advice or check == "sensor_rate_rad_s"
+    assert _sensors(()) == []
+
+
+def test_least_standard_deviations_fall_where_both_segments_have_sensors():
+    names = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "ankle_angle_r", "lumbar_bending")
+    shares = floor_shares(names, ["pelvis", "thigh_r", "shank_r"])
+    assert shares.tolist() == [0.65, 0.85, 0.65, 0.85, 1.0]
