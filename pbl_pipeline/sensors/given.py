@@ -133,7 +133,7 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
             raise PblError(
                 "USAGE",
                 found=said("the sensor {name} on {segment}: one of them twice", name=samples.name, segment=segment),
-                expected="each segment with one sensor of its own",
+                expected="one sensor on each segment",
                 next_step="name each sensor once",
             )
     clocks = {x.clock for _, x, _ in found}

@@ -25,4 +25,4 @@ class SensorLog:
     acceleration: np.ndarray | None  # (T, 3) m/s2, of a sensor at rest 9.81 upwards
     orientation: np.ndarray | None  # (T, 4) unit quaternion, scalar first
     started_utc: float | None = None  # s since 1970, of time 0
-    notes: tuple[str, ...] = ()  # what was left out, and what differs from what the file says
+    notes: tuple[str, ...] = ()  # remarks: samples that were left out, differences from the file's own statements

@@ -25,7 +25,7 @@ log_error = functools.partial(
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """What a file holds of one sensor: N rows in SI units and in the axes of the sensor, NaN where a cell is empty.
+    """Samples of one sensor in a file: N rows in SI units and in the axes of the sensor, NaN where a cell is empty.
 
     Sensors with the same `clock` are synchronous; the stamps of "UTC" are seconds since 1970. A `counter` counts
     samples, of which the file states `stated_hz` a second. `orientation` (quaternions, scalar first) is from the sensor
@@ -107,7 +107,7 @@ def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] 
 def numbers(file: LogFile, found: pd.DataFrame, names: Sequence[str]) -> np.ndarray | None:
     """Columns (N, K) of a table, or (N,) where `names` is one; None where one is absent or all cells are empty.
 
-    Raises `PblError` SENSOR_LOG for a cell that is no number.
+    Raises `PblError` SENSOR_LOG for a cell that is not a number.
     """
     wanted = [names] if isinstance(names, str) else list(names)
     if not set(wanted) <= set(found.columns):

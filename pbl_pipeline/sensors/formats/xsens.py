@@ -25,7 +25,7 @@ def _knows(file: LogFile) -> bool:
 
 
 def _header(file: LogFile) -> tuple[int, str]:
-    """Number and text of the first line that is no comment."""
+    """Number and text of the first line that is not a comment."""
     lines = file.text[:8000].splitlines()
     return next(((i, line) for i, line in enumerate(lines) if not line.startswith("//")), (0, ""))
 
