@@ -74,7 +74,7 @@ ORDER = (
     "phone_clock_offset_s",
     "sensors_on_another_segment",
     "sensor_misfit_sd",
-    "sensor_slip_deg",
+    "sensor_slip_sd",
     "sensor_share_dropped",
     "sensor_bias_deg_s",
     "sensor_rate_rad_s",
