@@ -125,14 +125,14 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
         ),
         warn_if(
             drifting,
-            "sensor_bias_deg_s",
+            "sensor_bias",
             bias,
             SENSOR_BIAS_WARN_DEG_S,
             f"gyroscopes drift: {drifting}; let the sensors lie still for some seconds before they are put on",
         ),
         warn_if(
             moved < SENSOR_RATE_WARN,
-            "sensor_rate_rad_s",
+            "sensor_rate",
             moved,
             SENSOR_RATE_WARN,
             "a person who hardly moves does not show how the sensors sit, nor their clock: they add next to nothing",

@@ -154,8 +154,8 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
                 a=max(s[0] for s in spans),
                 b=min(s[1] for s in spans),
             ),
-            said("the time of trial {name}", name=session.names[i]),
-            "pass the log of this recording, or state when it started in the log's time",
+            said("one time in them at which trial {name} fits", name=session.names[i]),
+            "pass the log of this recording and state when it started in the log's time: strides are alike",
         ) from error
 
 

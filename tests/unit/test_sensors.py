@@ -98,6 +98,18 @@ def test_orientation_alone_is_enough(truth, seen):
     assert clock_of(seen, [oriented(alone)], 0.0)[0] == pytest.approx(0.1, abs=0.01)
 
 
+def test_strides_that_are_alike_need_a_stated_clock(truth, seen):
+    """A log that repeats the recording."""
+    log = synthetic.worn(truth, 3, ("shank_r",), rest_s=0, beyond_s=0, clock_s=0)[0][0]
+    twice = np.concatenate([log.time, log.time + 3.0])
+    repeated = dataclasses.replace(
+        log, time=twice, rate=np.tile(log.rate, (2, 1)), acceleration=np.tile(log.acceleration, (2, 1))
+    )
+    with pytest.raises(ValueError, match="several times"):
+        clock_of(seen, [oriented(repeated)], None)
+    assert clock_of(seen, [oriented(repeated)], 3.1)[0] == pytest.approx(3.0, abs=0.02)
+
+
 def test_another_log_is_refused(truth, seen):
     log = synthetic.worn(truth, 3, ("shank_r",), clock_s=500.0)[0][0]
     with pytest.raises(ValueError, match="does not reach"):
@@ -136,8 +148,8 @@ def fitted(**more) -> SensorFit:
         ({"z": np.array([0.8, 2.5])}, "sensor_misfit_sd", WARN),
         ({"slip": np.array([3.0])}, "sensor_slip_sd", WARN),
         ({"dropped": np.array([0.5])}, "sensor_share_dropped", WARN),
-        ({"bias_rad_s": np.array([0.0, -0.1, 0.0])}, "sensor_bias_deg_s", WARN),
-        ({"rate_rad_s": np.array([0.1])}, "sensor_rate_rad_s", WARN),
+        ({"bias_rad_s": np.array([0.0, -0.1, 0.0])}, "sensor_bias", WARN),
+        ({"rate_rad_s": np.array([0.1])}, "sensor_rate", WARN),
         ({"z": np.array([np.nan]), "dropped": np.array([1.0])}, "sensor_misfit_sd", WARN),
     ],
 )
@@ -146,7 +158,7 @@ def test_what_is_wrong_is_said(more, check, outcome):
     assert all(c.outcome == PASS for name, c in checks.items() if name not in (check, "sensor_share_dropped"))
     if check:
         assert checks[check].outcome == outcome
-        assert "shank_r" in checks[check].advice or check == "sensor_rate_rad_s"
+        assert "shank_r" in checks[check].advice or check == "sensor_rate"
     assert _sensors(()) == []
 
 
@@ -166,13 +178,13 @@ def part(whole: Keypoints, at: slice) -> Keypoints:
 
 @pytest.mark.long
 def test_one_log_of_two_recordings_makes_knees_better():
-    """Two parts of a walk seen from the front, whose places in the log are not known."""
+    """Two parts of a walk seen from the front, whose places in the log are known to some tenths of a second."""
     made = synthesise(SynthSpec(seed=22, seconds=3.6, marker_set="blazepose_33", noise="memory"))
     truth, parts = made.truth, (slice(0, 45), slice(60, 108))
     trials = [part(made.keypoints, at) for at in parts]
     logs, mounts = synthetic.worn(truth, 4, ("thigh_r", "shank_r"))
     without = fit_session(trials, ["a", "b"], "blazepose")
-    with_them = fit_session(trials, ["a", "b"], "blazepose", sensors=logs)
+    with_them = fit_session(trials, ["a", "b"], "blazepose", sensors=logs, sensor_clock_s=[0.3, 1.9])
     knee = truth.joint_names.index("knee_angle_r")
 
     def error(fit):
