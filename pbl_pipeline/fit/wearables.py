@@ -28,6 +28,8 @@ from .term import At
 #: with markers and sensors; and its correlation over 1/30 s.
 WOBBLE_DEG = {"pelvis": 2.0, "thigh": 2.7, "shank": 2.0, "foot": 2.5}
 MEMORY = 0.8
+#: That memory in seconds; and what a sensor turns in the mean over a recording (standard deviation of the whole angle).
+MEMORY_S, SLIP_SD_RAD = 0.15, np.deg2rad(2.0)
 #: Standard deviations (deg) of the vertical of a sensor's world, and of a camera's that was taken as level.
 LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
 #: Standard deviation (deg/s) of a gyroscope's bias, before and after a filter found it.
@@ -152,8 +154,8 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
                 a=max(s[0] for s in spans),
                 b=min(s[1] for s in spans),
             ),
-            said("the time of trial {name}", name=session.names[i]),
-            "pass the log of this recording, or state when it started in the log's time",
+            said("one time in them at which trial {name} fits", name=session.names[i]),
+            "pass the log of this recording and state when it started in the log's time: strides are alike",
         ) from error
 
 
@@ -205,7 +207,9 @@ def sensor_fits(
         if not len(size):
             return np.nan, 1.0, np.nan, np.nan
         third = -(-len(off) // 3)
-        slip = np.linalg.norm(off[-third:].mean(axis=0) - off[:third].mean(axis=0))
+        seconds = 2 * float(worn.middle_s[i]) / 3
+        likely = np.hypot(SLIP_SD_RAD, float(worn.sd_rad[j]) * np.sqrt(12 * MEMORY_S / seconds))
+        slip = np.linalg.norm(off[-third:].mean(axis=0) - off[:third].mean(axis=0)) / likely
         first, last = (int((t + CLOCK_RANGE_S) / SAMPLE_S) for t in (0.0, 2 * float(worn.middle_s[i])))
         rate = rate_of(np.asarray(worn.quat_wxyz, float)[i, j, first : last + 1])
         dropped = 1 - np.sum(size < width) / np.sum(used)
@@ -227,7 +231,7 @@ def sensor_fits(
                 gain=state.clock[: len(trials), 1] / MINUTE_S,
                 z=each[:, 0],
                 dropped=each[:, 1],
-                slip_rad=each[:, 2],
+                slip=each[:, 2],
                 rate_rad_s=each[:, 3],
             )
         )

@@ -33,6 +33,8 @@ SMOOTH_S, SMOOTH_SLOW_S = 0.03, 0.06
 EDGE_S = 0.2
 #: Search around a stated clock (s), and finer steps around the best.
 RANGE_S, FINE_S = 0.5, 0.15
+#: Correlations (of angular speeds) closer than this at times further apart than this (s) do not tell which is right.
+AMBIGUOUS, APART_S = 0.05, 0.3
 #: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
 RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
 
@@ -74,7 +76,7 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
     there (their weighted correlation, -1 to 1).
 
-    Raises `ValueError` if the log does not reach the recording.
+    Raises `ValueError` if the log does not reach the recording, or fits it as well at another stride.
     """
     first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
     low, high = first - seen.time[0] - 0.5, last - seen.time[-1] + 0.5
@@ -90,7 +92,11 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
         ours = np.linalg.norm(seen.rate[segment], axis=1)
         score += ours.var() * _correlation(np.linalg.norm(rate, axis=1), ours)
         weight += ours.var()
+    score = score / weight
     best = int(np.argmax(score))
+    away = np.abs(np.arange(len(score)) - best) * SAMPLE_S > APART_S
+    if stated is None and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
+        raise ValueError("the log fits the recording at several times")
     lags = np.arange(max(0, best - int(FINE_S / SAMPLE_S)), min(len(score), best + int(FINE_S / SAMPLE_S) + 1))
     agreement = [sum(_turned_sum(seen.rate[k], r[i : i + n]) for k, r in rates.items()) for i in lags]
     at = int(np.argmax(agreement))
@@ -99,12 +105,16 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
         shift = 0.5 * (a - c) / (a - 2 * b + c)
     else:
         shift = 0.0
-    return low + SAMPLE_S * (lags[at] + shift), float(score[best] / weight)
+    return low + SAMPLE_S * (lags[at] + shift), float(score[best])
 
 
 def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
-    quat, known = sensor.at(time)
-    return np.where(known[:, None], smooth(rate_of(quat)), 0.0)
+    """Rates (T, 3) in all runs of a log, 0 elsewhere."""
+    rate = np.zeros((len(time), 3))
+    for run in sensor.runs:
+        quat, known = Orientation(sensor.log, (run,)).at(time)
+        rate[known] = smooth(rate_of(quat))[known]
+    return rate
 
 
 def _correlation(long: np.ndarray, short: np.ndarray) -> np.ndarray:

@@ -30,8 +30,9 @@ class SensorFit:
     its own filter took off; `heading_rad`, `tilt_rad` (N,): of its world in that of the trial's camera; `clock_s` (N,):
     its time at the video's time 0, and `gain` (N,): how much faster it runs, as a share; `z` (N,): root mean square of
     its error in standard deviations, 1 if it moves on its segment as people's do; `dropped` (N,): share of the frames
-    in which it was not measured or errs by more than the Huber width; `slip_rad` (N,): how far it turned on its segment
-    from the first to the last third; `rate_rad_s` (N,): root mean square of its angular velocity.
+    in which it was not measured or errs by more than the Huber width; `slip` (N,): how far it turned on its segment
+    from the first to the last third, over what soft tissue makes likely; `rate_rad_s` (N,): root mean square of its
+    angular velocity.
     """
 
     name: str
@@ -45,7 +46,7 @@ class SensorFit:
     gain: np.ndarray
     z: np.ndarray
     dropped: np.ndarray
-    slip_rad: np.ndarray
+    slip: np.ndarray
     rate_rad_s: np.ndarray
 
 
