@@ -34,7 +34,7 @@ import pytest
 
 from pbl_schemas.operations import embedded
 from pbl_workers.web import certificates
-from tests import database, pages, windows
+from tests import Environment, database, pages, windows
 from tests.source import ROOT
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -320,7 +320,7 @@ def window(request: pytest.FixtureRequest) -> Iterator[Callable[[], windows.Wind
 
 @pytest.fixture
 def reader(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, window: Callable[[], windows.Window] | None
+    tmp_path: Path, environment: Environment, window: Callable[[], windows.Window] | None
 ) -> Iterator[Callable[[str], Reader]]:
     folder, home = tmp_path / "empty", database.new_home()
     for made in (folder, tmp_path / "bin"):
@@ -330,7 +330,7 @@ def reader(
     (folder / "walk.mp4").write_bytes(small_film())
     (sheet,) = (b.code for b in pages.blocks("docs/capture.md") if b.language == "text")
     (folder / "clinic.csv").write_text(sheet)
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "institution"))
+    environment(PBL_HOME=tmp_path / "institution")
     cert, key = certificates.server_certificate(("gait.example.org", "127.0.0.1"))
     for path, name in ((cert, "cert.pem"), (key, "key.pem"), (certificates.authority(), "authority.pem")):
         shutil.copy(path, folder / name)

@@ -14,7 +14,7 @@ from pbl_schemas.reading import comparison
 from pbl_schemas.reading.trend import trend_of
 from pbl_schemas.studies.visit_forms import enter_scores, scores_form
 from pbl_workers.populate import populate
-from tests import not_none
+from tests import Environment, not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -164,9 +164,9 @@ def test_the_letter_is_one_visit_on_a_page(visits: None):
 
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_the_letter_has_the_clinic_the_scores_a_comment_and_the_body(
-    visits: None, language: str, monkeypatch: pytest.MonkeyPatch
+    visits: None, language: str, environment: Environment
 ):
-    monkeypatch.setenv("PBL_LETTER_HEAD", "Clinic <North>; Station 1, 12345 Town")
+    environment(PBL_LETTER_HEAD="Clinic <North>; Station 1, 12345 Town")
     form = scores_form(2)
     enter_scores(2, form.values | {"role": "6_months", "mJOA": "14"}, "A", form.seen)
     browser = web.client()

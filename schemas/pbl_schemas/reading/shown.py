@@ -15,13 +15,18 @@ from pbl_pipeline.words import NOT_COMPUTED
 from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from ..decisions.review_decisions import may_be_accepted
+from ..rows import ReadAhead, row_of
 from . import registered
+from .objects import load_kinetics, load_solution, pooled_cycles
 from .visit_list import VisitRow, earlier_result, results_of, visits_of
 from .visits import load_recording, load_visit
 from .why import Step, whys
 
 if TYPE_CHECKING:
-    from pbl_pipeline.gait import Measure
+    import numpy as np
+
+    from pbl_pipeline.gait import GaitCycle, Measure
+    from pbl_pipeline.kinetics import Kinetics
     from pbl_pipeline.qc import Check
     from pbl_pipeline.visit import Recording, Visit
 
@@ -41,12 +46,23 @@ class ShownCheck:
 
 
 @dataclasses.dataclass(frozen=True)
+class Pooled:
+    """What is drawn of a result: its cycles, the body's scale, forces, and the norm of its index."""
+
+    cycles: Sequence[GaitCycle]
+    scale: np.ndarray | None
+    kinetics: Kinetics | None
+    norm: str
+
+
+@dataclasses.dataclass(frozen=True)
 class ShownVisit:
     """A visit, the result that is shown of it and the others that there are."""
 
     row: VisitRow  # its line in the list of visits
     recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
     load_visit: Callable[[], Visit] | None = None  # loads `visit`; None if nothing is computed yet
+    load_pooled: Callable[[], Pooled | None] = lambda: None  # what is drawn of it, in less time than `visit`
     results: tuple[Result, ...] = ()  # by every chain of methods
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
@@ -159,6 +175,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     return dataclasses.replace(
         about,
         load_visit=functools.partial(load_visit, of_result),
+        load_pooled=functools.partial(_pooled, key, [int(r.number or 0) for r in recordings]),
         results=results,
         shown=shown,
         key=key,
@@ -167,6 +184,13 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
         checks=_checks_of(key),
         computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")),
     )
+
+
+def _pooled(key: Mapping[str, Any], videos: Sequence[int]) -> Pooled:
+    """What is drawn of a result of these recordings, by its key. Raises as `load_visit`."""
+    rows = ReadAhead([key], videos)
+    norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
+    return Pooled(pooled_cycles(key, rows), load_solution(key, rows).scale, load_kinetics(key, rows), norm)
 
 
 def computed_visit(session_id: int, shown: int) -> ShownVisit:

@@ -74,7 +74,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, pd.DataFrame):
         return plain(value.to_dict("records"))
     if isinstance(value, ShownVisit):
-        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "load_visit"}
+        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if not f.name.startswith("load_")}
         return plain({**own, "visit": value.visit})
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
