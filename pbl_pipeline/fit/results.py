@@ -12,6 +12,8 @@ from pbl_pipeline.body import SCALE_NAMES, SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
+from pbl_pipeline.results import Solution
+from pbl_pipeline.sensors.worn import SensorFit
 from pbl_pipeline.video import Camera, check_lens
 
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
@@ -30,7 +32,8 @@ class TrialFit:
     residual_2d_px is the mean over them, and camera, phone_quat_wxyz and camera_position_m (3,) are the first one's;
     laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
     estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
-    the scale of a fit to one camera (`known_height.py`), NaN if it was not stated.
+    the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
+    keypoints, which tells their detector, "" if they have none or the file is from before it was kept.
     """
 
     name: str
@@ -58,6 +61,7 @@ class TrialFit:
     loss: float
     seconds: float
     height_m: float = float("nan")
+    confidence_curve: str = ""
 
     @functools.cached_property
     def not_observed(self) -> frozenset[str]:
@@ -85,8 +89,8 @@ class TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
         wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
         fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        # Older files, from before heights could be stated, lack it.
-        data = {"height_m": np.asarray(np.nan), **load_npz(path, fields)}
+        # Older files lack what could not be stated or was not kept then.
+        data = {"height_m": np.asarray(np.nan), "confidence_curve": np.asarray(""), **load_npz(path, fields)}
         missing = [k for k in fields if k not in data]
         if missing:
             raise PblError(
@@ -101,6 +105,7 @@ class TrialFit:
             values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
             values[k] = text_of(path, data, k)
+        values["confidence_curve"] = text_of(path, data, "confidence_curve")
         for k in ("loss", "seconds", "phone_clock_offset_s", "height_m"):
             values[k] = float(values[k])
         camera = Camera(data["camera_matrix"], data["distortion"], text_of(path, data, "camera_source"))
@@ -111,22 +116,14 @@ class TrialFit:
         return cls(**values, camera=camera)
 
 
-@dataclasses.dataclass(frozen=True)
-class SessionFit:
-    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SessionFit(Solution):
+    """All trials of a session with one body."""
 
     trials: tuple[TrialFit, ...]
-    scale: np.ndarray
     site_offset_m: np.ndarray
-    loss_trace: np.ndarray
-    iterations: int
-    converged: bool | None
-    solver: str
-    params_hash: str
-    seconds: float
-    compile_seconds: float
-    device: str
     qc: tuple[Check, ...]
+    sensors: tuple[SensorFit, ...] = ()
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

@@ -25,7 +25,7 @@ def session():
 
 
 def weighed(session, params=PARAMS, **points):
-    """Factor of `c_2d` and of `c_3d` of each marker, where the points of the frames are changed to lie `points` off the fitted ones."""
+    """Factors of `c_2d` and `c_3d` of each marker, where points are moved by `points` off the fitted ones."""
     p, start = session.problem, start_of(session)
     body, table = load_body(), p.points
     x = np.array(marker_positions(body, table, start.qpos, np.ones(8), np.zeros((len(table.body_index), 3))))
