@@ -50,6 +50,11 @@ class Result:
     filming: Filming | None = None  # how it was filmed; None if it was not looked up
 
     @property
+    def errors(self) -> tuple[float | None, float | None]:
+        """Standard deviation of the error and minimal detectable change."""
+        return self.sd, self.minimal_change
+
+    @property
     def chain(self) -> tuple[str, ...]:
         """Kind of recordings and methods."""
         return self.kind, *self.methods
@@ -96,7 +101,7 @@ def change_since(result: Result, before: Result) -> Change | None:
 
     if result.index is None or before.index is None:
         return None
-    errors = [(r.sd, r.minimal_change) for r in (result, before)]
+    errors = [r.errors for r in (result, before)]
     return judged(result.index - before.index, errors, not_alike(result, before), IMPORTANT_CHANGE)
 
 
@@ -106,7 +111,7 @@ def measure_changes(
     """Return the changes of the measures that two results both have. `differs`: as in `judged`."""
     pairs = {name: (mine, before.get(name)) for name, mine in now.items()}
     return {
-        name: judged(mine.mean - old.mean, [(m.error_sd, m.minimal_change) for m in (mine, old)], differs)
+        name: judged(mine.mean - old.mean, [m.errors for m in (mine, old)], differs)
         for name, (mine, old) in pairs.items()
         if mine is not None and old is not None
     }

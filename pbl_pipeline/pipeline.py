@@ -33,7 +33,7 @@ from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
 from pbl_pipeline.tracking import TrackingParams, choose_subject, require_subject, track_people
 from pbl_pipeline.video import PhoneLog, attitude_of, check_file, find_camera, frames_kept, probe, read_phone_log
-from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Solution, Visit, save_visit
+from pbl_pipeline.visit import OVERLAY, REPORT, Held, Recording, Visit, save_visit, solution_of
 
 
 def run_visit(
@@ -105,7 +105,7 @@ def run_visit(
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]
     left_out = [r for r in found if r.problem]
     methods = {"Tracking": people.key, "Keypoints": keypoints.key, "Fit": method.key}
-    visit = Visit((*fitted, *left_out), Solution.of(fit), fit.qc, methods=methods)
+    visit = Visit((*fitted, *left_out), solution_of(fit), fit.qc, methods=methods)
     return measured(visit, norm=norm, mass_kg=mass_kg), problems
 
 

@@ -67,7 +67,7 @@ def fit(
     from pbl_pipeline.fit import fit_session, points_of
     from pbl_pipeline.keypoints import WorldMarkers
     from pbl_pipeline.pipeline import distinct_names
-    from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
+    from pbl_pipeline.visit import Recording, Visit, save_visit, solution_of
 
     check_out_folder(out)
     fit_paramset(solver, params)  # raises for a wrong name before anything is read
@@ -88,7 +88,7 @@ def fit(
     recordings = tuple(Recording.of(trial.name, trial) for trial in session.trials)
     laboratory = all(isinstance(trial, WorldMarkers) for trial in trials)
     kind = "rig" if cameras else "markers" if laboratory else "single"
-    visit = Visit(recordings, Solution.of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
+    visit = Visit(recordings, solution_of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
     for path in save_visit(visit, out):
         click.echo(path)
     click.echo(f"fitted in {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")

@@ -70,20 +70,20 @@ def lines(blocks: Sequence[np.ndarray], separator: str) -> bytes:
 
 
 @dataclasses.dataclass(frozen=True)
-class Labels:
+class Texts:
     """(N,) texts `texts[codes]` with few different ones. A categorical in Parquet, pandas and R."""
 
     codes: np.ndarray
     texts: tuple[str, ...]
 
     @classmethod
-    def of(cls, values: Sequence[str]) -> Labels:
+    def of(cls, values: Sequence[str]) -> Texts:
         texts = tuple(dict.fromkeys(values))
         place = {t: i for i, t in enumerate(texts)}
         return cls(np.array([place[v] for v in values], np.int32), texts)
 
     @classmethod
-    def constant(cls, text: str, n: int) -> Labels:
+    def constant(cls, text: str, n: int) -> Texts:
         return cls(np.zeros(n, np.int32), (text,))
 
     def __len__(self) -> int:
@@ -95,14 +95,14 @@ class Column:
     """One column of a table."""
 
     name: str
-    values: np.ndarray | Labels  # (N,) float with NaN for missing, int, bool or `Labels`
+    values: np.ndarray | Texts  # (N,) float with NaN for missing, int, bool or `Texts`
     unit: str
     meaning: str
 
     @property
     def kind(self) -> str:
         """ "text", "integer", "boolean" or "number"."""
-        if isinstance(self.values, Labels):
+        if isinstance(self.values, Texts):
             return "text"
         return {"i": "integer", "b": "boolean"}.get(self.values.dtype.kind, "number")
 
@@ -148,7 +148,7 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
     parquet: Any = needed("pyarrow.parquet", "writing Parquet files")
     arrays = []
     for c in table.columns:
-        if isinstance(c.values, Labels):
+        if isinstance(c.values, Texts):
             arrays.append(
                 pa.DictionaryArray.from_arrays(pa.array(c.values.codes), pa.array(c.values.texts, pa.string()))
             )
@@ -158,7 +158,7 @@ def write_parquet(table: Table, path: Path, about: Mapping[str, str]) -> None:
     made = pa.Table.from_arrays(arrays, schema=pa.schema(fields, metadata=dict(about)))
     # Statistics double the size of few rows. A dictionary of numbers that hardly repeat adds a tenth of the size and a
     # fifth of the time.
-    labels = [c.name for c in table.columns if isinstance(c.values, Labels)]
+    labels = [c.name for c in table.columns if isinstance(c.values, Texts)]
     parquet.write_table(made, path, compression="zstd", write_statistics=False, use_dictionary=labels)
 
 
@@ -177,21 +177,21 @@ def dictionary(tables: Sequence[Table]) -> Table:
         "unit": ([c.unit for _, c in found], "empty where there is none"),
         "meaning": ([c.meaning for _, c in found], "what it holds, and which direction is positive"),
     }
-    return Table("data_dictionary", tuple(Column(k, Labels.of(v), "", m) for k, (v, m) in texts.items()))
+    return Table("data_dictionary", tuple(Column(k, Texts.of(v), "", m) for k, (v, m) in texts.items()))
 
 
-def _stacked(pieces: Sequence[np.ndarray | Labels | None], lengths: Sequence[int]) -> np.ndarray | Labels:
+def _stacked(pieces: Sequence[np.ndarray | Texts | None], lengths: Sequence[int]) -> np.ndarray | Texts:
     first = next(p for p in pieces if p is not None)
-    if not isinstance(first, Labels):
+    if not isinstance(first, Texts):
         filled = [p if isinstance(p, np.ndarray) else np.full(n, np.nan) for p, n in zip(pieces, lengths, strict=True)]
         return np.concatenate(filled)
     texts: dict[str, int] = {}
     codes = []
     for piece, n in zip(pieces, lengths, strict=True):
-        own = piece if isinstance(piece, Labels) else Labels.constant("", n)
+        own = piece if isinstance(piece, Texts) else Texts.constant("", n)
         number = np.array([texts.setdefault(t, len(texts)) for t in own.texts], np.int32)
         codes.append(number[own.codes] if len(own) else np.zeros(0, np.int32))
-    return Labels(np.concatenate(codes), tuple(texts))
+    return Texts(np.concatenate(codes), tuple(texts))
 
 
 def _cells(kind: str, columns: Sequence[Column]) -> list[np.ndarray]:
@@ -200,8 +200,8 @@ def _cells(kind: str, columns: Sequence[Column]) -> list[np.ndarray]:
     found = []
     for column in columns:
         values = column.values
-        if not isinstance(values, Labels):
-            values = Labels(values.astype(np.int32), ("false", "true"))
+        if not isinstance(values, Texts):
+            values = Texts(values.astype(np.int32), ("false", "true"))
         found.append(text_cells([_quoted(t).encode() for t in values.texts])[values.codes])
     return found
 

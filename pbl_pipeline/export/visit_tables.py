@@ -14,18 +14,19 @@ from pbl_pipeline.fit.angles_file import angles_table
 from pbl_pipeline.gait import ANGLE_NAMES, MEASURES, NUMBERS, GaitCycle, GaitMetrics, Gdi, Spatiotemporal, TrialMetrics
 from pbl_pipeline.gait import cycle_measures as measures_of
 from pbl_pipeline.kinetics import CURVES, CycleKinetics, Kinetics
+from pbl_pipeline.records import meanings
+from pbl_pipeline.results import Measure
 from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.words import KINETICS, unit_of
 
-from .columns import Column, Labels, Table, joined
+from .columns import Column, Table, Texts, joined
 from .trial import ExportTrial
 
-_MEANINGS = json.loads(shipped_text("export/meanings.json"))
 #: Positive direction of a joint value, by the joint's name without its side.
-JOINT_SIGNS: dict[str, str] = _MEANINGS["joint_signs"]
+JOINT_SIGNS: dict[str, str] = json.loads(shipped_text("export/joint_signs.json"))
 _SIDES = {"r": "right", "l": "left"}
-_STATISTICS: dict[str, str] = _MEANINGS["statistics"]
-_OF_INDEX: dict[str, str] = _MEANINGS["index_statistics"]
+_STATISTICS = dict(sorted(meanings(Measure).items(), key=lambda named: named[0] != "mean"))
+_ONLY_LONG = ("variability", "cv_percent", "asymmetry_percent")
 _TRIAL = "name of the trial"
 
 
@@ -74,7 +75,7 @@ def _angles_long(wide: Table, trial: ExportTrial) -> Table:
     sd = sd * [1.0 if name in SLIDES else 180.0 / np.pi for _, name in joints]
     base, sides = zip(*(_sided(name) for _, name in joints), strict=True)
     columns = [
-        Column("trial", Labels.constant(trial.name, n * j), "", _TRIAL),
+        Column("trial", Texts.constant(trial.name, n * j), "", _TRIAL),
         Column("frame", np.tile(seen, j), "", "number of the frame, from 0; those without a pose are left out"),
         Column("time_s", np.tile(np.asarray(fit.time_s, float)[seen], j), "s", "from the first frame of the video"),
         Column("angle", _repeated(base, n), "", "OpenSim's name without the side; signs: see angles_wide"),
@@ -89,7 +90,7 @@ def _angles_long(wide: Table, trial: ExportTrial) -> Table:
 def _time(trial: ExportTrial) -> list[Column]:
     n = len(trial.fit.time_s)
     return [
-        Column("trial", Labels.constant(trial.name, n), "", _TRIAL),
+        Column("trial", Texts.constant(trial.name, n), "", _TRIAL),
         Column("frame", np.arange(n), "", "number of the frame, from 0"),
         Column("time_s", np.asarray(trial.fit.time_s, float), "s", "from the first frame of the video"),
     ]
@@ -106,19 +107,19 @@ def joint_sign(joint: str) -> str:
     return JOINT_SIGNS.get(_sided(joint)[0], "")
 
 
-def _repeated(texts: Sequence[str], n: int) -> Labels:
-    one = Labels.of(texts)
-    return Labels(np.repeat(one.codes, n), one.texts)
+def _repeated(texts: Sequence[str], n: int) -> Texts:
+    one = Texts.of(texts)
+    return Texts(np.repeat(one.codes, n), one.texts)
 
 
 # ----------------------------------------------------------------------------------------------------- events, cycles
 def _events(name: str, measured: TrialMetrics) -> Table:
     found = measured.events.events
     columns = [
-        Column("trial", Labels.constant(name, len(found)), "", _TRIAL),
+        Column("trial", Texts.constant(name, len(found)), "", _TRIAL),
         Column("time_s", _floats(e.time_s for e in found), "s", "from the first frame of the video"),
-        Column("side", Labels.of([e.side for e in found]), "", "left or right"),
-        Column("event", Labels.of([e.event for e in found]), "", "foot_down: initial contact; foot_up: toe-off"),
+        Column("side", Texts.of([e.side for e in found]), "", "left or right"),
+        Column("event", Texts.of([e.event for e in found]), "", "foot_down: initial contact; foot_up: toe-off"),
         Column("probability", _floats(e.probability for e in found), "", "that it is real, 0 to 1 (docs/events.md)"),
         Column("bout", _integers(e.bout for e in found), "", "number of the walking bout, from 0"),
     ]
@@ -165,8 +166,8 @@ def _cycles_wide(cycles: Sequence[_Cycle], pooled: Collection[str]) -> Table:
     columns += [
         Column("gdi", _floats(c.gdi for c in cycles), "", "Gait Deviation Index of the cycle"),
         Column("pooled", np.array([c.trial in pooled for c in cycles], bool), "", "whether the visit pools its trial"),
-        Column("far_leg", Labels.of([c.cycle.far_leg for c in cycles]), "", "leg that the other hid from the camera"),
-        Column("excluded", Labels.of([c.cycle.excluded for c in cycles]), "", "why it is not part of the measures"),
+        Column("far_leg", Texts.of([c.cycle.far_leg for c in cycles]), "", "leg that the other hid from the camera"),
+        Column("excluded", Texts.of([c.cycle.excluded for c in cycles]), "", "why it is not part of the measures"),
     ]
     for name in KINETICS:
         column = _floats(None if c.forces is None else c.forces.measures.get(name) for c in cycles)
@@ -184,9 +185,9 @@ def _cycles_long(cycles: Sequence[_Cycle]) -> Table:
     ]
     columns = _cycle_keys([(n, c) for n, c, _, _ in found])
     columns += [
-        Column("measure", Labels.of([m for _, _, m, _ in found]), "", "docs/measures.md, kinetics.md"),
+        Column("measure", Texts.of([m for _, _, m, _ in found]), "", "docs/measures.md, kinetics.md"),
         Column("value", _floats(v for _, _, _, v in found), "column unit", "of this cycle"),
-        Column("unit", Labels.of([unit_of(m) for _, _, m, _ in found]), "", "empty: none"),
+        Column("unit", Texts.of([unit_of(m) for _, _, m, _ in found]), "", "empty: none"),
     ]
     return Table("cycles_long", tuple(columns))
 
@@ -285,14 +286,14 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
         *_scope([(scope, trial) for scope, trial, *_ in found]),
         Column(
             "measure",
-            Labels.of([r[2] for r in found]),
+            Texts.of([r[2] for r in found]),
             "",
             "docs/measures.md, kinetics.md; gvs: score of one angle",
         ),
-        Column("statistic", Labels.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
+        Column("statistic", Texts.of([r[3] for r in found]), "", "mean, left, right, sd, n, ... (docs/measures.md)"),
         Column("value", _floats(r[4] for r in found), "column unit", "missing where it cannot be trusted"),
-        Column("unit", Labels.of([_unit(r[2], r[3]) for r in found]), "", "empty: none"),
-        Column("reason", Labels.of([r[5] for r in found]), "", "why there is no value"),
+        Column("unit", Texts.of([_unit(r[2], r[3]) for r in found]), "", "empty: none"),
+        Column("reason", Texts.of([r[5] for r in found]), "", "why there is no value"),
     ]
     return Table("measures_long", tuple(columns))
 
@@ -300,22 +301,22 @@ def _measures_long(parts: Sequence[_Part]) -> Table:
 def _measures_wide(parts: Sequence[_Part]) -> Table:
     rows = [{(m, s): v for m, s, v, _ in _values(part)} for part in parts]
     names = dict.fromkeys((*MEASURES, *(m for part in parts for m in part[2].of_task)))
-    wanted = [(m, s) for m in names for s in ("mean", "left", "right", "sd", "n", "error_sd", "minimal_change")]
+    wanted = [(m, s) for m in names for s in _STATISTICS if s not in _ONLY_LONG]
     wanted += [("gdi", s) for s in (*NUMBERS, "n")]
     wanted += [("gps_deg", s) for s in ("mean", "left", "right")]
     wanted += [(m, s) for m in KINETICS for s in _OF_FORCES]
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])
     for measure, statistic in wanted:
         values = _floats(row.get((measure, statistic), np.nan) for row in rows)
-        text = (_STATISTICS | _OF_INDEX).get(statistic, statistic.replace("_", " "))
+        text = (_STATISTICS | meanings(Gdi)).get(statistic, statistic.replace("_", " "))
         columns.append(Column(f"{measure}_{statistic}", values, _unit(measure, statistic), text))
     return Table("measures_wide", tuple(columns))
 
 
 def _scope(keys: Sequence[tuple[str, str]]) -> list[Column]:
     return [
-        Column("scope", Labels.of([s for s, _ in keys]), "", "session: all trials together; trial: one"),
-        Column("trial", Labels.of([t for _, t in keys]), "", f"{_TRIAL}, empty for the session"),
+        Column("scope", Texts.of([s for s, _ in keys]), "", "session: all trials together; trial: one"),
+        Column("trial", Texts.of([t for _, t in keys]), "", f"{_TRIAL}, empty for the session"),
     ]
 
 

@@ -12,6 +12,8 @@ from pbl_pipeline.body import SCALE_NAMES, SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
+from pbl_pipeline.results import Solution
+from pbl_pipeline.sensors.worn import SensorFit
 from pbl_pipeline.video import Camera, check_lens
 
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
@@ -111,22 +113,14 @@ class TrialFit:
         return cls(**values, camera=camera)
 
 
-@dataclasses.dataclass(frozen=True)
-class SessionFit:
-    """All trials of a session with one body. loss_trace (K, 2): step, total loss. converged None: not recorded."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SessionFit(Solution):
+    """All trials of a session with one body."""
 
     trials: tuple[TrialFit, ...]
-    scale: np.ndarray
     site_offset_m: np.ndarray
-    loss_trace: np.ndarray
-    iterations: int
-    converged: bool | None
-    solver: str
-    params_hash: str
-    seconds: float
-    compile_seconds: float
-    device: str
     qc: tuple[Check, ...]
+    sensors: tuple[SensorFit, ...] = ()
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

@@ -15,13 +15,7 @@ from pbl_pipeline.paramset import Paramset, later
 from pbl_pipeline.qc import EMPTY, PASS, Check, warn_if
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import LEFT, RIGHT
-from pbl_pipeline.results.index import (
-    GDI_MODEL,
-    GILLETTE_MODEL,
-    PAPER_INDEX,
-    Gdi,
-    GdiCycle,
-)
+from pbl_pipeline.results.index import GDI_MODEL, GILLETTE_MODEL, NUMBERS, PAPER_INDEX, Gdi, GdiCycle
 from pbl_pipeline.results.measures import Z90
 
 from .cycle_measures import far_leg_of
@@ -173,32 +167,30 @@ def score_gdi(
     n_left, n_right = (sum(c.side == side for c in usable) for side in (LEFT, RIGHT))
     enough = bool(usable) and min(n_left, n_right) >= params.min_cycles_per_side
     reason = "" if enough else _too_few(cycles, n_left, n_right, params)
-    left, right, mean, profile, sd, minimal_change = None, None, None, None, None, None
-    unshrunk, unshrunk_sd, passes = None, None, []
+    numbers, profile, passes = dict[str, float | None].fromkeys(NUMBERS), None, []
     if enough:
         error_model = error_model or _model_of_error(usable, basis, params)
         if error_model is not None:
             passes = with_doubts(error_model, passes_of(usable, basis))
             expected = expected_index(estimate(error_model, passes), basis, error_model.widening)
-            left, right, mean, sd = expected.left, expected.right, expected.mean, expected.sd
-            minimal_change = minimal_change_of(expected.sd_anew)
-            if n_left and n_right:
-                unshrunk, unshrunk_sd = unshrunk_index(error_model, passes, basis)
+            both = n_left and n_right
+            unshrunk = unshrunk_index(error_model, passes, basis) if both else (None, None)
+            errors = expected.sd, minimal_change_of(expected.sd_anew)
+            found = expected.mean, expected.left, expected.right, *errors, *unshrunk
         else:
             parts = _parts(usable, vectors, basis, params)
             left, right = (_weighted([p for p in parts if p.side == side]) for side in (LEFT, RIGHT))
             mean = _weighted(parts)
-            sd, minimal_change = _errors(parts, params)
-            unshrunk, unshrunk_sd = mean, sd
+            errors = _errors(parts, params)
+            found = mean, left, right, *errors, mean, errors[0]
+        numbers = dict(zip(NUMBERS, found, strict=True))
         scores = variable_scores(np.array(vectors), basis)
         sides = np.array([c.side for c in usable])
         profile = movement_profile({s: scores[sides == s] for s in (LEFT, RIGHT)}, basis)
     return Gdi(
         status=PASS if enough else EMPTY,
         reason=reason,
-        left=left,
-        right=right,
-        mean=mean,
+        **numbers,
         n=len(scored),
         n_left=n_left,
         n_right=n_right,
@@ -211,10 +203,6 @@ def score_gdi(
             *(_agreement(passes, basis) if error_model else _trials_agree(usable, vectors, basis)),
         ),
         profile=profile,
-        sd=sd,
-        minimal_change=minimal_change,
-        unshrunk=unshrunk,
-        unshrunk_sd=unshrunk_sd,
     )
 
 

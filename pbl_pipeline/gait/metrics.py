@@ -13,9 +13,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
+from pbl_pipeline.records import plain
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvents
-from pbl_pipeline.results.measures import Z90
+from pbl_pipeline.results.measures import OF_VISIT, Z90
 
 from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
 from ._gdi import (
@@ -83,14 +84,10 @@ class TrialMetrics(TrialCycles):
 
     def to_dict(self) -> dict:
         """Return the trial's part of metrics.json, from which `metrics_file.metrics_of` makes it again."""
-        found = {f.name: getattr(self.events, f.name) for f in dataclasses.fields(self.events) if f.name != "events"}
-        events = {**found, "walking_s": [list(bout) for bout in found["walking_s"]]}
-        events["qc"] = [c.to_dict() for c in self.events.qc]
-        cycles = [
-            {k: v for k, v in dataclasses.asdict(c).items() if k not in ("trial", "curves", "curves_sd", "error_model")}
-            for c in self.cycles
-        ]
-        more = {"pooled": self.pooled, "events": events, "gait_cycles": cycles}
+        of_files = ("trial", "curves", "curves_sd", "error_model")
+        events = {k: v for k, v in vars(self.events).items() if k != "events"}
+        cycles = [{k: v for k, v in vars(c).items() if k not in of_files} for c in self.cycles]
+        more = plain({"pooled": self.pooled, "events": events, "gait_cycles": cycles})
         return {"name": self.name, **_measures(self), **more}
 
 
@@ -147,7 +144,7 @@ class GaitMetrics(SessionMetrics):
         """The content of metrics.json."""
         judged = {
             "outcome": self.outcome,
-            "qc": [c.to_dict() for c in self.checks],
+            "qc": plain(self.checks),
             "qc_before_gait": len(dict.fromkeys(self.before)),
         }
         session = _measures(self)
@@ -179,8 +176,7 @@ class GaitMetrics(SessionMetrics):
         g = self.gdi
         lines.append(f"{_short(g):<24}{_cell(g.left)}{_cell(g.right)}{_cell(g.mean)}{'':>8}{g.n:>5}  {g.reason}")
         if g.interval is not None:
-            low, high = g.interval
-            lines.append(f"{'its 90 % interval':<24}{low:>9.1f} to {high:.1f}, minimal change {g.minimal_change:.1f}")
+            lines.append(f"its {g.error_words(1)}")
             if more := worth_of_one_more(self.cycles, g):
                 lines.append(more)
         if g.profile is not None and g.profile.gps is not None:
@@ -292,7 +288,9 @@ def with_errors(measures: Spatiotemporal, cycles: Sequence[GaitCycle], events: P
         error = None if m is None else measure_error(model, name, m.n, m.variability, m.n - 2)
         if m is None or error is None or (metric and name in LENGTHS):
             continue
-        found[name] = dataclasses.replace(m, error_sd=error[0], minimal_change=minimal_change_of(error[1]))
+        found[name] = dataclasses.replace(
+            m, **dict(zip(OF_VISIT, (error[0], minimal_change_of(error[1])), strict=True))
+        )
     return dataclasses.replace(measures, measures=found)
 
 
@@ -418,15 +416,14 @@ def _measures(part: TrialMetrics | GaitMetrics) -> dict:
     reasons = dict(values.reasons)
     if part.gdi.mean is None:
         reasons["gdi"] = part.gdi.reason
-    table = {name: None if m is None else m.to_dict() for name, m in values.measures.items()}
     return {
         "status": part.status,
         "reason": part.reason,
-        **table,
+        **plain(values.measures, 4),
         "gdi": part.gdi.to_dict(),
-        "profile_deg": None if part.gdi.profile is None else part.gdi.profile.to_dict(),
+        "profile_deg": plain(part.gdi.profile, 3),
         "reasons": reasons,
         "cycles": {"found": values.n_cycles_found, "used": values.n_cycles_used, "steps": values.n_steps_used},
         "outcome": worst(part.qc),
-        "qc": [c.to_dict() for c in part.qc],
+        "qc": plain(part.qc),
     }

@@ -13,7 +13,7 @@ from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import EMPTY, PASS, Check
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
-from pbl_pipeline.results.index import NUMBERS, Gdi, GdiCycle, MovementProfile
+from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, numbers_of
 from pbl_pipeline.results.measures import Measure
 
 from ._cycles import REPORT_PERCENT, GaitCycle
@@ -173,11 +173,9 @@ def _index(content: Mapping[str, Any], model: str, checks: Sequence[Check], cycl
     told, profile = content["gdi"], content.get("profile_deg")
     own = tuple(structured(c, GdiCycle) for c in told.get("cycles", ())) if cycles is None else tuple(cycles)
     known = None if profile is None else structured(profile, MovementProfile)
-    numbers = {n: told.get(n) for n in NUMBERS} | {n: told[n] for n in ("left", "right", "mean")}
-    if (numbers["sd"] is None) != (numbers["minimal_change"] is None):
-        raise ValueError("an index with one of sd and minimal_change")
+    numbers = numbers_of(told)
     return Gdi(
-        **{n: None if value is None else float(value) for n, value in numbers.items()},
+        **numbers,
         status=PASS if numbers["mean"] is not None else EMPTY,
         reason=str(content["reasons"].get("gdi", "")),
         n=int(told["n"]),

@@ -18,7 +18,7 @@ from pbl_pipeline.gait.cycle_measures import measure_of, sampling_sd
 from pbl_pipeline.gait.ground import FOLLOWS, SLIDES, is_metric, why_no_lengths
 from pbl_pipeline.methods import Method
 from pbl_pipeline.qc import EMPTY, PASS, Check, in_order, warn_if
-from pbl_pipeline.results.forces import WIDTH_SD
+from pbl_pipeline.results.forces import WIDTH_SD, CycleKinetics, KineticMeasure, Kinetics, Series, TrialKinetics
 from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.shipped import shipped_text
 from pbl_pipeline.texts import code_of
@@ -27,16 +27,7 @@ from .dynamics import GRAVITY, Dynamics, Motion, inverse_dynamics, smooth_motion
 from .ground import GroundReaction, contact_of, ground_reaction, needed_vertical
 from .joints import knee_adduction, leg_moments
 from .measures import cycle_table, split_table
-from .types import (
-    MEASURES,
-    CycleKinetics,
-    KineticMeasure,
-    Kinetics,
-    KineticsParams,
-    Series,
-    TrialKinetics,
-    Walk,
-)
+from .types import MEASURES, KineticsParams, Walk
 from .vertical import VerticalModel, dimensionless_speed, load_vertical_model, vertical_force
 
 _ERRORS = list(csv.DictReader(shipped_text("kinetics/measure_errors.csv").splitlines()))

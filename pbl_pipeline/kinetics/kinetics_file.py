@@ -14,9 +14,11 @@ from pbl_pipeline.files import check_numbers, load_npz, texts_of
 from pbl_pipeline.gait import REPORT_PERCENT
 from pbl_pipeline.gait.metrics_file import curve_table, known_curves
 from pbl_pipeline.paramset import structured
+from pbl_pipeline.records import plain
+from pbl_pipeline.results import CycleKinetics, Kinetics, Series, TrialKinetics
 
 from .joints import MOMENTS
-from .types import CURVES, CycleKinetics, Kinetics, Series, TrialKinetics
+from .types import CURVES
 
 _SERIES = tuple(f.name for f in dataclasses.fields(Series))
 _OF_CYCLES = ("cycle_no", "names", "percent", "curve", "curve_sd")
@@ -29,7 +31,7 @@ def content_of(kinetics: Kinetics) -> dict[str, Any]:
         **_own(kinetics, *own),
         "measures": {name: m.to_dict() for name, m in kinetics.measures.items()},
         "reasons": dict(kinetics.reasons),
-        "qc": [c.to_dict() for c in kinetics.qc],
+        "qc": plain(kinetics.qc),
         "trials": [
             {**_own(t, "name", "status", "code", "reason"), "cycles": [_cycle(c) for c in t.cycles]}
             for t in kinetics.trials

@@ -8,10 +8,11 @@ import numpy as np
 
 from pbl_pipeline.gait import REPORT_PERCENT, GaitCycle
 from pbl_pipeline.gait.events import LEFT
+from pbl_pipeline.results import Series
 from pbl_pipeline.sampling import interval_of
 
 from .joints import MOMENTS
-from .types import CURVES, MEASURES, Series
+from .types import CURVES, MEASURES
 
 _HIP, _KNEE, _ANKLE = (MOMENTS.index(name) for name in ("hip_flexion", "knee_flexion", "ankle_angle"))
 #: Frames of one stance, fewest.

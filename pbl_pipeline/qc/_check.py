@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Annotated
 
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column
 
 PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
@@ -19,18 +18,15 @@ CADENCE = "cadence_plausible"
 class Check:
     """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 
-    check: Annotated[str, Column("{}_check", "varchar(64)", "name, with its unit", key=True)]
-    outcome: Annotated[str, Column("{}_check_outcome", f"enum({', '.join(map(repr, OUTCOMES))})")]
-    value: Annotated[float | None, Column("{}_check_value", "float64", "in the unit (see {}_check)", null=True)]
-    threshold: Annotated[float | None, Column("{}_check_threshold", "float64", "in the unit (see {}_check)", null=True)]
-    advice: Annotated[str, Column("{}_check_advice", "varchar(1000)", "what to do about it")] = ""
+    check: str = column("{}_check", "name, with its unit", "varchar(64)", key=True)
+    outcome: str = column("{}_check_outcome", type=f"enum({', '.join(map(repr, OUTCOMES))})")
+    value: float | None = column("{}_check_value", "in the unit (see {}_check)")
+    threshold: float | None = column("{}_check_threshold", "in the unit (see {}_check)")
+    advice: str = column("{}_check_advice", "what to do about it", "varchar(1000)", default="")
 
     def __post_init__(self) -> None:
         if self.outcome not in OUTCOMES:
             raise ValueError(f"outcome {self.outcome!r} is not one of {OUTCOMES}")
-
-    def to_dict(self) -> dict:
-        return dataclasses.asdict(self)
 
 
 def warn_if(bad: object, check: str, value: float | None, threshold: float | None, advice: str) -> Check:

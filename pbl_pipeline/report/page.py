@@ -184,16 +184,8 @@ def _gdi_tile(gdi: Gdi) -> dict:
         "unit": "",
         "left": number(gdi.left, 1),
         "right": number(gdi.right, 1),
-        "note": _interval(gdi) or f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
+        "note": gdi.error_words() or f"sd {number(_gdi_sd(gdi), 1)}, n {gdi.n}",
     }
-
-
-def _interval(gdi: Gdi) -> str:
-    """The index's 90 % interval and its minimal change; "" if the angles' error is not known."""
-    if gdi.interval is None or gdi.minimal_change is None:
-        return ""
-    low, high = (number(v, 0) for v in gdi.interval)
-    return f"90 % interval {low} to {high}, minimal change {number(gdi.minimal_change, 0)}"
 
 
 def _measure_row(words: tuple[str, str, int], m: Measure | None, reason: str) -> dict:
@@ -246,7 +238,7 @@ def _index(gdi: Gdi, cycles: Sequence[GaitCycle], people: str) -> dict:
             f"Mean {number(gdi.mean, 1)} over {plural(gdi.n, 'cycle')}: left {number(gdi.left, 1)} "
             f"(n {gdi.n_left}), right {number(gdi.right, 1)} (n {gdi.n_right})"
         )
-        if interval := _interval(gdi):
+        if interval := gdi.error_words():
             text += f"; {interval}: less between two visits filmed alike may be chance"
         if more := worth_of_one_more(cycles, gdi):
             text += f"; {more}"

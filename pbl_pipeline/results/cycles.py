@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
 
 import numpy as np
 
 from pbl_pipeline.qc import CADENCE
-from pbl_pipeline.records import Column, stored
+from pbl_pipeline.records import column, stored
 
 #: Angles of the fitted body: the pelvis' forward axis is level in neutral standing, because Delp's frame of the pelvis
 #: (OpenSim's) has its frontal plane through the anterior spines and the pubic symphysis.
@@ -25,43 +24,25 @@ class Exclusion:
     its side, if that is large. `failed_checks`: checks of the fit that FAIL, or `CADENCE`.
     """
 
-    first_step: Annotated[bool, Column("cycle_first_step", "bool", "touches the first step of its walking bout")] = (
-        False
+    first_step: bool = column("cycle_first_step", "touches the first step of its walking bout", "bool", default=False)
+    last_step: bool = column("cycle_last_step", "touches the last step of its walking bout", "bool", default=False)
+    length_ratio: float | None = column(
+        "cycle_length_ratio", "(1) length over the typical stride's, null unless left out for it", default=None
     )
-    last_step: Annotated[bool, Column("cycle_last_step", "bool", "touches the last step of its walking bout")] = False
-    length_ratio: Annotated[
-        float | None,
-        Column(
-            "cycle_length_ratio",
-            "float64",
-            "(1) length over the typical stride's, null unless left out for it",
-            null=True,
-        ),
-    ] = None
-    length_unproven: Annotated[
-        bool,
-        Column(
-            "cycle_length_unproven",
-            "bool",
-            "no feet show whether a step was missed; null: not left out for its length, or not known",
-            null=True,
-        ),
-    ] = False
-    curve_distance_deg: Annotated[
-        float | None,
-        Column(
-            "cycle_curve_distance",
-            "float64",
-            "(deg) from its side's median curves, null unless left out for it",
-            null=True,
-        ),
-    ] = None
-    n_curves: Annotated[
-        int | None, Column("cycle_curves_n", "int16", "cycles of that median, null with it", null=True)
-    ] = None
-    failed_checks: Annotated[
-        tuple[str, ...], Column("cycle_failed_checks", "json", "names of the checks of the fit that FAIL, such as []")
-    ] = ()
+    length_unproven: bool = column(
+        "cycle_length_unproven",
+        "no feet show whether a step was missed; null: not left out for its length, or not known",
+        "bool",
+        null=True,
+        default=False,
+    )
+    curve_distance_deg: float | None = column(
+        "cycle_curve_distance", "(deg) from its side's median curves, null unless left out for it", default=None
+    )
+    n_curves: int | None = column("cycle_curves_n", "cycles of that median, null with it", "int16", default=None)
+    failed_checks: tuple[str, ...] = column(
+        "cycle_failed_checks", "names of the checks of the fit that FAIL, such as []", "json", default=()
+    )
 
     def __bool__(self) -> bool:
         """True if there is a reason."""
@@ -98,28 +79,18 @@ class Lengths:
     the step width stays unknown.
     """
 
-    stride_length_m: Annotated[
-        float | None, Column("cycle_stride_length", "float64", "(m) over the floor", null=True)
-    ] = None
-    step_length_m: Annotated[
-        float | None, Column("cycle_step_length", "float64", "(m) of the step that ends the cycle", null=True)
-    ] = None
-    step_width_m: Annotated[
-        float | None, Column("cycle_step_width", "float64", "(m) null unless the metres were measured", null=True)
-    ] = None
-    missing: Annotated[str, Column("cycle_lengths_missing", "varchar(150)", "why there are no lengths", empty=True)] = (
-        ""
+    stride_length_m: float | None = column("cycle_stride_length", "(m) over the floor", default=None)
+    step_length_m: float | None = column("cycle_step_length", "(m) of the step that ends the cycle", default=None)
+    step_width_m: float | None = column("cycle_step_width", "(m) null unless the metres were measured", default=None)
+    missing: str = column("cycle_lengths_missing", "why there are no lengths", "varchar(150)", empty=True, default="")
+    metric: bool = column(
+        "cycle_lengths_metric",
+        "false: as large as the detector takes the person to be",
+        "bool",
+        null=True,
+        before="missing",
+        default=False,
     )
-    metric: Annotated[
-        bool,
-        Column(
-            "cycle_lengths_metric",
-            "bool",
-            "false: as large as the detector takes the person to be",
-            null=True,
-            before="missing",
-        ),
-    ] = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,34 +111,32 @@ class GaitCycle:
     """
 
     trial: str
-    number: Annotated[int, Column("cycle_no", "int16", "in order of time, both sides together, from 0", key=True)]
-    bout: Annotated[int, Column("cycle_bout", "int16", "walking bout, from 0")]
-    side: Annotated[str, Column("cycle_side", "enum('left', 'right')", before="bout")]
-    start_s: Annotated[float, Column("cycle_start", "float64", "(s) foot down")]
-    opposite_foot_up_s: Annotated[float, Column("opposite_foot_up", "float64", "(s)")]
-    opposite_foot_down_s: Annotated[float, Column("opposite_foot_down", "float64", "(s)")]
-    foot_up_s: Annotated[float, Column("cycle_foot_up", "float64", "(s)")]
-    end_s: Annotated[float, Column("cycle_end", "float64", "(s) next foot down of the same side")]
+    number: int = column("cycle_no", "in order of time, both sides together, from 0", "int16", key=True)
+    bout: int = column("cycle_bout", "walking bout, from 0", "int16")
+    side: str = column("cycle_side", type="enum('left', 'right')", before="bout")
+    start_s: float = column("cycle_start", "(s) foot down")
+    opposite_foot_up_s: float = column("opposite_foot_up", "(s)")
+    opposite_foot_down_s: float = column("opposite_foot_down", "(s)")
+    foot_up_s: float = column("cycle_foot_up", "(s)")
+    end_s: float = column("cycle_end", "(s) next foot down of the same side")
     exclusion: Exclusion = dataclasses.field(default_factory=Exclusion)
     curves: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
-    curves_missing: Annotated[str, Column("curves_missing", "varchar(100)", "why it has no curves")] = ""
+    curves_missing: str = column("curves_missing", "why it has no curves", "varchar(100)", default="")
     curves_sd: dict[str, np.ndarray] = dataclasses.field(default_factory=dict, compare=False, repr=False)
     lengths: Lengths = dataclasses.field(default_factory=lambda: Lengths(missing=NO_POSITIONS))
     angle_model: str = BODY_ANGLES
-    far_leg: Annotated[
-        str,
-        Column(
-            "cycle_far_leg",
-            "enum('left', 'right')",
-            "the leg that one camera saw behind the other, if one",
-            null=True,
-            before="lengths",
-        ),
-    ] = ""
+    far_leg: str = column(
+        "cycle_far_leg",
+        "the leg that one camera saw behind the other, if one",
+        "enum('left', 'right')",
+        null=True,
+        before="lengths",
+        default="",
+    )
     error_model: str = ""
 
     @property
-    @stored("cycle_used", "bool", "false where one of the next six says why", before="exclusion")
+    @stored("cycle_used", "false where one of the next six says why", "bool", before="exclusion")
     def used(self) -> bool:
         """True if the cycle takes part in the measures."""
         return not self.exclusion

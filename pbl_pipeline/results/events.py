@@ -5,10 +5,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 from pathlib import Path
-from typing import Annotated
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import Column, stored
+from pbl_pipeline.records import column, stored
 
 LEFT, RIGHT = "left", "right"
 FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
@@ -23,16 +22,13 @@ class GaitEvent:
     """One event. `probability` in 0..1 that it is real: calibrated in the event model, only a measure of prominence in
     the coordinate-based methods; `bout` counts walking bouts from 0."""
 
-    time_s: Annotated[float, Column("event_time", "float64", "(s) time of the trial")]
-    side: Annotated[str, Column("event_side", "enum('left', 'right')")]
-    event: Annotated[str, Column("event_kind", "enum('foot_down', 'foot_up')")]
-    probability: Annotated[
-        float,
-        Column(
-            "event_probability", "float64", "(0..1) that it is real; by coordinates: how clear it is, not calibrated"
-        ),
-    ]
-    bout: Annotated[int, Column("event_bout", "int16", "walking bout, from 0")] = 0
+    time_s: float = column("event_time", "(s) time of the trial")
+    side: str = column("event_side", type="enum('left', 'right')")
+    event: str = column("event_kind", type="enum('foot_down', 'foot_up')")
+    probability: float = column(
+        "event_probability", "(0..1) that it is real; by coordinates: how clear it is, not calibrated"
+    )
+    bout: int = column("event_bout", "walking bout, from 0", "int16", default=0)
 
     def __post_init__(self) -> None:
         if self.side not in SIDES or self.event not in EVENTS:
@@ -49,23 +45,23 @@ class GaitEvents:
     pairs that are out of order.
     """
 
-    status: Annotated[str, Column("events_status", "enum('PASS', 'EMPTY')")]
+    status: str = column("events_status", type="enum('PASS', 'EMPTY')")
     events: tuple[GaitEvent, ...]
-    reason: Annotated[str, Column("events_reason", "varchar(1000)", "why EMPTY")]
-    method: Annotated[str, Column("events_detector", "varchar(64)", "name of the method in the library")]
+    reason: str = column("events_reason", "why EMPTY", "varchar(1000)")
+    method: str = column("events_detector", "name of the method in the library", "varchar(64)")
     params_hash: str
-    source: Annotated[str, Column("events_source", "varchar(64)", "what the feet come from")]
-    walking_s: Annotated[
-        tuple[tuple[float, float], ...], Column("walking_bouts", "json", "(s) start and end of each walking bout")
-    ] = ()
-    n_candidates: Annotated[int, Column("n_candidates", "int16", "possible events before their check")] = 0
-    n_order_breaks: Annotated[
-        int, Column("n_order_breaks", "int16", "bouts that ended because an event was missing or out of order")
-    ] = 0
+    source: str = column("events_source", "what the feet come from", "varchar(64)")
+    walking_s: tuple[tuple[float, float], ...] = column(
+        "walking_bouts", "(s) start and end of each walking bout", "json", default=()
+    )
+    n_candidates: int = column("n_candidates", "possible events before their check", "int16", default=0)
+    n_order_breaks: int = column(
+        "n_order_breaks", "bouts that ended because an event was missing or out of order", "int16", default=0
+    )
     qc: tuple[Check, ...] = ()
 
     @property
-    @stored("n_events", "int16", before="n_candidates")
+    @stored("n_events", type="int16", before="n_candidates")
     def n_events(self) -> int:
         """Number of events."""
         return len(self.events)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Any
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column, plain
+from pbl_pipeline.words import number
 
-from .events import RIGHT, SIDES
+from .events import RIGHT
 from .measures import Z90
 
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
@@ -22,6 +24,8 @@ _NAMES = {
     PAPER_INDEX: "GDI of three angles, the paper's recipe",
     GILLETTE_MODEL: "GDI (Schwartz & Rozumalski 2008)",
 }
+#: Index with its error, as lists of visits show it.
+WITH_ERROR = ("mean", "sd", "minimal_change")
 #: Numbers of an index: fields of `Gdi`, statistics of files.
 NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
 
@@ -30,12 +34,9 @@ NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrun
 class VariableScore:
     """Gait Variable Score (deg) of an angle, None for a side without cycles."""
 
-    angle: Annotated[str, Column("{}_angle", "varchar(32)", "name", key=True)]
-    left: Annotated[
-        float | None,
-        Column("{}_score_left", "float64", "(deg) root mean square distance from the normative mean curve", null=True),
-    ]
-    right: Annotated[float | None, Column("{}_score_right", "float64", "(deg)", null=True)]
+    angle: str = column("{}_angle", "name", "varchar(32)", key=True)
+    left: float | None = column("{}_score_left", "(deg) root mean square distance from the normative mean curve")
+    right: float | None = column("{}_score_right", "(deg)")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,28 +50,15 @@ class MovementProfile:
 
     left: dict[str, float]
     right: dict[str, float]
-    gps_left: Annotated[float | None, Column("{}_gps_left", "float64", "(deg)", null=True)]
-    gps_right: Annotated[float | None, Column("{}_gps_right", "float64", "(deg)", null=True)]
-    gps: Annotated[
-        float | None,
-        Column(
-            "{}_gps",
-            "float64",
-            "(deg) Gait Profile Score of the person; null unless the norm has nine angles",
-            null=True,
-            before="gps_left",
-        ),
-    ]
+    gps_left: float | None = column("{}_gps_left", "(deg)")
+    gps_right: float | None = column("{}_gps_right", "(deg)")
+    gps: float | None = column(
+        "{}_gps", "(deg) Gait Profile Score of the person; null unless the norm has nine angles", before="gps_left"
+    )
 
     def of_side(self, side: str) -> dict[str, float]:
         """The scores of "left" or "right"."""
         return self.right if side == RIGHT else self.left
-
-    def to_dict(self) -> dict:
-        """`profile_deg` of metrics.json."""
-        own = dataclasses.asdict(self)
-        sides = {side: {angle: _rounded(v) for angle, v in own.pop(side).items()} for side in SIDES}
-        return sides | {k: _rounded(v) for k, v in own.items()}
 
     @property
     def scores(self) -> tuple[VariableScore, ...]:
@@ -86,11 +74,9 @@ class GdiCycle:
     trial: str
     number: int
     side: str
-    gdi: Annotated[float, Column("cycle_gdi", "float64", "(-)")]
-    z: Annotated[float, Column("cycle_z", "float64", "(-) standardised log distance to the normative mean")]
-    explained: Annotated[
-        float, Column("cycle_explained", "float64", "(0..1) share of the deviation that the index sees")
-    ]
+    gdi: float = column("cycle_gdi", "(-)")
+    z: float = column("cycle_z", "(-) standardised log distance to the normative mean")
+    explained: float = column("cycle_explained", "(0..1) share of the deviation that the index sees")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +91,12 @@ class Gdi:
     either; None where it is too uncertain (`measurement.MOST_UNSURE`); `unshrunk_sd`: standard deviation of its error.
     """
 
-    status: Annotated[str, Column("{}_status", "enum('PASS', 'EMPTY')")]
-    reason: Annotated[str, Column("{}_reason", "varchar(1000)", "why there is no index")]
-    left: Annotated[float | None, Column("{}_left", "float64", "(-)", null=True)]
-    right: Annotated[float | None, Column("{}_right", "float64", "(-)", null=True)]
-    mean: Annotated[float | None, Column("{}", "float64", "(-) mean over all used cycles", null=True, before="left")]
-    n: Annotated[int, Column("{}_n", "int16", "cycles with an index", before="(end)")]
+    status: str = column("{}_status", type="enum('PASS', 'EMPTY')")
+    reason: str = column("{}_reason", "why there is no index", "varchar(1000)")
+    left: float | None = column("{}_left", "(-)")
+    right: float | None = column("{}_right", "(-)")
+    mean: float | None = column("{}", "(-) mean over all used cycles", before="left")
+    n: int = column("{}_n", "cycles with an index", "int16", before="(end)")
     n_left: int
     n_right: int
     norm: str
@@ -119,36 +105,34 @@ class Gdi:
     cycles: tuple[GdiCycle, ...]
     qc: tuple[Check, ...]
     profile: MovementProfile | None = None
-    sd: Annotated[float | None, Column("{}_sd", "float64", "(-) standard deviation of the error of {}", null=True)] = (
-        None
+    sd: float | None = column("{}_sd", "(-) standard deviation of the error of {}", default=None)
+    minimal_change: float | None = column(
+        "{}_minimal_change", "(-) minimal detectable change (90 percent) between two such visits", default=None
     )
-    minimal_change: Annotated[
-        float | None,
-        Column(
-            "{}_minimal_change",
-            "float64",
-            "(-) minimal detectable change (90 percent) between two such visits",
-            null=True,
-        ),
-    ] = None
-    unshrunk: Annotated[
-        float | None,
-        Column(
-            "{}_unshrunk",
-            "float64",
-            "(-) not drawn towards the mean of people: for correlations and means over people",
-            null=True,
-        ),
-    ] = None
-    unshrunk_sd: Annotated[
-        float | None,
-        Column("{}_unshrunk_sd", "float64", "(-) standard deviation of the error of {}_unshrunk", null=True),
-    ] = None
+    unshrunk: float | None = column(
+        "{}_unshrunk",
+        "(-) not drawn towards the mean of people: for correlations and means over people",
+        meaning="index that is not drawn towards the mean of people: for correlations and means over people",
+        default=None,
+    )
+    unshrunk_sd: float | None = column(
+        "{}_unshrunk_sd",
+        "(-) standard deviation of the error of {}_unshrunk",
+        meaning="standard deviation of the error of unshrunk",
+        default=None,
+    )
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """90 % interval of the true index; None if `sd` is not known."""
         return interval_90(self.mean, self.sd)
+
+    def error_words(self, decimals: int = 0) -> str:
+        """The 90 % interval and the minimal detectable change in words; "" if the angles' error is not known."""
+        if self.interval is None or self.minimal_change is None:
+            return ""
+        low, high, change = (number(v, decimals) for v in (*self.interval, self.minimal_change))
+        return f"90 % interval {low} to {high}, minimal change {change}"
 
     @property
     def title(self) -> str:
@@ -157,12 +141,19 @@ class Gdi:
 
     def to_dict(self) -> dict:
         """`gdi` of metrics.json."""
-        rounded = {k: _rounded(getattr(self, k)) for k in NUMBERS}
-        interval = interval_90(rounded["mean"], rounded["sd"])  # as a reader of the file computes it
-        counted = {"n": self.n, "n_left": self.n_left, "n_right": self.n_right, "norm": self.norm}
-        cycles = [dataclasses.asdict(c) for c in self.cycles]
-        of_mean = None if interval is None else [_rounded(v) for v in interval]
-        return {**rounded, "interval": of_mean, **counted, "params_hash": self.params_hash, "cycles": cycles}
+        rounded = {name: plain(getattr(self, name), 3) for name in NUMBERS}
+        # As a reader of the file computes it.
+        own = {**rounded, "interval": plain(interval_90(rounded["mean"], rounded["sd"]), 3)}
+        own |= {name: getattr(self, name) for name in ("n", "n_left", "n_right", "norm", "params_hash")}
+        return {**own, "cycles": plain(self.cycles)}
+
+
+def numbers_of(told: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the `NUMBERS` of an index that `Gdi.to_dict` wrote. Raises KeyError, TypeError, ValueError."""
+    numbers = {n: told.get(n) for n in NUMBERS} | {n: told[n] for n in ("left", "right", "mean")}
+    if (numbers["sd"] is None) != (numbers["minimal_change"] is None):
+        raise ValueError("an index with one of sd and minimal_change")
+    return {n: None if value is None else float(value) for n, value in numbers.items()}
 
 
 def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | None:
@@ -170,7 +161,3 @@ def interval_90(mean: float | None, sd: float | None) -> tuple[float, float] | N
     if mean is None or sd is None or not math.isfinite(sd):
         return None
     return mean - Z90 * sd, mean + Z90 * sd
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, 3)

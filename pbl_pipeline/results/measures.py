@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
 
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
@@ -27,47 +26,47 @@ class Measure:
     None if the error was not measured.
     """
 
-    left: Annotated[float | None, Column("{}_left", "float64", "in the unit (see {})", null=True)]
-    right: Annotated[float | None, Column("{}_right", "float64", "in the unit (see {})", null=True)]
-    mean: Annotated[float, Column("{}_mean", "float64", "in the unit (see {}): both sides", null=True, before="left")]
-    sd: Annotated[
-        float | None, Column("{}_sd", "float64", "in the unit (see {}): n - 1, null for one value", null=True)
-    ]
-    n: Annotated[int, Column("{}_n", "int16", "values", before="error_sd")]
-    variability: Annotated[
-        float | None,
-        Column(
-            "{}_variability",
-            "float64",
-            "in the unit (see {}): sd within a side, null below two values of a side",
-            null=True,
-        ),
-    ] = None
-    cv_percent: Annotated[float | None, Column("{}_cv", "float64", "(percent) variability of the mean", null=True)] = (
-        None
+    left: float | None = column("{}_left", "in the unit (see {})", meaning="mean of the left side")
+    right: float | None = column("{}_right", "in the unit (see {})", meaning="mean of the right side")
+    mean: float = column(
+        "{}_mean", "in the unit (see {}): both sides", null=True, before="left", meaning="mean over both sides"
     )
-    asymmetry_percent: Annotated[
-        float | None,
-        Column(
-            "{}_asymmetry",
-            "float64",
-            "(percent) right minus left, of their mean; null where it means nothing",
-            null=True,
-        ),
-    ] = None
-    error_sd: Annotated[
-        float | None,
-        Column("{}_error", "float64", "in the unit (see {}): standard deviation of the error of the mean", null=True),
-    ] = None
-    minimal_change: Annotated[
-        float | None,
-        Column(
-            "{}_minimal_change", "float64", "in the unit (see {}): minimal detectable change (90 percent)", null=True
-        ),
-    ] = None
+    sd: float | None = column(
+        "{}_sd", "in the unit (see {}): n - 1, null for one value", meaning="standard deviation over both sides (n - 1)"
+    )
+    n: int = column("{}_n", "values", "int16", before="error_sd", meaning="number of values")
+    variability: float | None = column(
+        "{}_variability",
+        "in the unit (see {}): sd within a side, null below two values of a side",
+        meaning="standard deviation within a side",
+        default=None,
+    )
+    cv_percent: float | None = column(
+        "{}_cv", "(percent) variability of the mean", meaning="variability in percent of the mean", default=None
+    )
+    asymmetry_percent: float | None = column(
+        "{}_asymmetry",
+        "(percent) right minus left, of their mean; null where it means nothing",
+        meaning="100 (right - left) / mean of both",
+        default=None,
+    )
+    error_sd: float | None = column(
+        "{}_error",
+        "in the unit (see {}): standard deviation of the error of the mean",
+        meaning="standard deviation of the error of the mean",
+        default=None,
+    )
+    minimal_change: float | None = column(
+        "{}_minimal_change",
+        "in the unit (see {}): minimal detectable change (90 percent)",
+        meaning="minimal detectable change (90 %) between two visits filmed alike",
+        default=None,
+    )
 
-    def to_dict(self) -> dict:
-        return {k: round(v, 4) if isinstance(v, float) else v for k, v in dataclasses.asdict(self).items()}
+    @property
+    def errors(self) -> tuple[float | None, float | None]:
+        """Standard deviation of the error and minimal detectable change."""
+        return self.error_sd, self.minimal_change
 
     @property
     def interval(self) -> tuple[float, float] | None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Annotated
 
 import numpy as np
 
-from pbl_pipeline.records import Column
+from pbl_pipeline.records import column
 
 #: Fields of `VideoInfo` that stand in the row of the file, not in that of its facts.
 OF_FILE = ("path", "sha256", "size_bytes")
@@ -27,25 +26,21 @@ class FirstPicture:
         Focal length (mm) of the same view on 35 mm film, or None.
     """
 
-    path: Annotated[str, Column("video_path", "varchar(1000)")]
-    width_px: Annotated[int, Column("width", "int32", "(px) of the upright frame", before="fps")]
-    height_px: Annotated[int, Column("height", "int32", "(px) of the upright frame", before="fps")]
-    rotation_deg: Annotated[int, Column("rotation", "int16", "(deg) rotation flag of the file", before="fps")]
-    make: Annotated[str | None, Column("phone_make", "varchar(64)", null=True, before="capture_fps")]
-    model: Annotated[str | None, Column("phone_model", "varchar(64)", null=True, before="capture_fps")]
-    lens: Annotated[
-        str | None, Column("phone_lens", "varchar(128)", "lens as the phone names it", null=True, before="capture_fps")
-    ] = None
-    focal_35mm: Annotated[
-        float | None,
-        Column(
-            "focal_35mm",
-            "float64",
-            "(mm) focal length of the same view on 35 mm film, as the file states it",
-            null=True,
-            before="capture_fps",
-        ),
-    ] = None
+    path: str = column("video_path", "where the file lies, absolute", "varchar(1000)")
+    width_px: int = column("width", "(px) of the upright frame", "int32", before="fps")
+    height_px: int = column("height", "(px) of the upright frame", "int32", before="fps")
+    rotation_deg: int = column("rotation", "(deg) rotation flag of the file", "int16", before="fps")
+    make: str | None = column("phone_make", type="varchar(64)", before="capture_fps")
+    model: str | None = column("phone_model", type="varchar(64)", before="capture_fps")
+    lens: str | None = column(
+        "phone_lens", "lens as the phone names it", "varchar(128)", before="capture_fps", default=None
+    )
+    focal_35mm: float | None = column(
+        "focal_35mm",
+        "(mm) focal length of the same view on 35 mm film, as the file states it",
+        before="capture_fps",
+        default=None,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,28 +69,19 @@ class VideoInfo(FirstPicture):
         Remarks for the reader: frames hidden by an edit list, repeated stamps, a mirrored picture.
     """
 
-    sha256: Annotated[str, Column("video_sha256", "char(64)")]
-    size_bytes: Annotated[int, Column("video_size", "int64")]
-    container: Annotated[str, Column("container", "varchar(64)")]
-    codec: Annotated[str, Column("codec", "varchar(32)")]
-    pixel_format: Annotated[str, Column("pixel_format", "varchar(32)")]
+    sha256: str = column("video_sha256", "of its bytes: the same file is never registered twice", "char(64)")
+    size_bytes: int = column("video_size", "(byte) length of the file", "int64")
+    container: str = column("container", type="varchar(64)")
+    codec: str = column("codec", type="varchar(32)")
+    pixel_format: str = column("pixel_format", type="varchar(32)")
     time_s: np.ndarray
-    fps: Annotated[float, Column("fps", "float64", "(1/s) 1 / sampling interval, a description only", null=True)]
-    duration_s: Annotated[
-        float, Column("duration", "float64", "(s) from the first frame to the end of the last", null=True)
-    ]
-    n_frames: Annotated[int, Column("n_frames", "int32", "frames that decode")]
-    n_frames_announced: Annotated[
-        int, Column("n_frames_announced", "int32", "frames the header claims, 0 when it says nothing")
-    ]
-    variable_frame_rate: Annotated[bool, Column("variable_frame_rate", "bool", "whether frame intervals differ")]
-    recorded_utc: Annotated[
-        str | None, Column("recorded_utc", "varchar(40)", "recording time as the file states it", null=True)
-    ]
-    notes: Annotated[
-        tuple[str, ...],
-        Column("video_notes", "json", "remarks on the file, such as a mirrored picture", before="(end)"),
-    ] = ()
-    capture_fps: Annotated[
-        float | None, Column("capture_fps", "float64", "(1/s) rate at which the phone says it recorded", null=True)
-    ] = None
+    fps: float = column("fps", "(1/s) 1 / sampling interval, a description only", null=True)
+    duration_s: float = column("duration", "(s) from the first frame to the end of the last", null=True)
+    n_frames: int = column("n_frames", "frames that decode", "int32")
+    n_frames_announced: int = column("n_frames_announced", "frames the header claims, 0 when it says nothing", "int32")
+    variable_frame_rate: bool = column("variable_frame_rate", "whether frame intervals differ", "bool")
+    recorded_utc: str | None = column("recorded_utc", "recording time as the file states it", "varchar(40)")
+    notes: tuple[str, ...] = column(
+        "video_notes", "remarks on the file, such as a mirrored picture", "json", before="(end)", default=()
+    )
+    capture_fps: float | None = column("capture_fps", "(1/s) rate at which the phone says it recorded", default=None)

@@ -1,5 +1,7 @@
 """People in a video: detection, tracks and choice of the subject."""
 
+from pbl_pipeline.results import PersonTrack, SubjectChoice
+
 from .appearance import appearance_of, appearance_similarity
 from .associate import AssociationParams
 from .blazepose import BlazePoseDetector, BlazePoseWindows, body_box, circle_roi
@@ -20,6 +22,6 @@ from .subject_choice import (
 )
 from .tiling import tiles
 from .track import track_people
-from .types import Detection, PersonDetector, PersonTrack, SubjectChoice, Tracking, WindowDetector
+from .types import Detection, PersonDetector, Tracking, WindowDetector
 from .walker_score import SubjectParams, step_s, time_in_view_s
 from .yolox import YoloxDetector

@@ -15,10 +15,11 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.results import PersonTrack, SubjectChoice
 from pbl_pipeline.video import read_frames
 
 from .methods import SUBJECT_METHODS
-from .types import PersonTrack, SubjectChoice, Tracking
+from .types import Tracking
 from .walker_score import MOST_LISTED, SubjectParams
 
 #: Width of one picture in the sheet (px), least and largest number of pictures, pictures side by side.

@@ -15,6 +15,7 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.models import box_iou
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.prefetch import prefetched
+from pbl_pipeline.results import PersonTrack
 from pbl_pipeline.sampling import interval_of
 from pbl_pipeline.video import VideoInfo, probe, read_frames
 
@@ -27,7 +28,7 @@ from .methods import METHODS
 from .params import TrackingParams
 from .reidentify import backtrack, join_trails, with_exact_ends
 from .tiling import detect_in
-from .types import Detection, PersonDetector, PersonTrack, Scene, Tracking, WindowDetector
+from .types import Detection, PersonDetector, Scene, Tracking, WindowDetector
 
 #: Least overlap of the boxes in a second detection of a new person.
 CONFIRM_IOU = 0.3

@@ -7,6 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from pbl_pipeline.results.people import PersonTrack
 from pbl_pipeline.video import Frame
 
 
@@ -44,17 +45,6 @@ class WindowDetector(PersonDetector, Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class PersonTrack:
-    """One person over the video. Rows of frames without the person are NaN (score 0)."""
-
-    person_id: int
-    box_px: np.ndarray  # (T, 4) x0, y0, x1, y1
-    roi_px: np.ndarray  # (T, 4) centre x, centre y, side, rotation (rad)
-    score: np.ndarray  # (T,)
-    observed: np.ndarray  # (T,) bool: detected in this frame; False where the box is interpolated over a short gap
-
-
-@dataclasses.dataclass(frozen=True)
 class Tracking:
     """All people in the video: `time_s` (T,), persons numbered from 1 in order of appearance."""
 
@@ -63,16 +53,3 @@ class Tracking:
     persons: tuple[PersonTrack, ...]
     detector: str
     model_sha256: str
-
-
-@dataclasses.dataclass(frozen=True)
-class SubjectChoice:
-    """Choice of the person to measure."""
-
-    status: str  # "CHOSEN" (automatic), "MANUAL", "NEEDS_CHOICE" or "NO_PERSON"
-    person_id: int | None  # None unless CHOSEN or MANUAL
-    score: float
-    runner_up_id: int | None
-    runner_up_score: float
-    scores: dict[int, float]  # 0 to 1, by person_id
-    reason: str  # a sentence for clinicians

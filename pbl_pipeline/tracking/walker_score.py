@@ -24,9 +24,10 @@ import dataclasses
 import numpy as np
 
 from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.results import PersonTrack, SubjectChoice
 
 from .associate import measure
-from .types import Detection, PersonTrack, SubjectChoice, Tracking
+from .types import Detection, Tracking
 
 #: Largest number of people who are described if they are too similar to choose between, the best first.
 MOST_LISTED = 6

@@ -1,10 +1,11 @@
 """Comparison of a fit with a reference: errors per joint, the paper's tables, paired curves (docs/validation.md)."""
 
+from pbl_pipeline.results import JointError
+
 from .align import align_path
 from .bridge import bridge_pairs, bridge_table, folder_values, refit_bridge_set, touched
 from .compare import (
     CURVE_COLUMNS,
-    JointError,
     KinematicErrors,
     compare,
     compare_angles,

@@ -16,7 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import EVENT_METHODS, GDI_METHODS, MEASURES, GaitParams, gait_metrics
 from pbl_pipeline.methods import Method, Stage
 from pbl_pipeline.synthetic import Impairment, SynthSpec, synthesise
-from pbl_pipeline.visit import Recording, Solution, Visit, save_visit
+from pbl_pipeline.visit import Recording, Visit, save_visit, solution_of
 from pbl_pipeline.visit.files import file_of_visit
 
 from .write import Cell, Table
@@ -62,7 +62,7 @@ def refit_bridge_set(name: str, folder: Path, done: Callable[[], object] = lambd
         index = method if stage == "gdi" else None
         measured = gait_metrics(session.trials, params=params, fit_checks=session.qc, model=index)
         recordings = (Recording.of(recording, session.trials[0]).with_measured(measured.trials[0]),)
-        visit = Visit(recordings, Solution.of(session), session.qc, methods={"Fit": fit.key}, measures=measured)
+        visit = Visit(recordings, solution_of(session), session.qc, methods={"Fit": fit.key}, measures=measured)
         save_visit(visit, folder / recording)
         done()
 

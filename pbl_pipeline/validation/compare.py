@@ -14,6 +14,7 @@ from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Z90, GaitCycle, trial_poses
+from pbl_pipeline.results import JointError, TrialError
 
 from .align import (
     MAX_GAP_S,
@@ -77,38 +78,11 @@ def _finite(values: Sequence[float] | np.ndarray) -> np.ndarray:
     return v[np.isfinite(v)]
 
 
-@dataclasses.dataclass(frozen=True)
-class JointError:
-    """Error of one joint over the common frames, error = fit - reference, degrees.
-
-    n: frames with both values. median_abs_deg, mean_abs_deg: of |error|. bias_deg: mean error. sd_deg: sd of the error
-    (ddof 0), which is its rms without the constant part. rms_deg: bias and sd together. correlation: Pearson's, NaN
-    where one of the two does not move. within_90: fraction of the frames inside 1.645 sd of the fit, NaN without sd.
-    normal_p: p of the Shapiro-Wilk test of the errors of the frames, NaN for fewer than three or errors all the same.
-    """
-
-    joint: str
-    n: int
-    median_abs_deg: float
-    mean_abs_deg: float
-    bias_deg: float
-    sd_deg: float
-    rms_deg: float
-    correlation: float
-    within_90: float
-    normal_p: float = float("nan")
-
-
-@dataclasses.dataclass(frozen=True)
-class KinematicErrors:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KinematicErrors(TrialError):
     """Errors of one trial against its reference."""
 
-    lag_s: float  # of the video behind the reference (positive: the video is later)
-    n: int  # frames in which at least one joint could be compared
     joints: tuple[JointError, ...]  # one entry per joint that both know, in the order of the reference
-    #: Median of |error| over all frames and all joints of `JOINTS_PAPER` that are known: the paper's error of a trial.
-    median_abs_deg: float
-    rte_m: float  # mean distance of the pelvis path to the reference's, NaN where one is not known
     #: "right" and "left" -> "front", "back", "ipsilateral", "contralateral" or "mixed" (`view_classes`).
     view: Mapping[str, str] = dataclasses.field(default_factory=lambda: dict.fromkeys(("right", "left"), MIXED))
     #: Medians of the fit's residuals over frames and markers.
@@ -119,8 +93,6 @@ class KinematicErrors:
     reference: str = ""
     source: str = ""
     convention: str = ""
-    #: The search went this far to both sides; a lag at its end is suspicious (`lag_at_limit`).
-    max_lag_s: float = float("nan")
 
     @property
     def lag_at_limit(self) -> bool:

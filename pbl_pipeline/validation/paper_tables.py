@@ -13,9 +13,10 @@ import numpy as np
 import pandas as pd
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results import JointError
 from pbl_pipeline.shipped import shipped_text
 
-from .compare import JointError, KinematicErrors, median_niqr, niqr, normality_p
+from .compare import KinematicErrors, median_niqr, niqr, normality_p
 from .reference import (
     BACK,
     CONTRALATERAL,

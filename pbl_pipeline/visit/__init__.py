@@ -5,6 +5,8 @@
 nothing themselves.
 """
 
+from pbl_pipeline.results import Solution
+
 from .files import (
     FIT,
     METRICS,
@@ -21,4 +23,4 @@ from .files import (
     visit_facts,
     visit_of_fits,
 )
-from .types import Held, Recording, Solution, Visit
+from .types import Held, Recording, Visit, solution_of

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,12 +24,12 @@ from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.kinetics.kinetics_file import kinetics_of, load_arrays, save_arrays, save_content
 from pbl_pipeline.names import distinct
-from pbl_pipeline.paramset import structured
 from pbl_pipeline.qc import WARN, Check
-from pbl_pipeline.tracking import SubjectChoice
+from pbl_pipeline.records import from_json, plain
+from pbl_pipeline.results import Solution, SubjectChoice
 from pbl_pipeline.video import VideoInfo
 
-from .types import Held, Recording, Solution, Visit
+from .types import Held, Recording, Visit
 
 #: Files of a visit. `overlay.mp4` and `report.html` are drawn by `pipeline.write_results`.
 SESSION, METRICS, REPORT, KINETICS = "session.json", "metrics.json", "report.html", "kinetics.json"
@@ -84,22 +83,20 @@ def visit_facts(visit: Visit) -> dict[str, Any]:
     content: dict[str, Any] = {
         "trials": list(fits),
         "orientation_source": {n: f.orientation_source for n, f in fits.items()},
-        "phone_clock_offset_s": {n: _known(f.phone_clock_offset_s) for n, f in fits.items()},
-        "height_m": next((_known(f.height_m) for f in fits.values()), None),
-        "qc": [c.to_dict() for c in visit.fit_checks],
+        "phone_clock_offset_s": {n: plain(round(f.phone_clock_offset_s, 4)) for n, f in fits.items()},
+        "height_m": next((plain(round(f.height_m, 4)) for f in fits.values()), None),
+        "qc": plain(visit.fit_checks),
     }
     if visit.solution is not None:
         s = visit.solution
+        own = plain(s, 5)
+        del own["software"]
         content |= {
-            "solver": s.solver,
-            "params_hash": s.params_hash,
-            "iterations": None if s.iterations is None else int(s.iterations),
-            "converged": None if s.converged is None else bool(s.converged),
-            "scale": dict(zip(SCALE_NAMES, (round(float(v), 5) for v in s.scale), strict=True)),
-            "loss_trace": [[int(step), round(float(loss), 5)] for step, loss in s.loss_trace],
+            **own,
+            "scale": dict(zip(SCALE_NAMES, own["scale"], strict=True)),
+            "loss_trace": [[int(step), loss] for step, loss in own["loss_trace"]],
             "seconds": round(s.seconds, 3),
             "compile_seconds": round(s.compile_seconds, 3),
-            "device": s.device,
             "code_version": s.software,
         }
     whose = {"subject": visit.subject, "label": visit.label, "date": visit.date, "kind": visit.kind}
@@ -221,28 +218,13 @@ def _file(folder: Path, name: str, end: str) -> Path:
 def recording_facts(recording: Recording) -> dict[str, Any]:
     """Return the content of session.json about a recording: facts without arrays, and only the name of its file."""
     video, choice = recording.video, recording.choice
-    facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None, "choice": None}
+    facts: dict[str, Any] = {"name": recording.name, "problem": recording.problem, "video": None}
+    facts["choice"] = None if choice is None else dataclasses.asdict(choice)
     facts["condition"] = dataclasses.asdict(recording.condition)
     if video is not None:
-        own = {k: v for k, v in dataclasses.asdict(video).items() if k not in ("time_s", "path")}
-        facts["video"] = {**_json(own), "file": Path(video.path).name}
-    if choice is not None:
-        facts["choice"] = _json(dataclasses.asdict(choice))
-    return facts
-
-
-def _json(value: Any) -> Any:
-    """Return a value for JSON: NaN as null, tuples as lists, keys as texts."""
-    if isinstance(value, Mapping):
-        return {str(k): _json(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _known(value: float) -> float | None:
-    """Return the number for JSON; None for NaN."""
-    return round(float(value), 4) if math.isfinite(value) else None
+        own = {k: v for k, v in vars(video).items() if k not in ("time_s", "path")}
+        facts["video"] = {**own, "file": Path(video.path).name}
+    return plain(facts)
 
 
 # ------------------------------------------------------------------------------------------------------------- reading
@@ -296,7 +278,7 @@ def _told(facts: Mapping[str, Any], points: Path | None) -> dict[str, Any]:
     video, choice = facts.get("video"), facts.get("choice")
     return {
         "video": None if video is None else _video(video, points),
-        "choice": None if choice is None else _choice(choice),
+        "choice": None if choice is None else from_json(SubjectChoice, choice),
         "condition": Condition(**facts.get("condition", {})),
         "problem": str(facts.get("problem", "")),
     }
@@ -309,14 +291,7 @@ def _video(facts: Mapping[str, Any], points: Path | None) -> VideoInfo:
     time = None if points is None or not points.is_file() else load_npz(points, ["time_s"]).get("time_s")
     if time is None or np.shape(time) != (n,):
         time = np.full(n, np.nan)
-    unknown = {k: math.nan for k in ("fps", "duration_s") if own[k] is None}
-    return structured({**own, **unknown, "path": file, "time_s": time}, VideoInfo)
-
-
-def _choice(facts: Mapping[str, Any]) -> SubjectChoice:
-    unknown = {k: math.nan for k in ("score", "runner_up_score") if facts[k] is None}
-    scores = {int(k): math.nan if v is None else v for k, v in facts["scores"].items()}
-    return structured({**facts, **unknown, "scores": scores}, SubjectChoice)
+    return from_json(VideoInfo, own, path=file, time_s=time)
 
 
 def _keypoints_of(path: Path, fit_path: Path) -> Keypoints | None:
@@ -332,7 +307,7 @@ def _solution(content: Mapping[str, Any]) -> Solution:
     own = {f.name: content.get(f.name) for f in dataclasses.fields(Solution)}
     own["scale"] = [content["scale"][n] for n in SCALE_NAMES]
     own["loss_trace"] = np.reshape(content["loss_trace"], (-1, 2))
-    return structured({**own, "software": content.get("code_version", "")}, Solution)
+    return from_json(Solution, own, software=content.get("code_version", ""))
 
 
 def _checks_unknown(names: Sequence[str]) -> Check:

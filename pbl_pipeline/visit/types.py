@@ -19,6 +19,7 @@ from pbl_pipeline.gait import Condition, GaitCycle, GaitEvents, GaitMetrics, Tri
 from pbl_pipeline.keypoints import Keypoints, check_keypoints, log_shift_s
 from pbl_pipeline.kinetics import Kinetics
 from pbl_pipeline.qc import WARN, Check
+from pbl_pipeline.results import Solution
 from pbl_pipeline.tracking import SubjectChoice
 from pbl_pipeline.video import PhoneLog, VideoInfo, check_timing, read_phone_log
 
@@ -100,25 +101,10 @@ class Recording:
         return (*timing, *(() if self.keypoints is None else check_keypoints(self.keypoints)))
 
 
-@dataclasses.dataclass(frozen=True)
-class Solution:
-    """Result of fitting the body of a visit, without the movements."""
-
-    solver: str
-    params_hash: str
-    iterations: int | None  # None if not recorded
-    converged: bool | None  # None if not recorded
-    scale: np.ndarray  # (8,) multipliers of `body.SCALE_NAMES`
-    loss_trace: np.ndarray  # (K, 2) step, loss
-    seconds: float
-    compile_seconds: float
-    device: str
-    software: str = ""  # version and commit of the code
-
-    @classmethod
-    def of(cls, fit: SessionFit, software: str = "") -> Solution:
-        own = [f.name for f in dataclasses.fields(cls) if f.name != "software"]
-        return cls(**{name: getattr(fit, name) for name in own}, software=software or code_version())
+def solution_of(fit: SessionFit) -> Solution:
+    """Return the solution of a fit that this code made."""
+    own = {f.name: getattr(fit, f.name) for f in dataclasses.fields(Solution)}
+    return Solution(**own | {"software": code_version()})
 
 
 @dataclasses.dataclass(frozen=True)

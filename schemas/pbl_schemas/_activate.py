@@ -42,7 +42,7 @@ def activate(
         Insert the method, body and norm rows of this version of the code (loads the numerical libraries, a few
         seconds). Commands that only look leave it out: False inserts them only where there are none.
     """
-    from . import connection, fit, jobs, linking, plan, store, tables_version
+    from . import connection, linking, queues, store, tables_version
     from .methods import insert_if_none, insert_once
     from .operations import catalog, embedded
 
@@ -62,11 +62,10 @@ def activate(
     for stage, module in zip(STAGES, modules(), strict=True):
         connection.bind(stage, module.schema, create_tables)
     linking.link(linking_module, create_tables)
-    fit.SessionFit.plan = staticmethod(plan.plan_fit_sets)
     if create_tables:
         insert_once() if methods else insert_if_none()
     if new and create_tables:  # as `pbl db init` leaves them, whatever came first
-        jobs.declare()
+        queues.declare()
         store.check_store(connection.store_backend(), create=True)
 
 

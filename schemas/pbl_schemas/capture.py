@@ -2,13 +2,40 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+from pbl_pipeline.records import column
+
 from . import session, video  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
+from .record_parts import part_of
 
 schema = dj.Schema()
 
 #: States of a recording of a phone.
 UPLOADING, RECEIVED, REFUSED = "uploading", "received", "refused"
+
+
+@dataclasses.dataclass(frozen=True)
+class ProtocolStep:
+    """A step of a visit's protocol. done: recordings that are usable; waiting: those without a verdict yet."""
+
+    number: int = column("step_no", "from 1, in the order of filming", "int16", key=True)
+    activity: str = column("step_activity", "as in Video", "varchar(32)")
+    pace: str = column("step_pace", "as in Pace; empty for any", "varchar(32)", empty=True)
+    view: str = column(
+        "step_view",
+        "side from which the person is filmed; front: or back",
+        "enum('left', 'right', 'front', 'any')",
+    )
+    passes: int = column("step_passes", "recordings that are wanted", "int16")
+    done: int = 0
+    waiting: int = 0
+
+    @property
+    def complete(self) -> bool:
+        """True if the visit has all of its passes."""
+        return self.done >= self.passes
 
 
 @schema
@@ -20,16 +47,7 @@ class Protocol(dj.Manual):
     protocol_created : datetime                # when registered, UTC
     """
 
-    class Step(dj.Part):
-        definition = """
-        -> master
-        step_no        : int16                 # from 1, in the order of filming
-        ---
-        step_activity  : varchar(32)           # as in Video
-        step_pace=''   : varchar(32)           # as in Pace; empty for any
-        step_view      : enum('left', 'right', 'front', 'any')  # side from which the person is filmed; front: or back
-        step_passes    : int16                 # recordings that are wanted
-        """
+    Step = part_of("Step", ProtocolStep)
 
 
 @schema

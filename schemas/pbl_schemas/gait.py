@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
@@ -20,6 +20,7 @@ from . import fit, keypoints, session, video  # noqa: F401  definitions refer to
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .review import Decision
 from .rows import Rows, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
@@ -29,6 +30,32 @@ if TYPE_CHECKING:
     from pbl_pipeline.gait.metrics_file import Curves
 
 schema = dj.Schema()
+
+
+#: Measures whose mean has a column in the row of the result -> that column, its comment.
+MEASURE_COLUMNS = {
+    "cadence_steps_per_min": ("cadence", "(steps/min)"),
+    "stride_time_s": ("stride_time", "(s)"),
+    "step_time_s": ("step_time", "(s)"),
+    "stance_percent": ("stance", "(percent) of the cycle"),
+    "swing_percent": ("swing", "(percent) of the cycle"),
+    "double_support_percent": ("double_support", "(percent) of the cycle"),
+    "double_support_time_s": ("double_support_time", "(s) both double supports of a cycle"),
+    "speed_m_per_s": ("speed", "(m/s)"),
+    "stride_length_m": ("stride_length", "(m)"),
+    "step_width_m": ("step_width", "(m)"),
+}
+
+
+def mean_columns(names: Iterable[str], prefix: str = "") -> str:
+    """Definition lines of the means of these measures; `mean_row` returns their values."""
+    columns = (MEASURE_COLUMNS[name] for name in names)
+    return "\n".join(f"{prefix}{column}=null : float64  # {comment}" for column, comment in columns)
+
+
+def mean_row(measures: Mapping[str, Measure | None], names: Iterable[str], prefix: str = "") -> dict[str, float | None]:
+    """Values of `mean_columns(names, prefix)`."""
+    return {f"{prefix}{MEASURE_COLUMNS[n][0]}": None if (m := measures[n]) is None else number(m.mean) for n in names}
 
 
 def measure_columns(prefix: str) -> str:
@@ -157,12 +184,7 @@ class GaitEvents(dj.Computed):
         {definition(GaitEvent)}
         """
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of the events
-        -> master
-        {definition(Quality, "events")}
-        """
+    Check = part_of("Check", Quality, "events", "quality checks of the events")
 
     @property
     def key_source(self) -> Any:
@@ -188,7 +210,7 @@ class GaitEvents(dj.Computed):
             }
         )
         self.Event.insert({**key, "event_no": i, **to_row(e)} for i, e in enumerate(found.events, 1))
-        self.Check.insert({**key, **to_row(check, "events")} for check in found.qc)
+        self.Check.insert_records(key, found.qc)
 
 
 @schema
@@ -205,11 +227,7 @@ class GaitCycle(dj.Computed):
     {origin_columns("cycles")}
     """  # noqa: E501
 
-    class Cycle(dj.Part):
-        definition = f"""
-        -> master
-        {definition(Cycle)}
-        """
+    Cycle = part_of("Cycle", Cycle)
 
     def make_fetch(self, key: dict) -> tuple:
         correction = correction_of(key)
@@ -264,16 +282,7 @@ class Spatiotemporal(dj.Computed):
     measures_status          : enum('PASS', 'EMPTY')
     measures_reason          : varchar(1000)   # why EMPTY
     n_steps_used             : int16
-    cadence=null             : float64         # (steps/min)
-    stride_time=null         : float64         # (s)
-    step_time=null           : float64         # (s)
-    stance=null              : float64         # (percent) of the cycle
-    swing=null               : float64         # (percent) of the cycle
-    double_support=null      : float64         # (percent) of the cycle
-    double_support_time=null : float64         # (s) both double supports of a cycle
-    speed=null               : float64         # (m/s)
-    stride_length=null       : float64         # (m)
-    step_width=null          : float64         # (m)
+    {mean_columns(MEASURE_COLUMNS)}
     {origin_columns("measures")}
     index (measures_status)
     """
@@ -318,36 +327,16 @@ class Spatiotemporal(dj.Computed):
                 "measures_status": result.status,
                 "measures_reason": result.reason[:1000],
                 "n_steps_used": result.n_steps_used,
-                **{column: mean_of(result.measures[name]) for name, column in MEASURE_COLUMNS.items()},
+                **mean_row(result.measures, MEASURE_COLUMNS),
                 **origin.row("measures"),
             }
         )
         self.Measure.insert({**key, **row} for row in measure_rows(result.measures, result.reasons))
 
 
-#: Name of a measure in metrics.json -> column of Spatiotemporal (the unit is in the column's comment).
-MEASURE_COLUMNS = {
-    "cadence_steps_per_min": "cadence",
-    "stride_time_s": "stride_time",
-    "step_time_s": "step_time",
-    "stance_percent": "stance",
-    "swing_percent": "swing",
-    "double_support_percent": "double_support",
-    "double_support_time_s": "double_support_time",
-    "speed_m_per_s": "speed",
-    "stride_length_m": "stride_length",
-    "step_width_m": "step_width",
-}
-
-
 def measure_of_row(row: Mapping[str, Any], prefix: str) -> Measure | None:
     """Return the measure of a row of `measure_columns(prefix)`, None if it is not known."""
     return None if row[f"{prefix}_mean"] is None else from_row(Measure, row, prefix)
-
-
-def mean_of(measure: Measure | None) -> float | None:
-    """The mean of a library `Measure`, None if there is none."""
-    return None if measure is None else number(measure.mean)
 
 
 def measure_rows(
@@ -373,7 +362,7 @@ def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = Non
         row,
         events=tuple(from_row(GaitEvent, e) for e in rows(GaitEvents.Event, key)),
         params_hash=row["events_method_hash"],
-        qc=in_order(from_row(Quality, check, "events") for check in rows(GaitEvents.Check, key)),
+        qc=in_order(GaitEvents.Check.records(key, rows)),
     )
     if correction is None:
         return detected

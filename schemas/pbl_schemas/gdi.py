@@ -16,6 +16,7 @@ from . import fit, gait, session, video  # noqa: F401  a definition refers to se
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import InputChanged, Rows, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
@@ -90,19 +91,11 @@ class GDI(dj.Computed):
         {definition(GdiCycle)}
         """
 
-    class Profile(dj.Part):
-        definition = f"""
-        # Movement Analysis Profile: how far each angle of the norm is from it
-        -> master
-        {definition(VariableScore, "gdi")}
-        """
+    Profile = part_of(
+        "Profile", VariableScore, "gdi", "Movement Analysis Profile: how far each angle of the norm is from it"
+    )
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of the index
-        -> master
-        {definition(Quality, "index")}
-        """
+    Check = part_of("Check", Quality, "index", "quality checks of the index")
 
     @property
     def key_source(self) -> Any:
@@ -139,8 +132,12 @@ class GDI(dj.Computed):
             }
         )
         self.Cycle.insert({**key, "cycle_no": c.number, **to_row(c)} for c in result.cycles)
-        self.Profile.insert({**key, **to_row(s, "gdi")} for s in (result.profile or _NO_PROFILE).scores)
-        self.Check.insert({**key, **to_row(check, "index")} for check in result.qc)
+        self.Profile.insert_records(key, (result.profile or _NO_PROFILE).scores)
+        self.Check.insert_records(key, result.qc)
+
+
+#: Measures whose mean stands in the row of the visit.
+_MEANS = tuple(gait.MEASURE_COLUMNS)[:6]
 
 
 @schema
@@ -160,12 +157,7 @@ class SessionGdi(dj.Computed):
     session_cycles              : int16        # used cycles
     session_corrected           : int16        # trials of the set whose events a person corrected
     session_params_hash         : char(16)     # hash over the parameters of events and index together
-    session_cadence=null        : float64      # (steps/min)
-    session_stride_time=null    : float64      # (s)
-    session_step_time=null      : float64      # (s)
-    session_stance=null         : float64      # (percent) of the cycle
-    session_swing=null          : float64      # (percent) of the cycle
-    session_double_support=null : float64      # (percent) of the cycle
+    {gait.mean_columns(_MEANS, "session_")}
     {origin_columns("session_gdi")}
     index (session_status)
     """
@@ -185,19 +177,11 @@ class SessionGdi(dj.Computed):
         {definition(Measure, "session_measure", only=OF_VISIT)}
         """
 
-    class Profile(dj.Part):
-        definition = f"""
-        # Movement Analysis Profile: how far each angle of the norm is from it
-        -> master
-        {definition(VariableScore, "session")}
-        """
+    Profile = part_of(
+        "Profile", VariableScore, "session", "Movement Analysis Profile: how far each angle of the norm is from it"
+    )
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of measures and index
-        -> master
-        {definition(Quality, "gdi")}
-        """
+    Check = part_of("Check", Quality, "gdi", "quality checks of measures and index")
 
     @property
     def key_source(self) -> Any:
@@ -264,8 +248,6 @@ class SessionGdi(dj.Computed):
         origin: Origin,
     ) -> None:
         measures, index = result.spatiotemporal, result.gdi
-        columns = ("cadence", "stride_time", "step_time", "stance", "swing", "double_support")
-        by_column = {column: name for name, column in gait.MEASURE_COLUMNS.items()}
         self.insert1(
             {
                 **key,
@@ -277,33 +259,29 @@ class SessionGdi(dj.Computed):
                 "session_cycles": measures.n_cycles_used,
                 "session_corrected": sum(r["correction_no"] is not None for r in trials),
                 "session_params_hash": result.params_hash,
-                **{f"session_{c}": gait.mean_of(measures.measures[by_column[c]]) for c in columns},
+                **gait.mean_row(measures.measures, _MEANS, "session_"),
                 **origin.row("session_gdi", method_hash=sha, model_sha256=norm_sha),
             }
         )
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
         rows = gait.measure_rows(measures.measures, measures.reasons, "session_measure", without=())
         self.Measure.insert({**key, **row} for row in rows)
-        self.Profile.insert({**key, **to_row(s, "session")} for s in (index.profile or _NO_PROFILE).scores)
-        self.Check.insert({**key, **to_row(check, "gdi")} for check in result.qc)
+        self.Profile.insert_records(key, (index.profile or _NO_PROFILE).scores)
+        self.Check.insert_records(key, result.qc)
 
 
 #: The profile of a trial or a visit without an index.
 _NO_PROFILE = MovementProfile({}, {}, None, None, None)
 
 
-def profile_of_rows(
-    rows: Sequence[Mapping[str, Any]], master: Mapping[str, Any], prefix: str
-) -> MovementProfile | None:
-    """Return the library's `MovementProfile`; None without rows."""
+def load_profile(part: Any, key: Any, row: Mapping[str, Any], rows: Rows) -> MovementProfile | None:
+    """Return the library's `MovementProfile` of a row with its part table; None without rows there."""
     from pbl_pipeline.gait import NINE_ANGLES
 
-    if not rows:
-        return None
     order = {angle: i for i, angle in enumerate(NINE_ANGLES)}
-    scores = sorted((from_row(VariableScore, r, prefix) for r in rows), key=lambda s: order.get(s.angle, len(order)))
+    scores = sorted(part.records(key, rows), key=lambda s: order.get(s.angle, len(order)))
     left, right = ({s.angle: v for s in scores if (v := getattr(s, side)) is not None} for side in ("left", "right"))
-    return from_row(MovementProfile, master, prefix, left=left, right=right)
+    return from_row(MovementProfile, row, part.prefix, left=left, right=right) if scores else None
 
 
 def pace_of(gdi_method: str, rows: Rows = stored_rows) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-_NUMBERS = ("instrument_low", "instrument_high", "minimal_change")
-_FLAGS = ("higher_is_better", "ordinal")
+NUMBERS = ("instrument_low", "instrument_high", "minimal_change")
+FLAGS = ("higher_is_better", "ordinal")
 
 
 def _row(cells: Mapping[str, str]) -> dict[str, Any]:
-    numbers = {name: float(cells[name]) if cells[name] else None for name in _NUMBERS}
-    return {**cells, **numbers, **{name: cells[name] == "yes" for name in _FLAGS}}
+    numbers = {name: float(cells[name]) if cells[name] else None for name in NUMBERS}
+    return {**cells, **numbers, **{name: cells[name] == "yes" for name in FLAGS}}
 
 
 with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as _file:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Collection
 from typing import Any
 
 import pymysql
 
 from pbl_pipeline.errors import PblError
 
-from .chain import computed_tables
 from .datajoint_setup import AccessError
-from .job_errors import error_code
 from .rows import MadeOnce
 
 #: Additional columns of DataJoint's job table, 0 for each new job, with their meaning.
@@ -43,30 +39,6 @@ def jobs_of(table: Any) -> Any:
         _add(jobs, missing)
         jobs = table.jobs
     return jobs
-
-
-def declare() -> None:
-    """Declare the queue of every computed table, which a worker's account may not."""
-    log = logging.getLogger("datajoint")
-    level = log.level
-    log.setLevel(logging.ERROR)  # it warns of types that it chooses itself for the keys of a queue
-    try:
-        for table in computed_tables():
-            jobs_of(table)
-    finally:
-        log.setLevel(level)
-
-
-def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
-    """Delete the error rows of a video (with these codes), so that the next populate tries again. Not in a transaction:
-    it may declare job tables."""
-    for table in computed_tables():
-        if "video_id" not in table.primary_key:
-            continue
-        jobs = jobs_of(table)
-        for row in (jobs.errors & {"video_id": video_id}).to_dicts():
-            if codes is None or error_code(row["error_message"]) in codes:
-                (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()
 
 
 def _add(jobs: Any, names: list[str]) -> None:

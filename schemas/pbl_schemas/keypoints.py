@@ -10,13 +10,14 @@ import numpy as np
 
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import definition, number, to_row
+from pbl_pipeline.records import number
 from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import one
 from .stored_files import file_ref, stored_file
 
@@ -70,12 +71,7 @@ class Keypoints(dj.Computed):
     {origin_columns("keypoints")}
     """  # noqa: E501
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of what was seen
-        -> master
-        {definition(Quality, "keypoints")}
-        """
+    Check = part_of("Check", Quality, "keypoints", "quality checks of what was seen")
 
     @property
     def key_source(self) -> Any:
@@ -168,7 +164,7 @@ class Keypoints(dj.Computed):
                     **origin.row("keypoints", method_hash=sha, model_sha256=model),
                 }
             )
-        self.Check.insert({**key, **to_row(check, "keypoints")} for check in checks)
+        self.Check.insert_records(key, checks)
 
 
 def camera_of_row(row: Mapping[str, Any]) -> Camera:

@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.forces import KineticMeasure
+from pbl_pipeline.results.forces import KineticMeasure, TrialKinetics
+from pbl_pipeline.results.forces import Kinetics as Result
 from pbl_pipeline.temporary import new_folder
 
 from . import capture, fit, gait, gdi, session, study, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import InputChanged
 from .stored_files import file_ref
 
 if TYPE_CHECKING:
-    from pbl_pipeline import kinetics as lib
     from pbl_pipeline.gait import GaitCycle, GaitEvents
 
 schema = dj.Schema()
@@ -53,12 +54,9 @@ class Kinetics(dj.Computed):
     -> KineticsMethod
     ---
     -> session.Session
-    forces_status        : enum('PASS', 'EMPTY')
-    forces_code          : varchar(32)         # why EMPTY, such as AID or VERTICAL_UNKNOWN
-    forces_reason        : varchar(255)        # the code in words
-    forces_mass=null     : float64             # (kg) body mass as it was stated, null: not known
+    {definition(Result, without=("residual_bw",))}
     forces_aid           : varchar(64)         # walking aid as it was stated, empty: nothing stated
-    forces_residual=null : float64             # (body weight) root mean square of the force that no foot carries
+    {definition(Result, only=("residual_bw",))}
     {origin_columns("forces")}
     index (forces_status)
     """  # noqa: E501
@@ -74,14 +72,12 @@ class Kinetics(dj.Computed):
         """
 
     class Trial(dj.Part):
-        definition = """
+        definition = f"""
         # the trials of the set, each with its curves
         -> master
         -> gait.GaitCycle
         ---
-        trial_forces_status : enum('PASS', 'EMPTY')
-        trial_forces_code   : varchar(32)      # why EMPTY
-        trial_forces_reason : varchar(255)     # the code in words
+        {definition(TrialKinetics)}
         trial_forces=null   : <object@arrays>  # npz: forces, moments and powers over time, curves of the cycles; null where there are none; docs/files.md
         """  # noqa: E501
 
@@ -106,12 +102,7 @@ class Kinetics(dj.Computed):
         forces_missing                            : varchar(100)  # why they are null
         """
 
-    class Check(dj.Part):
-        definition = f"""
-        # quality checks of the forces
-        -> master
-        {definition(Quality, "forces")}
-        """
+    Check = part_of("Check", Quality, "forces", "quality checks of the forces")
 
     @property
     def key_source(self) -> Any:
@@ -147,7 +138,7 @@ class Kinetics(dj.Computed):
         mass_kg: float | None,
         aid: str,
         method: Mapping[str, Any],
-    ) -> tuple[lib.Kinetics, list[int], str]:
+    ) -> tuple[Result, list[int], str]:
         from pbl_pipeline.kinetics import visit_kinetics
 
         fits, walks = [], []
@@ -158,19 +149,15 @@ class Kinetics(dj.Computed):
         found = visit_kinetics(fits, walks, methods.stored(**method), mass_kg=mass_kg, aid=aid)
         return found, [int(t["video_id"]) for t in trials], aid
 
-    def make_insert(self, key: dict, found: lib.Kinetics, ids: list[int], aid: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, found: Result, ids: list[int], aid: str, origin: Origin) -> None:
         from pbl_pipeline.kinetics.kinetics_file import save_arrays
 
         self.insert1(
             {
                 **key,
                 "session_id": fit.session_of_set(key),
-                "forces_status": found.status,
-                "forces_code": found.code,
-                "forces_reason": found.reason[:255],
-                "forces_mass": number(found.mass_kg),
+                **to_row(found),
                 "forces_aid": aid[:64],
-                "forces_residual": number(found.residual_bw),
                 **origin.row("forces", method_hash=found.params_hash),
             }
         )
@@ -193,9 +180,7 @@ class Kinetics(dj.Computed):
                     {
                         **key,
                         "video_id": number_of,
-                        "trial_forces_status": trial.status,
-                        "trial_forces_code": trial.code,
-                        "trial_forces_reason": trial.reason[:255],
+                        **to_row(trial),
                         "trial_forces": None if trial.series is None else path,
                     }
                 )
@@ -204,7 +189,7 @@ class Kinetics(dj.Computed):
             for v, trial in zip(ids, found.trials, strict=True)
             for c in trial.cycles
         )
-        self.Check.insert({**key, **to_row(check, "forces")} for check in found.qc)
+        self.Check.insert_records(key, found.qc)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
 
-from . import fit, keypoints, session, tracking, video
-from .chain import before
+from . import fit_sets as fit
+from . import keypoints, session, tracking, video
 from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
@@ -111,7 +111,8 @@ def _plan_locked(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]
 def queues_before_fit() -> list[Any]:
     """Queues whose error rows decide that a trial does not take part in a fit. Declares them, which ends a transaction
     that is open: ask before `locked`."""
-    return [jobs_of(table) for table in before(fit.SessionFit)]
+    stages = (video.VideoInfo, tracking.Tracking, tracking.SubjectChoice, keypoints.Keypoints, fit.TrialInput)
+    return [jobs_of(table) for table in stages]
 
 
 def plan_anew(session_id: int, failed: Sequence[Any]) -> list[dict[str, Any]]:

@@ -16,12 +16,12 @@ from .rows import one
 
 schema = dj.Schema()
 
-#: The part tables that hold checks: stage, table, prefix of its columns.
+#: Stage and part table that holds its checks.
 SOURCES = (
-    ("keypoints", keypoints.Keypoints.Check, "keypoints"),
-    ("fit", fit.SessionFit.Check, "fit"),
-    ("gait", gait.GaitEvents.Check, "events"),
-    ("gdi", gdi.SessionGdi.Check, "gdi"),
+    ("keypoints", keypoints.Keypoints.Check),
+    ("fit", fit.SessionFit.Check),
+    ("gait", gait.GaitEvents.Check),
+    ("gdi", gdi.SessionGdi.Check),
 )
 
 #: Columns of `SessionQc.Check` with the values of a check.
@@ -58,14 +58,14 @@ class SessionQc(dj.Computed):
     def make_fetch(self, key: dict) -> tuple:
         found = []
         corrected = (gait.GaitCycle & key & "correction_no IS NOT NULL").keys()
-        for stage, table, prefix in SOURCES:
+        for stage, table in SOURCES:
             of_set: Any = key
             if table is keypoints.Keypoints.Check:  # keypoints are the members of a set
                 names = keypoints.Keypoints.primary_key
                 of_set = [{k: row[k] for k in names} for row in (fit.FitSet.Video & key).to_dicts()]
             rows = (table & of_set) - (corrected if table is gait.GaitEvents.Check else [])
             checks = [
-                (row.get("video_id"), dataclasses.astuple(from_row(Quality, row, prefix)))
+                (row.get("video_id"), dataclasses.astuple(from_row(Quality, row, table.prefix)))
                 for row in rows.to_dicts(order_by="KEY")
             ]
             if table is gait.GaitEvents.Check:

@@ -126,6 +126,13 @@ def check_scores(rows: Iterable[Mapping[str, Any]]) -> None:
             check_score(row.get("score_value"), instrument, key=f"session_id={row.get('session_id')}")
 
 
+def important_change(instrument: Mapping[str, Any], before: float) -> float | None:
+    """Return the minimal important change of a score that was `before`, by the row of its instrument; None without."""
+    from pbl_pipeline.study import minimal_change_at
+
+    return minimal_change_at(before, instrument["minimal_change"], instrument["minimal_change_classes"])
+
+
 def check_score(value: Any, instrument: Mapping[str, Any], key: object = None) -> None:
     """Raise `PblError` SCORE_RANGE for a value that a row of ClinicalInstrument does not allow: outside its range, or a
     fraction of an ordinal score in points."""

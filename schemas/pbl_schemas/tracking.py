@@ -11,13 +11,16 @@ import numpy as np
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.files import check_numbers, load_npz
-from pbl_pipeline.records import number
+from pbl_pipeline.records import definition, to_row
+from pbl_pipeline.results.people import SubjectChoice as Choice
+from pbl_pipeline.results.people import TrackFigures
 from pbl_pipeline.temporary import new_folder
 
 from . import video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import delete_below, inside, one, utc_now
 from .stored_files import file_ref, stored_file
 
@@ -83,20 +86,7 @@ class Tracking(dj.Computed):
     {origin_columns("tracking")}
     """  # noqa: E501
 
-    class Person(dj.Part):
-        definition = """
-        # one person's track in figures
-        -> master
-        person_id       : int16
-        ---
-        first_frame     : int32                # first frame in view
-        last_frame      : int32                # last frame in view
-        first_time      : float64              # (s) time of the first frame in view
-        last_time       : float64              # (s) time of the last frame in view
-        n_observed      : int32                # frames in which the detector saw the person itself
-        detection_score : float64              # (0..1) median score of those frames
-        box_height      : float64              # (px) median height of the box
-        """
+    Person = part_of("Person", TrackFigures, comment="one person's track in figures")
 
     @property
     def key_source(self) -> Any:
@@ -132,7 +122,7 @@ class Tracking(dj.Computed):
                     **origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256),
                 }
             )
-        self.Person.insert({**key, **_person_row(p, tracking.time_s)} for p in tracking.persons)
+        self.Person.insert_records(key, (p.figures(tracking.time_s) for p in tracking.persons))
 
 
 @schema
@@ -141,13 +131,7 @@ class SubjectChoice(dj.Computed):
     # who is measured: chosen by score with a written reason, or by a person (SubjectOverride)
     -> Tracking
     ---
-    choice_status        : enum('CHOSEN', 'MANUAL', 'NEEDS_CHOICE', 'NO_PERSON')
-    chosen_person_id=null: int16               # null unless CHOSEN or MANUAL
-    choice_score=null    : float64             # (0..1) score of the chosen person
-    runner_up_id=null    : int16               # next best person
-    runner_up_score=null : float64             # (0..1) score of the next best person
-    choice_scores        : json                # person number to score (0..1)
-    choice_reason        : varchar(2000)       # why, in a sentence
+    {definition(Choice)}
     contact_sheet=null   : <object@arrays>    # JPEG of the people, boxed and numbered, where somebody has to choose
     {origin_columns("choice")}
     index (choice_status)
@@ -178,7 +162,7 @@ class SubjectChoice(dj.Computed):
         override: int | None,
         elsewhere: tuple | None,
         method: Mapping[str, Any],
-    ) -> tuple[lib.SubjectChoice, bytes | None, str]:
+    ) -> tuple[Choice, bytes | None, str]:
         from pbl_pipeline.tracking import carried_choice, choose_subject, contact_sheet_jpeg
 
         chooser = methods.stored(**method)
@@ -197,7 +181,7 @@ class SubjectChoice(dj.Computed):
             sheet = contact_sheet_jpeg(path, tracking, choice)
         return choice, sheet, chooser.hash
 
-    def make_insert(self, key: dict, choice: lib.SubjectChoice, sheet: bytes | None, sha: str, origin: Origin) -> None:
+    def make_insert(self, key: dict, choice: Choice, sheet: bytes | None, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
             picture = folder / "persons.jpg"
             if sheet is not None:
@@ -205,13 +189,7 @@ class SubjectChoice(dj.Computed):
             self.insert1(
                 {
                     **key,
-                    "choice_status": choice.status,
-                    "chosen_person_id": choice.person_id,
-                    "choice_score": number(choice.score),
-                    "runner_up_id": choice.runner_up_id,
-                    "runner_up_score": number(choice.runner_up_score),
-                    "choice_scores": {str(k): number(v) for k, v in choice.scores.items()},
-                    "choice_reason": choice.reason[:2000],
+                    **to_row(choice),
                     "contact_sheet": None if sheet is None else picture,
                     **origin.row("choice", method_hash=sha),
                 }
@@ -326,19 +304,3 @@ def load_tracking(path: Path, size_px: tuple[int, int], detector: str, model_sha
         for i, p in enumerate(data["person_id"])
     )
     return lib.Tracking(data["time_s"], size_px, people, detector, model_sha256)
-
-
-def _person_row(person: lib.PersonTrack, time_s: np.ndarray) -> dict[str, Any]:
-    frames = np.flatnonzero(np.isfinite(person.box_px).all(axis=1))
-    seen = np.asarray(person.observed, bool)
-    height = person.box_px[frames, 3] - person.box_px[frames, 1]
-    return {
-        "person_id": person.person_id,
-        "first_frame": int(frames[0]),
-        "last_frame": int(frames[-1]),
-        "first_time": float(time_s[frames[0]]),
-        "last_time": float(time_s[frames[-1]]),
-        "n_observed": int(seen.sum()),
-        "detection_score": float(np.median(person.score[seen])) if seen.any() else 0.0,
-        "box_height": float(np.median(height)),
-    }

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from pbl_pipeline.records import number
+from pbl_pipeline.records import definition, from_row, to_row
+from pbl_pipeline.results import JointError, TrialError
 
 from . import fit, session, video  # noqa: F401  definitions refer to session and video
 from .datajoint_setup import dj
 from .origin import Origin, computes, origin_columns
+from .record_parts import part_of
 from .rows import one, or_nan
 from .stored_files import file_ref, stored_file
 
@@ -51,31 +53,13 @@ class KinematicError(dj.Computed):
     -> ReferenceKinematics
     ---
     -> session.Session
-    error_lag             : float64            # (s) found by comparison; positive: the video is later than the reference
-    error_max_lag         : float64            # (s) how far it was searched to both sides
-    error_n               : int32              # frames compared
-    error_median_abs=null : float64            # (deg) median absolute error over all frames and the paper's joints
-    rte=null              : float64            # (m) mean distance of the pelvis paths after alignment, null where unknown
+    {definition(TrialError)}
     error_view_left       : varchar(16)        # joints of the left side seen from: front, back, ipsilateral, contralateral, mixed (also without a camera)
     error_view_right      : varchar(16)        # the same for the right side
     {origin_columns("error")}
     """  # noqa: E501
 
-    class Joint(dj.Part):
-        definition = """
-        -> master
-        error_joint           : varchar(32)    # OpenSim's name; the knee as knee_flexion, positive in flexion
-        ---
-        joint_n               : int32          # frames compared; where there is none, all below are null
-        joint_median_abs=null : float64        # (deg) median absolute error
-        joint_mean_abs=null   : float64        # (deg) mean absolute error
-        joint_bias=null       : float64        # (deg) mean of fit minus reference
-        joint_sd=null         : float64        # (deg) standard deviation of fit minus reference
-        joint_rms=null        : float64        # (deg) root of its mean square
-        joint_correlation=null: float64        # (-1..1) null where one of the two does not move
-        joint_within_90=null  : float64        # (0..1) share of frames inside the fit's 90 percent interval, or null
-        joint_normal_p=null   : float64        # (0..1) p of Shapiro-Wilk of the errors of the frames, or null
-        """
+    Joint = part_of("Joint", JointError)
 
     @property
     def key_source(self) -> Any:
@@ -103,41 +87,13 @@ class KinematicError(dj.Computed):
             {
                 **key,
                 "session_id": fit.session_of_set(key),
-                "error_lag": errors.lag_s,
-                "error_max_lag": errors.max_lag_s,
-                "error_n": errors.n,
-                "error_median_abs": number(errors.median_abs_deg),
-                "rte": number(errors.rte_m),
+                **to_row(errors),
                 "error_view_left": errors.view["left"],
                 "error_view_right": errors.view["right"],
                 **origin.row("error"),
             }
         )
-        joints = ({column: getattr(j, field) for field, column in JOINT_COLUMNS.items()} for j in errors.joints)
-        self.Joint.insert(
-            {**key, **{c: v if c in ("error_joint", "joint_n") else number(v) for c, v in row.items()}}
-            for row in joints
-        )
-
-
-#: Field of the library's `JointError` -> column of KinematicError.Joint.
-JOINT_COLUMNS = {
-    "joint": "error_joint",
-    "n": "joint_n",
-    "median_abs_deg": "joint_median_abs",
-    "mean_abs_deg": "joint_mean_abs",
-    "bias_deg": "joint_bias",
-    "sd_deg": "joint_sd",
-    "rms_deg": "joint_rms",
-    "correlation": "joint_correlation",
-    "within_90": "joint_within_90",
-    "normal_p": "joint_normal_p",
-}
-
-
-def _fields(joint: Mapping[str, Any]) -> dict[str, Any]:
-    values = {field: joint[column] for field, column in JOINT_COLUMNS.items()}
-    return {k: v if k in ("joint", "n") else or_nan(v) for k, v in values.items()}
+        self.Joint.insert_records(key, errors.joints)
 
 
 def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) -> lib.KinematicErrors:
@@ -147,18 +103,14 @@ def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) 
     """
     from pbl_pipeline import validation as lib
 
-    return lib.KinematicErrors(
-        trial=row["trial_name"],
-        reference=row["reference_name"],
-        source=row["reference_source"],
-        convention=row["reference_convention"],
-        lag_s=float(row["error_lag"]),
-        max_lag_s=float(row["error_max_lag"]),
-        n=int(row["error_n"]),
-        joints=tuple(lib.JointError(**_fields(j)) for j in joints),
-        median_abs_deg=or_nan(row["error_median_abs"]),
-        rte_m=or_nan(row["rte"]),
+    return from_row(
+        lib.KinematicErrors,
+        row,
+        joints=tuple(from_row(JointError, joint) for joint in joints),
         view={"left": row["error_view_left"], "right": row["error_view_right"]},
         residual_2d_px=or_nan(row["trial_residual_2d"]),
         residual_3d_cm=or_nan(row["trial_residual_3d"]),
+        trial=row["trial_name"],
+        **{name: row[f"reference_{name}"] for name in ("source", "convention")},
+        reference=row["reference_name"],
     )

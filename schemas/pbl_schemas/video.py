@@ -33,16 +33,15 @@ NO_CAMERA = "none"
 
 @schema
 class Video(dj.Manual):
-    definition = """
+    definition = f"""
     # a video file of one trial, or a file of laboratory markers (MarkerRecording)
     video_id        : int32
     ---
     -> session.Session
     -> [nullable] lab.CameraCalibration
-    video_path      : varchar(1000)            # where the file lies, absolute
+    {definition(Info, only=("path",))}
     video_name      : varchar(255)             # name of the file
-    video_sha256    : char(64)                 # of its bytes: the same file is never registered twice
-    video_size      : int64                    # (byte) length of the file
+    {definition(Info, only=("sha256", "size_bytes"))}
     activity        : varchar(32)              # what the subject does, such as walking
     camera_motion   : enum('static', 'handheld', 'one of several', 'none')  # none: laboratory markers
     video_created   : datetime                 # when registered, UTC

@@ -197,8 +197,8 @@ def test_places_that_an_object_store_can_hold_but_the_layout_does_not(name: str)
     assert incoming._misplaced(uploads.Upload(PurePosixPath(name)))
 
 
-def test_the_command_says_what_it_needs(tables: None, monkeypatch):
-    monkeypatch.delenv("PBL_INCOMING", raising=False)
+def test_the_command_says_what_it_needs(tables: None, environment):
+    environment(PBL_INCOMING=None)
     assert pbl("cron", "import").error_code == "USAGE"
 
 

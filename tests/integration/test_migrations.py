@@ -117,9 +117,8 @@ def home() -> Iterator[Home]:
 
 
 @pytest.fixture
-def forget(home: Home, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+def forget(home: Home, monkeypatch: pytest.MonkeyPatch, stand_ins: None) -> Iterator[Callable[[], None]]:
     """The server of this module, in use. Calling it makes the classes forget the server, as in a new process."""
-    chain.install(monkeypatch)
     with monkeypatch.context() as patch:
         for name, value in home.variables.items():
             patch.setenv(name, value)
@@ -617,7 +616,7 @@ def test_an_empty_server_gets_the_tables_as_they_are_defined(put: Put, add: Call
     assert "`pbl_lab`.`subject`: the table is created" in outcome.created
     assert [a.number for a in migrations.applied()] == [*range(1, OWN + 1)]  # with nothing to do
     assert len(lab.Subject()) == len(video.Video()) == 0
-    assert migrations.migrate() == migrations.Outcome([], [], [])
+    assert migrations.migrate() == migrations.Migrated([], [], [])
 
 
 def test_a_new_database_needs_nothing(database: Path):

@@ -29,7 +29,7 @@ from pbl_pipeline.keypoints import MultiView
 from pbl_pipeline.report.page import page_of
 from pbl_pipeline.tracking import Tracking
 from pbl_pipeline.video import VideoInfo, probe
-from pbl_pipeline.visit import Recording, Solution, Visit, load_visit, save_visit
+from pbl_pipeline.visit import Recording, Visit, load_visit, save_visit, solution_of
 from pbl_schemas import load_visit as load_from_tables
 from pbl_schemas.decisions import event_corrections
 from pbl_schemas.intake import Methods, ingest
@@ -158,7 +158,7 @@ def several_cameras(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     method = METHODS.find(default_fit(*points_of([trial])))
     session = fit_session([trial], [test_rigs.CAMERAS[0]], method)
     recording = Recording.of(session.trials[0].name, session.trials[0])
-    visit = Visit((recording,), Solution.of(session), session.qc, kind="rig", methods={"Fit": method.key})
+    visit = Visit((recording,), solution_of(session), session.qc, kind="rig", methods={"Fit": method.key})
     save_visit(pipeline.measured(visit, mass_kg=MASS_KG), folder / "out")
     return Both(folder / "out", "rig")
 

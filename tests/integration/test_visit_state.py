@@ -11,7 +11,7 @@ import pytest
 from pbl_schemas import gait, keypoints, video
 from pbl_schemas.connection import dj
 from pbl_schemas.decisions import event_corrections, review_decisions
-from pbl_schemas.intake.protocols import Step, add_protocol
+from pbl_schemas.intake.protocols import ProtocolStep, add_protocol
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.usable import usable, verdicts
 from pbl_schemas.reading.why import why, whys
@@ -79,7 +79,7 @@ def test_all_verdicts_at_once_are_those_one_by_one_with_as_many_statements(table
 
 
 def test_a_phone_is_told_what_changed_and_nothing_else(visit: int, tmp_path: Path):  # noqa: F811
-    add_protocol("clinic", [Step(1, "walking", "", "any", 1)])
+    add_protocol("clinic", [ProtocolStep(1, "walking", "", "any", 1)])
     browser, tags = phone(visit), [""]
 
     def changes() -> bool:

@@ -33,7 +33,7 @@ from pbl_schemas.capture import PhoneLink, PhoneRecording
 from pbl_schemas.cli.capture import capture
 from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
-from pbl_schemas.intake.protocols import Step, add_protocol, read_protocol, steps_of
+from pbl_schemas.intake.protocols import ProtocolStep, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading import usable as module_usable
 from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
@@ -42,7 +42,7 @@ from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, usual_words, verdict
-from tests import not_none
+from tests import Environment, not_none
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
@@ -50,9 +50,9 @@ from tests.rows import new_visit, register
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
     """A visit without recordings; the archive is a folder of the test, and its parts are small."""
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads):
         monkeypatch.setattr(module, "PART_BYTES", 4096)
     return new_visit("2026-01-10")
@@ -438,7 +438,7 @@ def drawn_take(rng: random.Random) -> tuple[str, Usable]:
 
 def test_drawn_mixes_of_takes_are_complete_by_usable_ones_alone(visit: int):
     wanted = {"1": ("walking", 2), "2": ("tug", 1), "3": ("sit_to_stand", 1)}
-    add_protocol("drawn", [Step(int(n), activity, "", "any", k) for n, (activity, k) in wanted.items()])
+    add_protocol("drawn", [ProtocolStep(int(n), activity, "", "any", k) for n, (activity, k) in wanted.items()])
     link_of(visit, protocol="drawn")
     rng, complete = random.Random(65), 0
     for _ in range(200):

@@ -21,10 +21,11 @@ from pbl_pipeline.video import VideoInfo, probe, read_frames, read_phone_log
 from pbl_schemas import connection, video
 from pbl_schemas.capture import PhoneRecording
 from pbl_schemas.intake import phone_recordings
-from pbl_schemas.intake.protocols import Step, add_protocol
+from pbl_schemas.intake.protocols import ProtocolStep, add_protocol
 from pbl_schemas.reading.usable import Usable
 from pbl_workers import phone_uploads
 from pbl_workers.web import Options, Where, certificates, create_app, phone
+from tests import Environment
 from tests.integration import web
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
@@ -91,8 +92,8 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads, phone):
         monkeypatch.setattr(module, "PART_BYTES", 65536)
     return new_visit("2026-01-10")
@@ -402,7 +403,7 @@ def test_films_without_sensors_and_says_what_is_lost(camera: Any, visit: int):
 
 
 def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch: pytest.MonkeyPatch):
-    add_protocol("clinic", [Step(1, "walking", "fast", "left", 1), Step(2, "tug", "", "any", 1)])
+    add_protocol("clinic", [ProtocolStep(1, "walking", "fast", "left", 1), ProtocolStep(2, "tug", "", "any", 1)])
     monkeypatch.setattr(phone, "usual_seconds", lambda: 14.0)
     with filming(camera, visit, protocol="clinic") as page:
         pressed = page.locator(".steps [aria-pressed='true']")

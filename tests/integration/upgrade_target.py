@@ -82,7 +82,7 @@ def migrate(at: int | None = None, after_s: float = 0.0) -> None:
 
     migrations.migrate(say=say)
     again = migrations.migrate(dry_run=True)
-    assert again == migrations.Outcome([], [], []), again
+    assert again == migrations.Migrated([], [], []), again
 
 
 if __name__ == "__main__":

@@ -93,8 +93,17 @@ def _modules(package: str) -> dict[str, set[str]]:
                     if isinstance(a, ast.JoinedStr) and isinstance(a.values[0], ast.Constant)
                 ]
                 targets |= {m for m in known for start in ahead if start.count(".") > 1 and m.startswith(start)}
+                # `import_module(f"package.{name}")`: the names of a constant of the file
+                targets |= {start + text for start in ahead for text in _texts(file)}
         found[name] = (targets & known) - {name}
     return found
+
+
+@functools.cache
+def _texts(file: Path) -> frozenset[str]:
+    """The texts of the file's constant tuples."""
+    tuples = [n.value for n in nodes(file) if isinstance(n, ast.Assign) and isinstance(n.value, ast.Tuple)]
+    return frozenset(str(e.value) for t in tuples for e in t.elts if isinstance(e, ast.Constant))
 
 
 def _in_circles(imports: dict[str, set[str]]) -> dict[str, list[str]]:
@@ -122,6 +131,48 @@ def test_a_circle_is_found():
     assert _in_circles(chain) == {}
     assert _in_circles({**chain, "c": {"b"}}) == {"b": ["c"], "c": ["b"]}
     assert _in_circles({**chain, "c": {"a"}}) == {"a": ["b"], "b": ["c"], "c": ["a"]}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_module_puts_something_into_another(package: str):
+    """`module.Class.name = ...` from outside is an import against the direction that no import shows."""
+    found = [f"{module_name(f)}: {text}" for f in files(package) for text in _put_in(ast.parse(f.read_text("utf-8")))]
+    assert not found
+
+
+def _put_in(tree: ast.Module) -> list[str]:
+    """Assignments to attributes of what was imported from our packages (DataJoint's settings are no module's)."""
+    imported: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.level or str(node.module).startswith("pbl_")):
+            imported |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Import):
+            imported |= {alias.asname or "" for alias in node.names if alias.name.startswith("pbl_")}
+    found = []
+    for node in ast.walk(tree):
+        targets: list[ast.expr] = []
+        if isinstance(node, ast.Assign):
+            targets = [t for t in node.targets if isinstance(t, ast.Attribute)]
+        elif isinstance(node, ast.AugAssign | ast.AnnAssign) and isinstance(node.target, ast.Attribute):
+            targets = [node.target]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
+            targets = [node.args[0]]
+        roots = {ast.unparse(t).partition(".")[0] for t in targets}
+        found += [ast.unparse(node)] if roots & (imported - {"dj"}) else []
+    return found
+
+
+@pytest.mark.parametrize(
+    ("code", "count"),
+    [
+        ("from . import fit\nfit.SessionFit.plan = staticmethod(len)", 1),
+        ("from .fit import SessionFit\nsetattr(SessionFit, 'plan', len)", 1),
+        ("import pbl_schemas.fit as fit\nfit.COUNT += 1", 1),
+        ("from . import fit\nfound = fit.COUNT\nfound.plan = 1", 0),
+    ],
+)
+def test_an_assignment_from_outside_is_found(code: str, count: int):
+    assert len(_put_in(ast.parse(code))) == count
 
 
 @functools.cache

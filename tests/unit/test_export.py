@@ -21,7 +21,7 @@ from pbl_pipeline.body import Y_UP_TO_Z_UP, load_body, load_marker_set
 from pbl_pipeline.csv_cells import frame_to_csv, quoted, unquoted, unquoted_frame
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.export import FORMATS, ExportOptions, write_export
-from pbl_pipeline.export.columns import Column, Labels, Table, lines, number_cells, text_cells, write_csv
+from pbl_pipeline.export.columns import Column, Table, Texts, lines, number_cells, text_cells, write_csv
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import GaitMetrics, angle_series, gait_metrics, read_lab_trial, trial_poses
 from pbl_pipeline.gait.c3d_file import C3dFile
@@ -959,7 +959,7 @@ def test_a_table_as_csv():
 
 
 def test_tables_of_a_visit(tmp_path: Path):
-    trial, values = Column("trial", Labels.of(["=cmd,x", "walk"]), "", ""), Column("v", np.array([-1.5, 2.0]), "", "")
+    trial, values = Column("trial", Texts.of(["=cmd,x", "walk"]), "", ""), Column("v", np.array([-1.5, 2.0]), "", "")
     write_csv(Table("t", (trial, values)), tmp_path / "t.csv")
     with (tmp_path / "t.csv").open(newline="") as file:
         (_, first, second) = csv.reader(file)

@@ -2,13 +2,13 @@
 
 import dataclasses
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import Column, declared, definition, from_row, stored, to_row
+from pbl_pipeline.records import column, declared, definition, from_row, stored, to_row
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
 from pbl_pipeline.results.measures import Measure
@@ -16,21 +16,21 @@ from pbl_pipeline.results.measures import Measure
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    size_m: Annotated[float | None, Column("{}_size", "float64", "(m) of {}", null=True)] = None
-    why: Annotated[str, Column("{}_why", "varchar(5)", "reason", empty=True)] = ""
+    size_m: float | None = column("{}_size", "(m) of {}", default=None)
+    why: str = column("{}_why", "reason", "varchar(5)", empty=True, default="")
 
 
 @dataclasses.dataclass(frozen=True)
 class Whole:
-    number: Annotated[int, Column("{}_no", "int16", key=True)]
-    mean: Annotated[float, Column("{}_mean", "float64", null=True)]
-    pairs: Annotated[tuple, Column("{}_pairs", "json")]
+    number: int = column("{}_no", type="int16", key=True)
+    mean: float = column("{}_mean", null=True)
+    pairs: tuple = column("{}_pairs", type="json")
     curve: np.ndarray  # in a file
     part: Part = Part()
-    side: Annotated[str, Column("{}_side", "enum('left', 'right')", null=True, before="pairs")] = ""
+    side: str = column("{}_side", type="enum('left', 'right')", null=True, before="pairs", default="")
 
     @property
-    @stored("{}_long", "bool", before="part")
+    @stored("{}_long", type="bool", before="part")
     def long(self) -> bool:
         return len(self.pairs) > 1
 

@@ -33,8 +33,8 @@ class Place:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """Outcome for a file: its name as it was sent; status as in `Registered`."""
+class Received:
+    """Outcome of a file: its name as it was sent; status as in `Registered`."""
 
     name: str
     status: str
@@ -108,7 +108,7 @@ def check(arrived: Arriving) -> PblError | None:
 
 def register(
     to: Place, arrived: Sequence[tuple[Arriving, Copy]], activity: str, pace: str, by: str
-) -> list[Outcome] | None:
+) -> list[Received] | None:
     """Register files that arrived whole; a sensor log goes with the video of its name. One outcome for each video and
     each log without a video; None, with nothing done, while the drop folder is being taken over or a person removed.
 
@@ -131,19 +131,19 @@ def register(
         expected="the video of the same name with it",
         next_step="send both together",
     )
-    out += [Outcome(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
+    out += [Received(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
     return out
 
 
-def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Outcome:
+def _register_copies(visit: VisitRecord, name: str, copies: list[Copy], by: str) -> Received:
     try:
         result: Registered = register_copies(visit, name, copies, archive_dir())
     except PblError as error:
         if CODES[error.code].cause == MACHINE:  # the others would meet it as well
             raise
-        return Outcome(name, "refused", error=error.with_key(name))
+        return Received(name, "refused", error=error.with_key(name))
     assert result.video_id is not None
     if result.status == "registered":
         record("recording", by, {}, {}, {"recording": "registered"}, video_id=result.video_id)
-    return Outcome(name, result.status, result.video_id)
+    return Received(name, result.status, result.video_id)

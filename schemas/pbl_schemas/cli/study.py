@@ -167,23 +167,33 @@ def instrument() -> None:
     "--high 5 --better higher --ordinal"
 )
 @click.argument("name")
-@click.option("--title", required=True, metavar="TEXT", help="Full name.")
-@click.option("--unit", required=True, metavar="UNIT", help="Of its values; an ordinal score in points is whole.")
-@click.option("--low", default="", metavar="VALUE", help="A lower value is refused.")
-@click.option("--high", default="", metavar="VALUE", help="A higher value is refused.")
-@click.option("--source", default="", metavar="TEXT", help="Source of the scale.")
+@click.option("--title", "instrument_name", required=True, metavar="TEXT", help="Full name.")
+@click.option(
+    "--unit",
+    "instrument_unit",
+    required=True,
+    metavar="UNIT",
+    help="Of its values; an ordinal score in points is whole.",
+)
+@click.option("--low", "instrument_low", default="", metavar="VALUE", help="A lower value is refused.")
+@click.option("--high", "instrument_high", default="", metavar="VALUE", help="A higher value is refused.")
+@click.option("--source", "instrument_source", default="", metavar="TEXT", help="Source of the scale.")
 @click.option("--better", type=click.Choice(["higher", "lower"]), required=True, help="Which values are better.")
 @click.option("--ordinal", is_flag=True, help="Its values are ranks.")
 @click.option("--minimal-change", default="", metavar="VALUE", help="Minimal important change.")
-@click.option("--change-source", default="", metavar="TEXT", help="Who found the minimal important change, in whom.")
+@click.option(
+    "--change-source",
+    "minimal_change_source",
+    default="",
+    metavar="TEXT",
+    help="Who found the minimal important change, in whom.",
+)
 def add(name: str, better: str, ordinal: bool, **stated: str) -> None:
     """Add the instrument NAME, which is then a column of sheets and a field of the web page."""
     import pbl_schemas
     from pbl_schemas.studies.study_sheets import add_instrument
 
-    columns = {"title": "instrument_name", "change_source": "minimal_change_source", "minimal_change": "minimal_change"}
-    values = {columns.get(option, f"instrument_{option}"): text for option, text in stated.items()}
-    values |= {"higher_is_better": "yes" if better == "higher" else "no", "ordinal": "yes" if ordinal else "no"}
+    values = stated | {"higher_is_better": "yes" if better == "higher" else "no", "ordinal": "yes" if ordinal else "no"}
     pbl_schemas.activate()
     errors = add_instrument({"instrument": name, **values}, getpass.getuser())
     for error in errors.values():

@@ -23,7 +23,7 @@ from pbl_pipeline.paramset import canonical_json
 from pbl_pipeline.records import number
 
 from .. import keypoints, lab, video
-from ..jobs import forget_errors
+from ..queues import forget_errors
 from ..rows import delete_below, utc_now
 from ..transactions import in_transaction, next_id
 
@@ -68,7 +68,7 @@ def camera_id_of(camera: Mapping[str, Any]) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class Change:
+class CalibrationChange:
     """A change of a device's calibration."""
 
     device: str
@@ -78,7 +78,7 @@ class Change:
     videos: frozenset[int]  # whose keypoints were deleted
 
 
-def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
+def add_calibration(file: str | Path, like: str | Path | None = None) -> CalibrationChange:
     """Register the calibration in `file` for all videos of its phone's lens, size and rate without another calibration.
     It takes the place of an older one. `like`: a recording of the phone, where the file does not name it.
 
@@ -88,7 +88,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
 
     found = load_lens_calibration(file, like)
 
-    def insert() -> list[Change]:
+    def insert() -> list[CalibrationChange]:
         key = {"device": _device(found.lens), **lab.mode_columns(found.lens)}
         row = {
             **key,
@@ -103,7 +103,7 @@ def add_calibration(file: str | Path, like: str | Path | None = None) -> Change:
     return change
 
 
-def remove_calibration(camera_id: int) -> list[Change]:
+def remove_calibration(camera_id: int) -> list[CalibrationChange]:
     """Withdraw a calibration from the devices that it is registered for. Videos that have it as their own keep it.
     Raises `PblError` DB_NOT_FOUND: no device has this calibration."""
     rows = (lab.DeviceCalibration & {"camera_id": camera_id}).to_dicts()
@@ -119,7 +119,7 @@ def remove_calibration(camera_id: int) -> list[Change]:
     return _retried(in_transaction(lambda: [_replace(key, None) for key in keys]))
 
 
-def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> Change:
+def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> CalibrationChange:
     """Put a row of DeviceCalibration, or none, in the place of that with this key; delete the outdated keypoints."""
     before = (lab.DeviceCalibration & key).to_dicts()
     (lab.DeviceCalibration & key).delete_quick()
@@ -128,10 +128,10 @@ def _replace(key: dict[str, Any], row: dict[str, Any] | None) -> Change:
     outdated = _outdated(key)
     now, old = (None if r is None else int(r["camera_id"]) for r in (row, before[0] if before else None))
     deleted = delete_below(keypoints.Keypoints, outdated)
-    return Change(key["device"], now, old, deleted, frozenset(key["video_id"] for key in outdated))
+    return CalibrationChange(key["device"], now, old, deleted, frozenset(key["video_id"] for key in outdated))
 
 
-def _retried(changes: list[Change]) -> list[Change]:
+def _retried(changes: list[CalibrationChange]) -> list[CalibrationChange]:
     """Forget errors of the other calibration. Not in a transaction: it may declare job tables."""
     for video_id in sorted(frozenset().union(*(change.videos for change in changes))):
         forget_errors(video_id)

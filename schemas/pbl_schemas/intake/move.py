@@ -16,9 +16,9 @@ from pbl_pipeline.names import check_label, normalised_label
 
 from .. import fit, gait, gdi, keypoints, kinetics, lab, session, video, worker
 from ..datajoint_setup import dj
-from ..jobs import forget_errors
 from ..operations.archive import LOCK, archive_dir, folder_of, plain_name
 from ..operations.folders import private_folder, remove_empty, sync_folders
+from ..queues import forget_errors
 from ..rows import delete_below
 from ..subject_codes import check_subject
 from ..transactions import in_transaction

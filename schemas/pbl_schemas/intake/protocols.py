@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pbl_pipeline.names import check_label
 
-from ..capture import PhoneLink, Protocol
+from ..capture import PhoneLink, Protocol, ProtocolStep
 from ..reading.usable import PENDING, REMARKS, USABLE, Usable
 from ..rows import utc_now
 from ..transactions import in_transaction
@@ -19,30 +19,9 @@ from .sheets import needed, number_of, read_sheets, refused
 
 VIEWS = ("left", "right", "front", "any")
 COLUMNS = ("activity", "pace", "view", "passes")
-#: Column of Protocol.Step -> field of `Step`.
-_STEP = {"step_no": "number", **{f"step_{name}": name for name in COLUMNS}}
 
 
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """A step of a visit's protocol. view: side from which it is filmed; done: recordings that are usable; waiting:
-    those on which there is no verdict yet."""
-
-    number: int
-    activity: str
-    pace: str
-    view: str
-    passes: int
-    done: int = 0
-    waiting: int = 0
-
-    @property
-    def complete(self) -> bool:
-        """True if the visit has all of its passes."""
-        return self.done >= self.passes
-
-
-def read_protocol(path: Path) -> list[Step]:
+def read_protocol(path: Path) -> list[ProtocolStep]:
     """Return the steps in a sheet, a row each in their order, with the columns `COLUMNS`. Raises `PblError`
     FILE_MISSING, SHEET_FORMAT."""
     (sheet,) = read_sheets(path)[:1] or [None]
@@ -58,14 +37,14 @@ def read_protocol(path: Path) -> list[Step]:
             raise refused(
                 f"view {view!r}, passes {passes:g}", f"view {', '.join(VIEWS)}; passes 1 to 99", "correct it", row.where
             )
-        steps.append(Step(number, activity, pace, view, int(passes)))
+        steps.append(ProtocolStep(number, activity, pace, view, int(passes)))
     if not 1 <= len(steps) <= MOST_RECORDINGS:
         expected = f"a row for each step, 1 to {MOST_RECORDINGS}: {', '.join(COLUMNS)}"
         raise refused(f"{len(steps)} rows", expected, "add the steps, or make two protocols", path)
     return steps
 
 
-def add_protocol(name: str, steps: Sequence[Step]) -> bool:
+def add_protocol(name: str, steps: Sequence[ProtocolStep]) -> bool:
     """Register a protocol; return whether it is new. Raises `PblError` USAGE for the name of one with other steps."""
     check_label("protocol", name, 32, 1)
     if Protocol & {"protocol": name}:
@@ -76,9 +55,7 @@ def add_protocol(name: str, steps: Sequence[Step]) -> bool:
 
     def insert() -> None:
         Protocol.insert1({"protocol": name, "protocol_created": utc_now()})
-        Protocol.Step.insert(
-            {"protocol": name, **{column: getattr(step, field) for column, field in _STEP.items()}} for step in steps
-        )
+        Protocol.Step.insert_records({"protocol": name}, steps)
 
     in_transaction(insert)
     return True
@@ -89,7 +66,7 @@ def protocols() -> list[str]:
     return sorted(str(name) for name in Protocol.to_arrays("protocol"))
 
 
-def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> list[Step]:
+def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> list[ProtocolStep]:
     """Return the steps of the protocol of a visit's newest link, with what its `phone_recordings.recordings` have done,
     a video once, and only where the activity of the step is registered; none without a protocol."""
     from pbl_pipeline.gait import Condition
@@ -108,6 +85,5 @@ def steps_of(session_id: int, sent: Iterable[tuple[Sent, Usable | None]]) -> lis
     return out
 
 
-def _steps(name: str) -> list[Step]:
-    rows = (Protocol.Step & {"protocol": name}).to_dicts(order_by="step_no")
-    return [Step(**{field: row[column] for column, field in _STEP.items()}) for row in rows]
+def _steps(name: str) -> list[ProtocolStep]:
+    return Protocol.Step.records({"protocol": name})

@@ -16,11 +16,11 @@ from pbl_pipeline.methods import of_stage
 
 from .. import fit, gait, gdi, keypoints, kinetics, session, tracking, video
 from ..datajoint_setup import DuplicateError, dj
-from ..jobs import forget_errors
 from ..method_rows import resolve_method
 from ..methods import insert_once
 from ..operations import catalog
 from ..plan import default_fit
+from ..queues import forget_errors
 from ..rows import PART, inside, rows_inside, utc_now
 from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of

@@ -15,7 +15,7 @@ from pbl_pipeline.temporary import new_folder
 
 from .. import fit, video
 from ..datajoint_setup import dj
-from ..jobs import forget_errors
+from ..queues import forget_errors
 from ..rows import utc_now
 from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of, camera_row, known_camera

@@ -12,4 +12,4 @@ applied, when, by which version, with which statements.
 
 from pbl_schemas.tables_version import Applied, applied
 
-from ._run import Migration, Outcome, available, migrate, workers_of_other_versions
+from ._run import Migrated, Migration, available, migrate, workers_of_other_versions

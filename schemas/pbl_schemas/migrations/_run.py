@@ -84,8 +84,8 @@ class Migration:
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
-    """Outcome of a run, or of a dry run. open: differences that no migration removes, as text. touched: visits, slices
+class Migrated:
+    """Result of a run, or of a dry run. open: differences that no migration removes, as text. touched: visits, slices
     and accepted checks whose results change, in words."""
 
     steps: list[tuple[str, list[str]]]
@@ -113,7 +113,7 @@ def workers_of_other_versions() -> list[str]:
     return [f"process {pid} on {host}, pbl-pipeline {version}" for host, pid, version in rows.fetchall()]
 
 
-def migrate(dry_run: bool = False, say: Say = lambda _: None, force: bool = False) -> Outcome:
+def migrate(dry_run: bool = False, say: Say = lambda _: None, force: bool = False) -> Migrated:
     """Bring the tables on the server to their definitions in this version of the code. Safe to repeat.
 
     Needs an account that may create and alter tables.
@@ -154,7 +154,7 @@ def migrate(dry_run: bool = False, say: Say = lambda _: None, force: bool = Fals
     if left := list(map(str, differences())):
         raise _differs(left)
     declare_all()
-    return Outcome(steps, created, [], plan.touched)
+    return Migrated(steps, created, [], plan.touched)
 
 
 def _bind(create: bool) -> list[str]:
@@ -184,7 +184,7 @@ def _reread() -> None:
         read_heading_again(cls)
 
 
-def _plan() -> Outcome:
+def _plan() -> Migrated:
     conn, created = connection.connect(), _bind(create=False)
     done = {a.number for a in applied()}
     due = [m for m in available() if m.number not in done]
@@ -192,7 +192,7 @@ def _plan() -> Outcome:
     planned = " ".join(s for _, statements in steps for s in statements)
     # What a planned statement changes, and what refers to a table that is still to be created, is compared afterwards.
     left = [str(d) for d in differences() if d.table not in planned and (d.known or not created)]
-    return Outcome(steps, created, left, _touched(conn, [m for m, (_, s) in zip(due, steps, strict=True) if s]))
+    return Migrated(steps, created, left, _touched(conn, [m for m, (_, s) in zip(due, steps, strict=True) if s]))
 
 
 def _touched(conn: Any, due: Sequence[Migration]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .. import connection, jobs, store
+from .. import connection, queues, store
 from .._activate import activate
 
 
@@ -12,5 +12,5 @@ def declare_all() -> None:
     Raises what `pbl_schemas.activate` raises, STORE_UNAVAILABLE.
     """
     activate()
-    jobs.declare()
+    queues.declare()
     store.check_store(connection.store_backend(), create=True)

@@ -11,7 +11,6 @@ from pbl_pipeline.change import Change, change_since, measure_changes, not_alike
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.filming import Difference
 from pbl_pipeline.gait import MEASURES
-from pbl_pipeline.study import minimal_change_at
 from pbl_pipeline.validation import touched
 
 from .. import connection, fit, gait, gdi, study, video
@@ -216,7 +215,7 @@ def _scores(ids: set[int]) -> dict[int, dict[str, float]]:
 def _score(value: float, before: float | None, instrument: dict[str, Any]) -> Score:
     if before is None:
         return Score(value, None, None)
-    least = minimal_change_at(before, instrument["minimal_change"], instrument["minimal_change_classes"])
+    least = study.important_change(instrument, before)
     return Score(value, value - before, None if least is None else abs(value - before) >= least)
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pbl_pipeline.records import from_row, number
-from pbl_pipeline.results import Gdi, GdiCycle, KineticMeasure
+from pbl_pipeline.qc import in_order
+from pbl_pipeline.records import from_row
+from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, KineticMeasure, Kinetics, Solution, TrialKinetics
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
-from ..rows import Rows, or_nan, row_of, stored_rows
+from ..rows import Rows, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
@@ -21,9 +22,7 @@ if TYPE_CHECKING:
     from pbl_pipeline import tracking as tracking_lib
     from pbl_pipeline.fit import TrialFit
     from pbl_pipeline.keypoints import Keypoints
-    from pbl_pipeline.kinetics import CycleKinetics, Kinetics, TrialKinetics
     from pbl_pipeline.qc import Check
-    from pbl_pipeline.visit import Solution
 
 
 def videos_of(key: Mapping[str, Any], rows: Rows = stored_rows) -> list[int]:
@@ -56,29 +55,25 @@ def _keys(key: Any) -> Any:
 
 def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     """The library's `Solution` of one row of SessionFit: how its body was fitted, without the fitted movements."""
-    from pbl_pipeline.visit import Solution
-
     row = row_of(fit.SessionFit, _of(fit.SessionFit, key), rows)
     with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         scale, trace = f["scale"], f["loss_trace"]
-    return Solution(
-        solver=row["solver"],
+    found = from_row(
+        Solution,
+        row,
         params_hash=row["fit_method_hash"],
-        # NULL for fits older than these columns: the trace ends with the last step, convergence is unknown
-        iterations=int(trace[-1, 0] if row["fit_iterations"] is None else row["fit_iterations"]),
-        converged=None if row["fit_converged"] is None else bool(row["fit_converged"]),
         scale=scale,
         loss_trace=trace,
         seconds=float(row["fit_seconds"]),
-        compile_seconds=float(row["compile_seconds"]),
-        device=row["compute_device"],
         software=row["fit_code_version"],
     )
+    # NULL for fits older than this column: the trace ends with the last step
+    return found if found.iterations is not None else dataclasses.replace(found, iterations=int(trace[-1, 0]))
 
 
-def load_fit_checks(key: Any, rows: Rows = stored_rows) -> list[Check]:
+def load_fit_checks(key: Any, rows: Rows = stored_rows) -> tuple[Check, ...]:
     """The library's `Check`s of one row of SessionFit."""
-    return _checks(rows(fit.SessionFit.Check, key), "fit")
+    return in_order(fit.SessionFit.Check.records(key, rows))
 
 
 def load_tracking(key: Any) -> tracking_lib.Tracking:
@@ -87,26 +82,6 @@ def load_tracking(key: Any) -> tracking_lib.Tracking:
     size = (video.VideoInfo & {"video_id": row["video_id"]}).fetch1("width", "height")
     with stored_file(file_ref(row["tracks"])) as path:
         return tracking.load_tracking(path, (int(size[0]), int(size[1])), row["detector"], row["tracking_model_sha256"])
-
-
-def load_choice(row: Mapping[str, Any]) -> tracking_lib.SubjectChoice:
-    from pbl_pipeline.tracking import SubjectChoice
-
-    return SubjectChoice(
-        status=row["choice_status"],
-        person_id=None if row["chosen_person_id"] is None else int(row["chosen_person_id"]),
-        score=or_nan(row["choice_score"]),
-        runner_up_id=None if row["runner_up_id"] is None else int(row["runner_up_id"]),
-        runner_up_score=or_nan(row["runner_up_score"]),
-        scores={int(k): or_nan(v) for k, v in row["choice_scores"].items()},
-        reason=row["choice_reason"],
-    )
-
-
-def _checks(rows: Sequence[Mapping[str, Any]], prefix: str) -> list[Check]:
-    from pbl_pipeline.qc import Check, in_order
-
-    return list(in_order(from_row(Check, row, prefix) for row in rows))
 
 
 def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
@@ -126,7 +101,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     )
     pooled = [t for t in trials if t.pooled]
     norm_name, model, params_hash = _index_of(row_key, rows)
-    checks = _checks(rows(gdi.SessionGdi.Check, row_key), "gdi")
+    checks = in_order(gdi.SessionGdi.Check.records(row_key, rows))
     index = from_row(
         Gdi,
         row,
@@ -139,7 +114,7 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         params_hash=params_hash,
         cycles=tuple(c for t in pooled for c in t.gdi.cycles),
         qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
-        profile=gdi.profile_of_rows(rows(gdi.SessionGdi.Profile, row_key), row, "session"),
+        profile=gdi.load_profile(gdi.SessionGdi.Profile, row_key, row, rows),
     )
     measures = _spatiotemporal(
         rows(gdi.SessionGdi.Measure, row_key),
@@ -222,8 +197,8 @@ def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> Gdi:
         model=model,
         params_hash=params_hash,
         cycles=cycles,
-        qc=tuple(_checks(rows(gdi.GDI.Check, key), "index")),
-        profile=gdi.profile_of_rows(rows(gdi.GDI.Profile, key), row, "gdi"),
+        qc=in_order(gdi.GDI.Check.records(key, rows)),
+        profile=gdi.load_profile(gdi.GDI.Profile, key, row, rows),
     )
 
 
@@ -245,18 +220,15 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
             reasons[name] = own["force_missing"]
             continue
         measures[name] = from_row(KineticMeasure, own, "force")
-    return lib.Kinetics(
-        status=row["forces_status"],
-        code=row["forces_code"],
-        reason=row["forces_reason"],
+    return from_row(
+        Kinetics,
+        row,
         measures=measures,
         reasons=reasons,
-        mass_kg=number(row["forces_mass"]),
-        residual_bw=number(row["forces_residual"]),
         method=row["kinetics_method"],
         params_hash=row["forces_method_hash"],
         trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
-        qc=tuple(_checks(rows(kinetics.Kinetics.Check, row_key), "forces")),
+        qc=in_order(kinetics.Kinetics.Check.records(row_key, rows)),
     )
 
 
@@ -274,7 +246,7 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
     def cycle(own: Mapping[str, Any]) -> CycleKinetics:
         number_of = int(own["cycle_no"])
         about = gait.cycle_of_row(cycles[number_of], "")
-        return lib.CycleKinetics(
+        return CycleKinetics(
             number_of,
             about.side,
             about.used,
@@ -284,13 +256,12 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
         )
 
     of_trial = {**_of(kinetics.Kinetics, row), "video_id": row["video_id"]}
-    return lib.TrialKinetics(
-        row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, row), rows)["trial_name"],
-        row["trial_forces_status"],
-        row["trial_forces_code"],
-        row["trial_forces_reason"],
-        tuple(cycle(r) for r in rows(kinetics.Kinetics.Cycle, of_trial)),
-        series,
+    return from_row(
+        TrialKinetics,
+        row,
+        name=row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, row), rows)["trial_name"],
+        cycles=tuple(cycle(r) for r in rows(kinetics.Kinetics.Cycle, of_trial)),
+        series=series,
     )
 
 

@@ -20,7 +20,7 @@ from . import registered
 from .objects import load_kinetics, load_solution, pooled_cycles
 from .visit_list import VisitRow, earlier_result, results_of, visits_of
 from .visits import load_recording, load_visit
-from .why import whys
+from .why import Step, whys
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,6 +73,7 @@ class ShownVisit:
     checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
     lacks: tuple[str, ...] = ()  # what its files lack
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person
+    stopped: Mapping[int, Step] = dataclasses.field(default_factory=dict)  # recordings that failed or wait for a choice
     marks: Mapping[int, Unusable] = dataclasses.field(default_factory=dict)  # recordings marked as not usable
     computed: str = ""  # when the checks were computed
     earlier: Result | None = None  # without a result: the last one of a part of the recordings
@@ -112,6 +113,7 @@ class ShownRecording:
     width_px: int | None = None
     height_px: int | None = None
     hidden_heads: str = ""  # how heads are hidden in what is shown; empty for the original
+    stopped: Step | None = None  # the step that failed or waits for a choice
     lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
 
     def fitted(self) -> Recording:
@@ -136,9 +138,10 @@ def _mean_of(found: Sequence[tuple[Measure | None, str]]) -> tuple[Measure | Non
     return task_measure([m.mean for m, _ in known]), ""
 
 
-def _problems(videos: Iterable[int]) -> dict[int, str]:
-    """Return why recordings have no fit, without the state of the queues where one only waits to be computed."""
-    return {v: NOT_COMPUTED if found.waits else found.verdict for v, found in whys(videos).items()}
+def _problems(videos: Iterable[int]) -> dict[int, tuple[str, Step | None]]:
+    """Return why recordings have no fit, without the state of the queues where one only waits to be computed, and the
+    step that failed or waits for a choice."""
+    return {v: (NOT_COMPUTED if found.waits else found.verdict, found.stopped) for v, found in whys(videos).items()}
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
@@ -153,11 +156,12 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
             expected=f"one of its {len(results)} results",
             next_step="open the visit from the list",
         )
-    recordings = _recordings(session_id)
+    recordings, stopped = _recordings(session_id)
     about = ShownVisit(
         row=next(v for v in of_person if v.session_id == session_id),
         recordings=recordings,
         of_person=of_person,
+        stopped=stopped,
         marks=unusable([r.number for r in recordings if r.number is not None]),
     )
     if not results:
@@ -209,8 +213,10 @@ def shown_recording(video_id: int) -> ShownRecording:
     visits = video.Video.proj("session_id") * session.Session.proj("subject", "session_label")
     named = (visits & {"video_id": video_id}).fetch1()
     lead = fit.trial_of(video_id)
+    stopped = None
     if not recording.fitted:
-        recording = dataclasses.replace(recording, problem=_problems([video_id])[video_id])
+        problem, stopped = _problems([video_id])[video_id]
+        recording = dataclasses.replace(recording, problem=problem)
     return ShownRecording(
         recording=recording,
         number=video_id,
@@ -220,6 +226,7 @@ def shown_recording(video_id: int) -> ShownRecording:
         pictures=recording.path is not None,
         **video_facts(recording),
         hidden_heads=settings.deidentify_how() if recording.path is not None else "",
+        stopped=stopped,
         lead=lead if lead != video_id else None,
     )
 
@@ -285,8 +292,8 @@ def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:
     return tuple(out)
 
 
-def _recordings(session_id: int) -> tuple[Recording, ...]:
-    """Return the recordings of a visit, with why one has no fit."""
+def _recordings(session_id: int) -> tuple[tuple[Recording, ...], dict[int, Step]]:
+    """Return the recordings of a visit, with why one has no fit, and the step at which one stopped."""
     from pbl_pipeline.gait import Condition
     from pbl_pipeline.visit import Recording
 
@@ -297,6 +304,6 @@ def _recordings(session_id: int) -> tuple[Recording, ...]:
     for row in rows:
         number = int(row["video_id"])
         condition = Condition(row["activity"], row["pace"] or "")
-        problem = problems.get(number, "")
+        problem = problems.get(number, ("", None))[0]
         out.append(Recording(row["video_name"], condition=condition, problem=problem, number=number))
-    return tuple(out)
+    return tuple(out), {v: step for v, (_, step) in problems.items() if step is not None}

@@ -107,8 +107,7 @@ def _value(session_id: int, at: int, result: Result, measure: str) -> dict:
         "left": found.left,
         "right": found.right,
         "reason": "",
-        "error": found.error_sd,
-        "least": found.minimal_change,
+        **dict(zip(("error", "least"), found.errors, strict=True)),
     }
 
 

@@ -16,7 +16,8 @@ from typing import Any
 
 from pbl_pipeline.change import Result, change_since
 from pbl_pipeline.filming import Difference
-from pbl_pipeline.records import number
+from pbl_pipeline.records import names, number
+from pbl_pipeline.results.index import WITH_ERROR, Gdi
 
 from .. import computed_tables, fit, gdi, qc, session, study, tracking, video
 from ..decisions.review_decisions import accepted_sql, is_accepted
@@ -37,6 +38,7 @@ INCOMPLETE = "incomplete"
 #: Outcomes of the checks that can be asked for.
 OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL", "ACCEPTED")
 #: Checks (q) of measures (g).
+_WITH_ERROR = names(Gdi, "session_gdi", only=WITH_ERROR)
 _RESULT = ("fit_set", "fit_method", "gait_method", "gdi_method", "norm")
 _SAME_RESULT = " AND ".join(f"q.{k} = g.{k}" for k in _RESULT)
 #: Stands for the day of a visit without one: before all others.
@@ -165,8 +167,8 @@ def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
     open_checks = _open_checks(ids)
     rows = _ask(
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
-        " g.session_status, g.session_reason, g.session_gdi_reason, g.session_gdi, g.session_gdi_sd,"
-        " g.session_gdi_minimal_change, g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
+        f" g.session_status, g.session_reason, g.session_gdi_reason, {', '.join(f'g.{c}' for c in _WITH_ERROR)},"
+        " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
         f" FROM {_name(fit.FitSet)} f"
         f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set"
         f" AND {f'c.fit_set IN ({_places(sets)})' if sets else 'c.fit_current = 1'}"
@@ -175,8 +177,8 @@ def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
         f" WHERE f.session_id IN ({_places(ids)}) ORDER BY g.session_gdi_computed DESC",
         [*sets, *ids],
     )
-    names = ("session_id", "fit_set", "fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
-    filmed = filming_of([dict(zip(names, row, strict=False)) for row in rows])
+    of_set = ("session_id", "fit_set", "fit_set_kind", "fit_method", "gait_method", "gdi_method", "norm")
+    filmed = filming_of([dict(zip(of_set, row, strict=False)) for row in rows])
     for row, filming in zip(rows, filmed, strict=True):
         session_id, fit_set, kind, *four = row[:7]
         status, why, no_index, index, sd, change, corrected, outcome, worst = row[7:]

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError, as_said, joined, said
 from pbl_pipeline.names import distinct
+from pbl_pipeline.records import from_row
+from pbl_pipeline.results import SubjectChoice
 from pbl_pipeline.texts import LANGUAGES
 
 from .. import fit, gait, gdi, keypoints, privacy, session, tracking, video
@@ -25,7 +27,6 @@ from ..operations.archive import plain_name
 from ..rows import ReadAhead, Rows, inside, row_of, stored_rows
 from ..stored_files import file_ref, stored_file
 from .objects import (
-    load_choice,
     load_fit_checks,
     load_keypoints,
     load_kinetics,
@@ -37,7 +38,6 @@ from .objects import (
 from .slice_rows import chain_of
 
 if TYPE_CHECKING:
-    from pbl_pipeline.tracking import SubjectChoice
     from pbl_pipeline.video import PhoneLog
     from pbl_pipeline.visit import Recording, Visit
 
@@ -248,7 +248,7 @@ def _visit(found: Mapping[str, Any], videos: Sequence[dict[str, Any]], rows: Row
     visit = Visit(
         tuple(recordings),
         load_solution(fit_key, rows),
-        tuple(load_fit_checks(fit_key, rows)),
+        load_fit_checks(fit_key, rows),
         kind=kind,
         methods=methods_of(key, rows),
         key=key,
@@ -275,7 +275,7 @@ def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows
         about["video"] = video.info_of_row({**row, **probed[0]}, probed[0]["frame_time"].load())
     if key is None:
         choices = rows(tracking.SubjectChoice, of_video)
-        choice = load_choice(choices[0]) if len(choices) == 1 else None
+        choice = from_row(SubjectChoice, choices[0]) if len(choices) == 1 else None
         detected = rows(keypoints.Keypoints, of_video)
         if len(detected) == 1:
             points = {k: detected[0][k] for k in keypoints.Keypoints.primary_key}
@@ -284,7 +284,8 @@ def _recording(row: Mapping[str, Any], key: Mapping[str, Any] | None, rows: Rows
     member = row_of(fit.FitSet.Video, {"fit_set": key["fit_set"], **of_video}, rows)
     if member["keypoint_method"]:
         points = {k: member[k] for k in keypoints.Keypoints.primary_key}
-        about["choice"] = load_choice(row_of(tracking.SubjectChoice, _of(tracking.SubjectChoice, points), rows))
+        choice = row_of(tracking.SubjectChoice, _of(tracking.SubjectChoice, points), rows)
+        about["choice"] = from_row(SubjectChoice, choice)
         about["load_keypoints"] = functools.partial(load_keypoints, points, rows)
         about["load_log"] = functools.partial(_log_of, number, points, rows)
     name = row_of(fit.SessionFit.Trial, key, rows)["trial_name"]

@@ -18,7 +18,7 @@ from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
 from ..decisions.review_decisions import record
-from ..instruments import disagreement
+from ..instruments import FLAGS, NUMBERS, disagreement
 from ..intake.records import VisitRecord, add_people, delete_forces, session_ids, set_condition, set_height, set_mass
 from ..intake.sheets import (
     Imported,
@@ -46,8 +46,6 @@ TEXTS = {
     "instrument_source": 255,
     "minimal_change_source": 255,
 }
-NUMBERS = ("instrument_low", "instrument_high", "minimal_change")
-FLAGS = ("higher_is_better", "ordinal")
 _NEEDED = (*list(TEXTS)[:3], *FLAGS)
 
 

@@ -18,7 +18,7 @@ from pbl_schemas import session as sessions
 from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
-from ..browser_uploads import Arriving, Outcome, Place
+from ..browser_uploads import Arriving, Place, Received
 from ..incoming import VIDEO_ENDINGS, Copy, check_room
 from ..refresh import queue_visit
 from . import pages, site
@@ -94,7 +94,7 @@ async def upload(request: Request) -> Response:
     return upload_page(request, await site.ask(request, browser_uploads.place, number_of(request)), {}, [])
 
 
-def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Outcome]) -> Response:
+def upload_page(request: Request, to: Place, values: Mapping[str, str], outcomes: Sequence[Received]) -> Response:
     from pbl_pipeline.gait import ACTIVITIES, PACES
 
     values = {"activity": "walking", "pace": "", **values}
@@ -122,9 +122,9 @@ async def send(request: Request) -> Response:
             if error is None:
                 good.append((one, copy))
             else:
-                outcomes.append(Outcome(one.name, "refused", error=error))
+                outcomes.append(Received(one.name, "refused", error=error))
         if not whole and not outcomes:
-            outcomes.append(Outcome("", "refused", error=_no_file()))
+            outcomes.append(Received("", "refused", error=_no_file()))
         outcomes += await taken_in(request, to, good, stated)
     finally:
         for one in arriving:
@@ -138,7 +138,7 @@ async def send(request: Request) -> Response:
 
 async def taken_in(
     request: Request, to: Place, good: list[tuple[Arriving, Copy]], stated: Mapping[str, str]
-) -> list[Outcome]:
+) -> list[Received]:
     for _ in range(int(_WAIT_S) if good else 0):
         done = await site.ask(
             request, browser_uploads.register, to, good, stated["activity"], stated["pace"], sender(request)
@@ -146,7 +146,7 @@ async def taken_in(
         if done is not None:
             return done
         await asyncio.sleep(1.0)
-    return [Outcome(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
+    return [Received(one.name, "refused", error=_busy(key=one.name)) for one, _ in good]
 
 
 ROUTES = [
@@ -161,7 +161,7 @@ ROUTES = [
 
 async def _receive(
     request: Request, to: Place, arriving: list[Arriving]
-) -> tuple[dict[str, str], list[Outcome], list[tuple[Arriving, Copy]]]:
+) -> tuple[dict[str, str], list[Received], list[tuple[Arriving, Copy]]]:
     """Return the fields of a form, the files that are refused immediately, and those that are on disk.
 
     `arriving` gets every file that was begun. Nothing is written before the form's token was read.
@@ -169,7 +169,7 @@ async def _receive(
     Raises `Refused` "token", "form", "size"; `PblError` USAGE, UPLOAD_REFUSED, FILE_UNWRITABLE.
     """
     fields: dict[str, bytearray] = {}
-    outcomes: list[Outcome] = []
+    outcomes: list[Received] = []
     whole: list[tuple[Arriving, Copy]] = []
     text: bytearray | None = None
     file: Arriving | None = None
@@ -208,7 +208,7 @@ async def _receive(
     return stated, outcomes, whole
 
 
-async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | None:
+async def _begin(to: Place, part: Part, outcomes: list[Received]) -> Arriving | None:
     """Return the file that begins; one that is refused becomes an outcome, and its bytes are not kept."""
     assert part.file is not None
     check_fields({part.name: part.file})
@@ -217,7 +217,7 @@ async def _begin(to: Place, part: Part, outcomes: list[Outcome]) -> Arriving | N
     except PblError as error:
         if error.code != "UPLOAD_REFUSED":
             raise
-        outcomes.append(Outcome(str(error.key), "refused", error=error))
+        outcomes.append(Received(str(error.key), "refused", error=error))
         return None
 
 

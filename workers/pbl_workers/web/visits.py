@@ -22,8 +22,6 @@ from pbl_pipeline.gait import (
     adult_ranges,
     far_leg_of,
     leg_length_m,
-    load_norm,
-    norm_names,
     normal_bands,
 )
 from pbl_pipeline.kinetics import GRAVITY, Kinetics
@@ -102,11 +100,6 @@ def overview(visit: Visit) -> list[dict[str, Any]]:
     return found
 
 
-def norm_people(norm: str) -> int | None:
-    """Return how many typically developing children a set of the index that ships is of; None for other sets."""
-    return load_norm(norm).n if norm in norm_names() else None
-
-
 _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
 
 
@@ -139,16 +132,14 @@ ROUTES = [
 
 
 def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
-    """Return the curves and forces of a visit, or why they cannot be shown, and of how many children the norm of its
-    index is."""
+    """Return the curves and forces of a visit, or why they cannot be shown."""
     try:
         found = about.load_pooled()
         curves = None if found is None else curves_of(about, found, language)
     except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
-        return {"curves": None, "no_curves": error, "norm_people": None, "forces": None}
-    norm = "" if found is None else found.norm
+        return {"curves": None, "no_curves": error, "forces": None}
     forces = None if found is None or found.kinetics is None else forces_of(found.kinetics, language)
-    return {"curves": curves, "no_curves": None, "norm_people": norm_people(norm), "forces": forces}
+    return {"curves": curves, "no_curves": None, "forces": forces}
 
 
 async def visits(request: Request) -> Response:

@@ -1,0 +1,55 @@
+"""People in a video: the track of each, in figures too, and the choice of who is measured."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from pbl_pipeline.records import column
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackFigures:
+    """One person's track in figures."""
+
+    person_id: int = column("person_id", type="int16", key=True)
+    first_frame: int = column("first_frame", "first frame in view", "int32")
+    last_frame: int = column("last_frame", "last frame in view", "int32")
+    first_time_s: float = column("first_time", "(s) time of the first frame in view")
+    last_time_s: float = column("last_time", "(s) time of the last frame in view")
+    n_observed: int = column("n_observed", "frames in which the detector saw the person itself", "int32")
+    score: float = column("detection_score", "(0..1) median score of those frames")
+    height_px: float = column("box_height", "(px) median height of the box")
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonTrack:
+    """One person over the video. Rows of frames without the person are NaN (score 0)."""
+
+    person_id: int
+    box_px: np.ndarray  # (T, 4) x0, y0, x1, y1
+    roi_px: np.ndarray  # (T, 4) centre x, centre y, side, rotation (rad)
+    score: np.ndarray  # (T,)
+    observed: np.ndarray  # (T,) bool: detected in this frame; False where the box is interpolated over a short gap
+
+    def figures(self, time_s: np.ndarray) -> TrackFigures:
+        """Return the track in figures. time_s: (T,)."""
+        frames, seen = np.flatnonzero(np.isfinite(self.box_px).all(axis=1)), np.asarray(self.observed, bool)
+        height = np.median(self.box_px[frames, 3] - self.box_px[frames, 1])
+        score = np.median(self.score[seen]) if seen.any() else 0.0
+        first, last = frames[0], frames[-1]
+        return TrackFigures(self.person_id, first, last, time_s[first], time_s[last], seen.sum(), score, height)
+
+
+@dataclasses.dataclass(frozen=True)
+class SubjectChoice:
+    """Choice of the person to measure."""
+
+    status: str = column("choice_status", type="enum('CHOSEN', 'MANUAL', 'NEEDS_CHOICE', 'NO_PERSON')")
+    person_id: int | None = column("chosen_person_id", "null unless CHOSEN or MANUAL", "int16")
+    score: float = column("choice_score", "(0..1) score of the chosen person", null=True)
+    runner_up_id: int | None = column("runner_up_id", "next best person", "int16")
+    runner_up_score: float = column("runner_up_score", "(0..1) score of the next best person", null=True)
+    scores: dict[int, float] = column("choice_scores", "person number to score (0..1)", "json")
+    reason: str = column("choice_reason", "why, in a sentence", "varchar(2000)")  # for clinicians
