@@ -172,6 +172,24 @@ def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
     assert jobs_left() == {"VideoInfo": {"pending": 6}}
 
 
+def test_a_more_urgent_job_waits_no_longer_than_candidates_are_kept(tables: None, tmp_path: Path):
+    ids = {*register(*videos(tmp_path, *(f"walk{i}" for i in range(6))))}
+    refresh.refresh()
+    for look in (lambda: queue.most_urgent(video.VideoInfo), lambda: time.sleep(queue.KEPT_S)):
+        ids -= {job.key["video_id"] for job in queue.claim(video.VideoInfo)}
+        urgent = ids.pop()
+        video.VideoInfo.jobs.update1({"video_id": urgent, "priority": registry.FIRST})
+        look()
+        assert [job.key["video_id"] for job in queue.claim(video.VideoInfo)] == [urgent]
+    # Others took what was read: the rest of the queue is still found.
+    queue.most_urgent(video.VideoInfo)
+    video.VideoInfo.jobs.delete_quick()
+    assert queue.fill(video.VideoInfo) == 6
+    for one in ids:
+        video.VideoInfo.jobs.reserve({"video_id": one})
+    assert len(queue.claim(video.VideoInfo, 6)) == 6 - len(ids)
+
+
 @pytest.mark.parametrize("priority", [registry.NEW, registry.FIRST])
 def test_who_has_the_pictures_takes_all_that_needs_them_unless_another_job_is_more_urgent(
     tables: None, tmp_path: Path, priority: int
