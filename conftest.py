@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from tests import SHARED, compiled
+from tests import SHARED, Environment, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
 
@@ -97,13 +97,28 @@ def nothing_of_the_developer(tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield
 
 
+@pytest.fixture
+def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
+    """Variables of the environment for a test, by their names; None removes one."""
+
+    def set_for_the_test(**values: object) -> None:
+        for name, value in values.items():
+            if value is None:
+                monkeypatch.delenv(name, raising=False)
+            else:
+                monkeypatch.setenv(name, str(value))
+
+    return set_for_the_test
+
+
 @pytest.fixture(scope="session", autouse=True)
 def phases_predicted_once() -> Iterator[None]:
-    """The event network looks at each walk once: tests have few, and every report and export is of one."""
+    """Network and filter of events look at each walk once: tests have few, and every report and export is of one."""
     from pbl_pipeline.gait.events import phase
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(phase, "predict", remembered(phase.predict))
+        for function in (phase.predict, phase.smooth_phases):
+            patch.setattr(phase, function.__name__, remembered(function))
         yield
 
 

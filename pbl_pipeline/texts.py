@@ -237,21 +237,24 @@ def library(language: str, english: str) -> str:
     return Markup('<span lang="en">{}</span>').format(english)
 
 
-def on_page(language: str, english: str) -> Markup:
-    """Return a text as `library` does, without codes of errors and without the sentences that name a command: a page
-    says what to click."""
+def on_page(language: str, english: str, click: bool = True) -> Markup:
+    """Return a text as `library` does, without codes of errors and without the sentences that name a command, instead
+    of which a page says what to click; not with `click` False, where links say it."""
     if isinstance(english, Said) and (own := _own_words(language, english)) is not None:
-        return escape(own)
-    english = _CODED.sub(lambda found: "" if found[1] in CODES else found[0], str(english))
+        return escape(_uncoded(own))
+    english = _uncoded(str(english))
     shown = Markup(_IN_BRACKETS.sub("", library(language, english)))  # noqa: S704  it is escaped already
     if not _COMMAND.search(shown):
         return shown
     parts = re.split(r"(?<=[.;]) |(?<=:) (?=`?pbl )|, (?=then `?pbl )", english)
     kept = " ".join(part for part in parts if not _COMMAND.search(part)).rstrip(" ;:").removesuffix("; next")
-    if not kept:
-        return escape(text(language, "error.click"))
-    stop = "" if kept.endswith((".", "!", "?")) else "."
-    return Markup("{}{} {}").format(library(language, kept), stop, text(language, "error.click"))
+    if kept:
+        kept = library(language, kept) + ("" if kept.endswith((".", "!", "?")) else ".")
+    return Markup(" ").join(part for part in (kept, text(language, "error.click") if click else "") if part)
+
+
+def _uncoded(text: str) -> str:
+    return _CODED.sub(lambda found: "" if found[1] in CODES else found[0], text)
 
 
 def language_of(cookie: str | None, accepted: str) -> str:

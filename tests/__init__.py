@@ -12,6 +12,8 @@ from pbl_pipeline.errors import PblError
 
 T = TypeVar("T")
 
+#: The fixture `environment`: sets variables for a test; None removes one.
+Environment = Callable[..., None]
 #: The development data beside the project.
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

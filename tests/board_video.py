@@ -25,15 +25,15 @@ def film(
     u, v = np.meshgrid((np.arange(width)[:, None] + fine).ravel(), (np.arange(height)[:, None] + fine).ravel())
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
     points = np.stack([u.ravel(), v.ravel()], 1).reshape(-1, 1, 2).astype(np.float64)
-    rays = cv2.undistortPoints(points, matrix, distortion, criteria=stop).reshape(-1, 2)
-    rays = np.column_stack([rays, np.ones(len(rays))])
+    rays = cv2.undistortPoints(points, matrix, distortion, criteria=stop)
     rng = np.random.default_rng(seed)
     middle = np.array(printed.shape[::-1]) / 2 - 0.5
     for R, t in poses:
-        depth = (R[:, 2] @ t) / (rays @ R[:, 2])
-        place = (rays * depth[:, None] - t) @ R[:, :2] / m_per_px + middle
-        x, y = (place[:, k].reshape(u.shape).astype(np.float32) for k in (0, 1))
-        seen = cv2.remap(printed, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)
+        # A ray r meets the board at depth R_z.t / R_z.r: a projective map of rays to places in `printed`.
+        to_board = np.outer(R[:, :2].T @ t, -R[:, 2]) + (R[:, 2] @ t) * R[:, :2].T
+        place = cv2.perspectiveTransform(rays, np.vstack([to_board / m_per_px + np.outer(middle, R[:, 2]), R[:, 2]]))
+        place = place.reshape(*u.shape, 2).astype(np.float32)
+        seen = cv2.remap(printed, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=110)  # type: ignore[call-overload]
         seen = cv2.resize(seen, size, interpolation=cv2.INTER_AREA).astype(np.float64)
         noisy = np.clip(0.8 * seen + 20 + rng.normal(0, 2, seen.shape), 0, 255).astype(np.uint8)
         yield cv2.merge([noisy] * 3)

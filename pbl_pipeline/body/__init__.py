@@ -28,6 +28,7 @@ from pbl_pipeline.body._kinematics import (  # noqa: E402
     MarkerJacobian,
     Points,
     body_poses,
+    body_turns,
     marker_jacobian,
     marker_positions,
     scale_multipliers,

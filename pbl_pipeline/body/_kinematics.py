@@ -119,6 +119,17 @@ def marker_jacobian(
     return MarkerJacobian(at.x, jnp.stack(per_qpos, axis=-2), at.per_scale, at.per_offset)
 
 
+def body_turns(
+    body: Body, body_index: Any, qpos: Float[Array, "N Q"]
+) -> tuple[Float[Array, "N J 3 3"], Float[Array, "N J 3 Q"]]:
+    """Rotations of J bodies, to the world, at N poses, and the rotation vectors (world axes, from the left) by which
+    they turn with the joint values."""
+    frames = chain_frames(body, qpos, scaled_body_pos(body, jnp.ones(len(body.scale_names), qpos.dtype)))
+    axes = jnp.where(jnp.asarray(body.is_hinge)[:, None], frames.xaxis, 0.0).swapaxes(1, 2)
+    moves = jnp.asarray(body.moves, qpos.dtype)[body_index]
+    return frames.xmat[:, body_index], moves[:, None, :] * axes[:, None]
+
+
 def scale_multipliers(s: Float[Array, "*n S"]) -> Float[Array, "*n S"]:
     """Multipliers of the scale groups from the paper's parameters, which add to 1: 1 + overall for the first group
     ("overall"), 1 + overall + own for the others."""

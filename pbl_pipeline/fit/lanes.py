@@ -22,7 +22,7 @@ from pbl_pipeline.body import Body
 from .normal_equations import Linearised, linearise, moved
 from .problem import Problem, State
 from .solution import Outcome, outcome
-from .solvers.gauss_newton import Limits, Progress, before_first, goes_on, minimise
+from .solvers.gauss_newton import LevenbergMarquardt, Limits, Progress, terminate
 from .solvers.linear import marginal_variance
 from .weights import Weights
 
@@ -51,11 +51,12 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """End of an iteration, on the host; with the points there or, for the last one, the variances (F, U) of the frames'
+    """End of an iteration, on the host; with the keypoints' dispersion (`Linearised`) and the points there or, for the last one, the variances (F, U) of the frames'
     unknowns and the outcome."""
 
     end: Progress
     x: np.ndarray | None  # (F, P, 3)
+    dispersion: np.ndarray
     variance: np.ndarray | None = None
     outcome: Outcome | None = None
 
@@ -66,15 +67,19 @@ class Found:
         return np.stack([np.arange(1, n + 1), np.asarray(self.end.trace)[:n]], axis=1).astype(np.float64)
 
 
+def _solver(body: Body, p: Problem, w: Weights) -> LevenbergMarquardt[State]:
+    return LevenbergMarquardt(lambda state: linearise(body, p, w, state), moved, p.weight)
+
+
 def begin_of(body: Body, p: Problem, w: Weights, start: State) -> Progress:
     """State in which `fit_problem` begins."""
-    return before_first(lambda state: linearise(body, p, w, state), start)
+    return _solver(body, p, w).init(start)
 
 
 def fit_problem(body: Body, p: Problem, w: Weights, begin: Progress, limits: Limits, steps: Any = None) -> Progress:
     """Minimise the total of `objective.py` over per-frame poses, from `begin_of` or where it ended before; with
     `steps`, at most so many now."""
-    return minimise(lambda state: linearise(body, p, w, state), moved, begin, p.weight, limits, steps)
+    return _solver(body, p, w).iterate(begin, limits, steps)
 
 
 def finish(p: Problem, latest: Linearised, R_nc: Array) -> tuple[Float[Array, "F U"], Outcome]:
@@ -97,7 +102,8 @@ _finish_one = jax.jit(finish)
 
 def fetch(p: Problem, end: Progress, last: bool) -> Found:
     """Fetch the end of an iteration to the host."""
-    rest = (None, *_finish_one(p, end.latest, end.state.R_nc)) if last else (end.latest.x,)
+    rest = (None, end.latest.dispersion, *_finish_one(p, end.latest, end.state.R_nc))
+    rest = rest if last else (end.latest.x, end.latest.dispersion)
     return Found(*jax.device_get((_kept(end), *rest)))
 
 
@@ -217,19 +223,21 @@ def _round(
 ) -> tuple[Progress, Bool[Array, " lanes"]]:
     """Some iterations more of each lane that has not ended, and which have not ended then."""
     at = jax.vmap(lambda p, at: fit_problem(body, p, w, at, limits, steps))(p, at)
-    return at, goes_on(at, limits)
+    return at, ~terminate(at, limits)
 
 
 @jax.jit
 def _finished(p: Problem, end: Progress) -> tuple[Any, ...]:
     """The fields of `Found` of last ends: copies, because the arrays of `end` are given away."""
-    return jax.tree.map(jnp.copy, (_kept(end), None, *jax.vmap(finish)(p, end.latest, end.state.R_nc)))
+    return jax.tree.map(
+        jnp.copy, (_kept(end), None, end.latest.dispersion, *jax.vmap(finish)(p, end.latest, end.state.R_nc))
+    )
 
 
 @jax.jit
 def _reached(end: Progress, at: Any) -> tuple[Any, ...]:
     """The fields of `Found` of some lanes whose ends are not the last."""
-    return _some((_kept(end), end.latest.x), at)
+    return _some((_kept(end), end.latest.x, end.latest.dispersion), at)
 
 
 @jax.jit

@@ -22,3 +22,10 @@ def linearised(residual: Callable[[Array], Array], x: Float[Array, "*n D"]) -> t
 def times(a: Float[Array, "*m 3 3"], b: Float[Array, "*m 3 R"]) -> Float[Array, "*m 3 R"]:
     """Products of many small matrices, written out: a library would be called once for each."""
     return functools.reduce(jnp.add, [a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(3)])
+
+
+def cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
+    """The matrix of the cross product with a vector."""
+    zero = jnp.zeros_like(x[..., 0])
+    a, b, c = x[..., 0], x[..., 1], x[..., 2]
+    return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)

@@ -5,8 +5,8 @@ marker's or a sole's residual depends on the joints, the camera and what the ses
 its derivative is that of a function of a few numbers times the kinematic Jacobian.
 
 Unknowns of a frame: qpos (Q) and, where the camera moves, a small rotation of it (3, world axes, from the left).
-Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N) and, where the paramset asks for
-them, the detector's errors common to all frames of a trial (lean 3, depth J; N times).
+Shared: s (S), marker offsets (3 J), clocks (N, where the camera moves), floors (3 N), where the paramset asks for them
+the detector's errors common to all frames of a trial (lean 3, depth J; N times), and the unknowns of wearable sensors.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +27,10 @@ from pbl_pipeline.body import Body, MarkerJacobian, marker_jacobian, scale_multi
 
 from .detector_error import DetectorError, detector_blocks, detector_error
 from .feet_terms import later
+from .imu_term import segments_at
 from .joint_terms import shift
 from .keypoint_terms import mean_weights
-from .linearised import times
+from .linearised import cross_matrix, times
 from .objective import TERMS
 from .phone_term import phone_at
 from .problem import Problem, State, frames_at
@@ -83,7 +84,7 @@ def linearise(body: Body, p: Problem, w: Weights, state: State) -> Linearised:
         columns = _columns_of(state, p.moving)
         x, soles, costs, sum_ = _keypoint_terms(body, p, w, state, columns)
         markers, at_floor, _ = p.split(x)
-        at = At(p, w, state, markers, at_floor, phone_at(p, state))
+        at = At(p, w, state, markers, at_floor, phone_at(p, state), segments_at(body, p, state))
         values = [term.mean(at, cost) for term, cost in zip(_terms(at, *OF_MARKERS), costs, strict=True)]
         seen = functools.reduce(jnp.add, values)
         sum_, others = _add_shared(sum_, at, columns)
@@ -118,21 +119,23 @@ class _Columns(NamedTuple):
     clock: slice
     floor: slice
     detector: slice
+    wearing: slice
     frame: int  # unknowns of a frame
     size: int
 
 
 def _columns_of(state: State, moving: bool) -> _Columns:
-    sizes = [a.size for a in _shared_parts(state, moving)]
+    sizes = [sum(a.size for a in jax.tree.leaves(part)) for part in _shared_parts(state, moving)]
     ends = np.cumsum(sizes).tolist()
-    s, offset, clock, floor, detector = (slice(end - size, end) for end, size in zip(ends, sizes, strict=True))
-    return _Columns(s, offset, clock, floor, detector, state.qpos.shape[1] + 3 * moving, ends[-1])
+    slices = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return _Columns(*slices, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
-def _shared_parts(state: State, moving: bool) -> tuple[Array, ...]:
+def _shared_parts(state: State, moving: bool) -> tuple[Any, ...]:
     """The shared unknowns of a state; clocks where a camera moves."""
     detector = jnp.concatenate([state.lean, state.depth_m], axis=1)
-    return state.s, state.site_offset_m, state.clock_s if moving else state.clock_s[:0], state.floor, detector
+    clock_s = state.clock_s if moving else state.clock_s[:0]
+    return state.s, state.site_offset_m, clock_s, state.floor, detector, state.wearing
 
 
 def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[Array], State]]:
@@ -140,7 +143,7 @@ def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[A
     y, parts_of = ravel_pytree(_shared_parts(state, moving))
 
     def with_shared(y: Float[Array, " K"]) -> State:
-        s, offset, clock, floor, detector = parts_of(y)
+        s, offset, clock, floor, detector, wearing = parts_of(y)
         return dataclasses.replace(
             state,
             s=s,
@@ -149,6 +152,7 @@ def _shared(state: State, moving: bool) -> tuple[Float[Array, " K"], Callable[[A
             floor=floor,
             lean=detector[:, :3],
             depth_m=detector[:, 3:],
+            wearing=wearing,
         )
 
     return y, with_shared
@@ -209,7 +213,7 @@ def _marker_blocks(at: At, jac: MarkerJacobian, detector: DetectorError) -> tupl
     p, x, U = at.problem, jac.x_world_m, jac.per_offset
     by_frame = [jac.per_qpos]
     if p.moving:
-        by_frame.append(_cross_matrix(x))  # a camera that turns sees every point turn the other way
+        by_frame.append(cross_matrix(x))  # a camera that turns sees every point turn the other way
     A = jnp.concatenate([*by_frame, jac.per_scale], axis=-1)
     n_s, n = jac.per_scale.shape[-1], A.shape[-1]
     q = n - n_s
@@ -292,12 +296,6 @@ def _spread(a: Float[Array, "*n A"], at: Sequence[slice], size: int) -> Float[Ar
     return jnp.concatenate([*parts, zeros(size - end)], axis=-1)
 
 
-def _cross_matrix(x: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
-    zero = jnp.zeros_like(x[..., 0])
-    a, b, c = x[..., 0], x[..., 1], x[..., 2]
-    return jnp.stack([zero, -c, b, c, zero, -a, -b, a, zero], axis=-1).reshape(*x.shape, 3)
-
-
 # --- all other terms
 
 
@@ -336,7 +334,23 @@ def _add_rows(sum_: _Blocks, rows: Rows, unknowns: Unknowns, at: At, soles: _Sol
             by_s = here @ soles.by_s + there @ later(soles.by_s)
             following = there @ later(soles.by_q)
             return _add_squares(sum_, columns, rows, here @ soles.by_q, [by_s], [columns.s], following)
+        case Unknowns.SEGMENT_IN_TWO_FRAMES:
+            assert at.segments is not None
+            by_q = at.segments.by_q
+            shared = _of_wearing(D[..., 6:], trials)
+            following = D[..., 3:6] @ later(by_q)
+            return _add_squares(sum_, columns, rows, D[..., :3] @ by_q, [shared], [columns.wearing], following)
     raise AssertionError(unknowns)
+
+
+def _of_wearing(D: Float[Array, "F m E 11"], trials: Float[Array, "F N"]) -> Float[Array, "F m E _"]:
+    """Derivatives by a sensor's mounting, world, bias and clock as those by the fields of `Wearing`."""
+    frames, m, e, _ = D.shape
+    own, n = jnp.eye(m, dtype=D.dtype), trials.shape[1]
+    mount, bias = (jnp.einsum("fmek,mj->fmejk", D[..., i : i + 3], own) for i in (0, 6))
+    world = jnp.einsum("fmek,mj,fn->fmenjk", D[..., 3:6], own, trials)
+    clock = jnp.einsum("fmek,fn->fmenk", D[..., 9:], trials)
+    return jnp.concatenate([a.reshape(frames, m, e, -1) for a in (mount, world, bias, clock)], axis=-1)
 
 
 def _add_squares(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .feet_terms import LFLOOR, LSLIDE
+from .imu_term import LIMU, WEARING
 from .joint_terms import LIMITS, LPELVIS, POSE_PRIOR, SMOOTHNESS
 from .keypoint_terms import L2D, L3D, L_MARKERS
 from .phone_term import LPHONE
@@ -22,8 +23,8 @@ PAPER = (L3D, L_MARKERS, L2D, LPHONE, LOFFSET)
 OF_SINGLE_FRAMES: tuple[AnyTerm, ...] = (*PAPER, POSE_PRIOR, SCALE)
 #: All of them.
 TERMS: tuple[AnyTerm, ...] = (
-    *(*PAPER, POSE_PRIOR, LIMITS, SMOOTHNESS, LFLOOR, LSLIDE, LPELVIS, DETECTOR),
-    *(SCALE, SIZE, CLOCK, FLOOR),
+    *(*PAPER, POSE_PRIOR, LIMITS, SMOOTHNESS, LFLOOR, LSLIDE, LPELVIS, LIMU, DETECTOR),
+    *(SCALE, SIZE, CLOCK, FLOOR, WEARING),
 )
 
 

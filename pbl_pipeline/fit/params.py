@@ -144,6 +144,14 @@ class GaussNewtonParams:
     #: in standard deviations. 0: the augmenter is not used.
     weight_pelvis: float = later(0.0)
     pelvis_sd_deg: float = later(6.0)
+    #: Wearable sensors (`imu_term.py`): half squares in standard deviations, as many keypoint residuals' as they are.
+    weight_sensor: float = later(1.0)
+    huber_sensor: float = later(3.0)
+    #: Standard deviations of how a sensor sits on its segment, found from the video (deg), and of the clock's start (s)
+    #: and gain in a minute (s).
+    mount_sd_deg: float = later(20.0)
+    sensor_clock_sd_s: float = later(0.2)
+    sensor_gain_sd_s: float = later(0.006)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
     #: Least standard deviation in deg (slides: cm), added in squares: detector errors that are common to many frames,
     #: which averaging does not reduce.

@@ -36,6 +36,7 @@ from .session import Session
 from .solution import Solution
 from .solvers.gauss_newton import Limits, Progress
 from .solvers.result import Result
+from .wearables import sensor_fits, with_wearables
 from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -54,8 +55,8 @@ def solve_per_frame(
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
-    floor or the augmenter's pelvis, a first solution shows when each foot stands and what the augmenter sees, and a
-    second one uses it. Where the augmenter is needed and not available, its error takes the place of the solution.
+    floor or the augmenter's pelvis, or sensors are worn, a first solution shows when each foot stands, what the
+    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available, its error takes the place of the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
@@ -64,7 +65,7 @@ def solve_per_frame(
     if first is None:
         return
     body, w = first[0].body, Weights.of(first[0].body, params, size_unseen=pixels_alone(first[0].problem))
-    fit = fit_many if several else _one_by_one
+    fit = fit_many if several and first[0].worn is None else _one_by_one
     begun, done = dict[Task, tuple[int, _Steps]](), dict[int, Solution | PblError]()
     waiting, numbers, due = deque[Task](), itertools.count(), 0
 
@@ -117,22 +118,28 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
 
     Raises `PblError` where the augmenter is needed and not available.
     """
-    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
+    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0 or session.worn is not None
     p = session.problem
     found = yield Task(p, _with_detector(start, params), last=not twice)
     if suspicious(session, found.end.state.qpos):
         turned = yield Task(p, _with_detector(start_of(session, flip=True), params), last=not twice)
         found = min(found, turned, key=lambda f: float(f.end.cost))
-    trace, told = found.trace, None
+    trace, told, moves_with = found.trace, None, ()
     if twice:
         p, start = _on_floor(session, found)
         if params.weight_pelvis > 0:
             p = with_augmented_pelvis(session, p, np.asarray(start.qpos), np.asarray(scale_multipliers(start.s)))
             told = np.asarray(p.c_pelvis)
+        if session.worn is not None:
+            p, start, moves_with = with_wearables(session, p, start, float(found.dispersion))
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
-    return _solution(session, params, found, trace, told)
+    solution = _solution(session, params, found, trace, told)
+    if session.worn is None:
+        return solution
+    sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
+    return dataclasses.replace(solution, sensors=sensors)
 
 
 def start_of(session: Session, flip: bool = False) -> State:

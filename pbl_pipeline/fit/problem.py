@@ -49,6 +49,49 @@ class PointTable:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Wearables:
+    """What m wearable sensors measured in the recordings, and where the fit of their unknowns starts.
+
+    `quat_wxyz`: rotations M of each, its axes to its own world, P samples at a fixed interval (`SAMPLE_S`) from
+    `CLOCK_RANGE_S` before the first frame of the trial on, at the start of the clock. `turned`: their integral (s) from
+    the middle of the trial to a frame, by which an error of the rate turns M in the sensor's world. `count`: 1 in
+    frames that were measured; `follows`: correlation of the error there with that of the next frame, 0 if that was not.
+    `mount`, `world`: start of the rotations from sensor to segment and from a sensor's world to that of a trial.
+    `sd_rad`: of a sensor on its segment; `bias_sd_rad_s`: of its gyroscope; `level_sd_rad`: of the vertical of a sensor's world; `tilt_sd_rad`: of that of
+    a trial's world, 0 where it was measured. `middle_s`: of the trials; `clock_s`: start of the clock. `dispersion`: of the keypoints (`Linearised`).
+    """
+
+    body_index: Int[Array, " m"]
+    quat_wxyz: Float[Array, "N m P 4"]
+    turned: Float[Array, "F m 3 3"]
+    count: Float[Array, "F m"]
+    follows: Float[Array, "F m"]
+    mount: Float[Array, "m 4"]
+    world: Float[Array, "N m 4"]
+    sd_rad: Float[Array, " m"]
+    bias_sd_rad_s: Float[Array, " m"]
+    level_sd_rad: Float[Array, "N m"]
+    tilt_sd_rad: Float[Array, " N"]
+    middle_s: Float[Array, " N"]
+    clock_s: Float[Array, " N"]
+    dispersion: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Wearing:
+    """Unknowns of m sensors, all 0 at the start (`Wearables`): `mount` and `world`, rotation vectors from the left of
+    the two rotations; `bias` (rad/s, sensor's axes), how much faster the gyroscope is than it turns; `clock`, the
+    sensors' clock less its start (s) and how much it gains in a minute (s)."""
+
+    mount: Float[Array, "m 3"]
+    world: Float[Array, "N m 3"]
+    bias: Float[Array, "m 3"]
+    clock: Float[Array, "N 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class Problem:
     """F frames of all trials, V views, J markers, N trials; M samples of the phone's orientation per trial. W is J
     where markers were measured in the world, which have no views, and 0 otherwise.
@@ -92,6 +135,7 @@ class Problem:
     sample_quat_wxyz: Float[Array, "N M 4"]
     sample_start_s: Float[Array, " N"]
     sample_step_s: Float[Array, ""]
+    wearables: Wearables | None = None
 
     @property
     def moving(self) -> bool:
@@ -127,6 +171,7 @@ class State:
     floor: Float[Array, "N 3"]
     lean: Float[Array, "D 3"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 3)))
     depth_m: Float[Array, "D J"] = dataclasses.field(default_factory=lambda: jnp.zeros((0, 0)))
+    wearing: Wearing | None = None
 
 
 @dataclasses.dataclass(frozen=True)

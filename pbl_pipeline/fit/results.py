@@ -14,6 +14,7 @@ from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, t
 from pbl_pipeline.qc import Check
 from pbl_pipeline.records import record
 from pbl_pipeline.results import Solution
+from pbl_pipeline.sensors.worn import SensorFit
 from pbl_pipeline.video import Camera, check_lens
 
 #: Median standard deviation of a joint angle from which on the joint counts as not observed.
@@ -120,6 +121,7 @@ class SessionFit(Solution):
     trials: tuple[TrialFit, ...]
     site_offset_m: np.ndarray
     qc: tuple[Check, ...]
+    sensors: tuple[SensorFit, ...] = ()
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

@@ -23,6 +23,7 @@ from pbl_pipeline.keypoints import (
     longest_run_s,
     visibility,
 )
+from pbl_pipeline.sensors.worn import Worn
 from pbl_pipeline.video import undistort_px
 
 from .params import CostParams, Params, ViewParams
@@ -59,6 +60,7 @@ class Session:
     problem: Problem
     metre: float = 1.0
     turned: tuple[Turned, ...] = ()  # trials whose vertical was wrong (`world_checks`)
+    worn: Worn | None = None
 
     def frames(self, i: int) -> slice:
         """Position of trial `i` in the packed frames."""

@@ -15,6 +15,8 @@ from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
 from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
+from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors.worn import input_error, worn
 from pbl_pipeline.video import Camera
 
 from .checks import check_fit
@@ -22,7 +24,7 @@ from .known_height import in_metres
 from .lever_arms import with_marker_places
 from .many_sessions import Packed, Work
 from .methods import METHODS
-from .params import Params
+from .params import GaussNewtonParams, Params
 from .per_frame import start_of
 from .problem import pixels_alone
 from .results import SessionFit, TrialFit
@@ -46,6 +48,8 @@ class SessionInput:
     camera_motion: str | Sequence[str] = "static"
     markers: MarkerSet | None = None
     height_m: float | None = None
+    sensors: Sequence[SensorLog] = ()
+    sensor_clock_s: Sequence[float | None] | None = None
 
 
 def fit_session(
@@ -55,6 +59,8 @@ def fit_session(
     camera_motion: str | Sequence[str] = "static",
     markers: MarkerSet | None = None,
     height_m: float | None = None,
+    sensors: Sequence[SensorLog] = (),
+    sensor_clock_s: Sequence[float | None] | None = None,
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
 
@@ -77,8 +83,15 @@ def fit_session(
     height_m
         The person's measured body height (m), which scales the lengths of a fit to one camera; without it they have the
         detector's guess (`known_height`). Angles do not depend on it.
+    sensors
+        Logs of wearable sensors, one for each segment, all on one clock; one log for all trials. The method is
+        `gauss-newton`'s.
+    sensor_clock_s
+        Time of the logs at time 0 of each trial's video, to half a second; None where it is not known, so that it is
+        looked for in the whole log. Default: one trial, in which both begin together; not known of several.
     """
-    result = fit_sessions([SessionInput(trials, names, camera_motion, markers, height_m)], paramset)[0]
+    given = SessionInput(trials, names, camera_motion, markers, height_m, sensors, sensor_clock_s)
+    result = fit_sessions([given], paramset)[0]
     if isinstance(result, PblError):
         raise result
     return result
@@ -104,8 +117,12 @@ def fit_sessions(
         begin, given = time.perf_counter(), sessions[i]
         check_height(given.height_m)
         session = make_session(given.trials, given.names, method.params, _motions(given), given.markers)
+        sensors = worn(given.sensors, given.sensor_clock_s, len(given.trials))
+        if sensors is not None and not isinstance(method.params, GaussNewtonParams):
+            raise input_error(f"wearable sensors and the method {method.key}", "a method of the solver gauss-newton")
+        session = dataclasses.replace(session, worn=sensors)
         shapes = tuple(a.shape for a in jax.tree.leaves(session.problem))
-        kind = shapes, pixels_alone(session.problem), type(session.trials[0])
+        kind = shapes, pixels_alone(session.problem), type(session.trials[0]), sensors is None
         return Packed(i, session, start_of(session), time.perf_counter() - begin, kind)
 
     def finish(packed: Packed, solution: Solution) -> SessionFit:
@@ -167,6 +184,7 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution, taller),
+        sensors=solution.sensors,
     )
 
 

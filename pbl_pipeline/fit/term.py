@@ -33,6 +33,7 @@ class Unknowns(enum.Enum):
     JOINT_IN_THREE_FRAMES = "a joint in three frames"
     SOLE_AND_FLOOR = "joints, scale, floor"
     SOLE_IN_TWO_FRAMES = "joints of two frames, scale"
+    SEGMENT_IN_TWO_FRAMES = "joints of two frames, sensors' alignment, bias, clock"
     SHARED = "what all frames share"
 
 
@@ -45,9 +46,18 @@ class Phone(NamedTuple):
     weight: Float[Array, " M"]
 
 
+class Segments(NamedTuple):
+    """Segments with sensors: their rotations to the world, and the rotation vectors (world axes, from the left) by
+    which they turn with the joints."""
+
+    rotation: Float[Array, "F m 3 3"]
+    by_q: Float[Array, "F m 3 Q"]
+
+
 class At(NamedTuple):
     """Arguments of the terms: the frames of a problem, the parameters, the unknowns, and the markers and
-    soles where the unknowns put them in the world (m). `phone`: None if no camera turns."""
+    soles where the unknowns put them in the world (m). `phone`: None if no camera turns; `segments`: None without
+    wearable sensors."""
 
     problem: Problem
     weights: Weights
@@ -55,6 +65,7 @@ class At(NamedTuple):
     x: Float[Array, "F J 3"]
     soles: Float[Array, "F P 3"]
     phone: Phone | None = None
+    segments: Segments | None = None
 
 
 class Rows(NamedTuple):

@@ -15,7 +15,7 @@ from pbl_pipeline.results.cycles import BODY_ANGLES, GaitCycle
 from pbl_pipeline.results.events import SIDES
 from pbl_pipeline.shipped import shipped_text
 
-from .cycle_measures import Spatiotemporal
+from .cycle_measures import Measure
 from .normative import GRAVITY, PLUG_IN_GAIT, gait_norm, offset_deg
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def leg_length_m(scale: np.ndarray) -> float:
 
 
 def normal_bands(
-    measures: Spatiotemporal | None = None, leg_m: float | None = None, angle_model: str = BODY_ANGLES
+    measures: Mapping[str, Measure | None] | None = None, leg_m: float | None = None, angle_model: str = BODY_ANGLES
 ) -> NormalBands:
     """Mean and sd of healthy people's angles at the speed of the measures.
 
@@ -103,7 +103,7 @@ def normal_bands(
     norm = gait_norm()
     wanted, matched = float(norm.speed[norm.groups.index("free")]), ""
     if measures is not None and leg_m is not None:
-        speed, cadence = measures["speed_m_per_s"], measures["cadence_steps_per_min"]
+        speed, cadence = measures.get("speed_m_per_s"), measures.get("cadence_steps_per_min")
         if speed is not None:
             wanted, matched = speed.mean / float(np.sqrt(GRAVITY * leg_m)), "speed"
         elif cadence is not None:

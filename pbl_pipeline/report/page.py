@@ -104,7 +104,7 @@ def _norm(visit: Visit) -> NormativeSet | None:
 def _bands(visit: Visit) -> NormalBands:
     fit = next((r.fit for r in visit.fitted), None)
     leg = None if fit is None else leg_length_m(fit.scale)
-    return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal, leg)
+    return normal_bands(None if visit.measures is None else visit.measures.spatiotemporal.measures, leg)
 
 
 def _checks(visit: Visit, recordings: Sequence[Recording]) -> list[Check]:

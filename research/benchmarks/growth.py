@@ -107,6 +107,7 @@ def _pbl(*command: str) -> None:
 def grow(visits: int, before: int = 0, work: Callable[[], object] = lambda: queue.work(1)) -> None:
     """Make rows of so many visits, of which there are `before` already. work: computes the first."""
     from pbl_schemas.operations import catalog
+    from pbl_workers import refresh
     from research.benchmarks.many_recordings import register_many
 
     if not before:
@@ -117,6 +118,7 @@ def grow(visits: int, before: int = 0, work: Callable[[], object] = lambda: queu
     visit_list.spread(visits)
     catalog.analyse()  # as `db restore` and large imports do
     _decide()
+    refresh.refresh(True)  # plans the visits that were decided about: work that grows with the decisions
 
 
 def _decide() -> None:

@@ -1,15 +1,18 @@
 """README.md, docs/web.md and docs/capture.md read to the letter: each in an empty folder with an empty home.
 
 Every command of the pages runs as it is printed, in order, and what their numbered lists print in bold is pressed on
-the page that `pbl web` serves, until the recording is registered and queued. Beside ELSEWHERE only this differs:
+the page that `pbl web` serves, until the letter is there, or the phone's recording. This is done without a browser, in
+a Chromium at 390 and 1280 px, and in a Firefox. Beside ELSEWHERE only this differs:
 
-- `walk.mp4` is a small film of coloured frames; stand-ins detect and fit in `pbl run` and `pbl populate`;
+- `walk.mp4` is a small film of coloured frames; stand-ins detect and fit;
 - visit 3 is visit 1 here, the port is a free one, and `pbl capture link` names the address that `pbl web` printed;
 - `cert.pem` and `key.pem`, which an institution has, are made here; `clinic.csv` is the sheet in docs/capture.md;
-- no browser is needed: links are followed, forms sent, and the phone's recording is sent as its script sends it.
+- without a browser links are followed, forms sent, and the phone's recording is sent as its script sends it;
+- a browser has a camera that shows a moving picture, and takes any certificate.
 """
 
 import contextlib
+import functools
 import hashlib
 import html
 import os
@@ -19,16 +22,19 @@ import signal
 import ssl
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Protocol
 
 import httpx2
 import pytest
 
 from pbl_schemas.operations import embedded
 from pbl_workers.web import certificates
-from tests import database, pages
+from tests import Environment, database, pages, windows
 from tests.source import ROOT
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -45,21 +51,30 @@ ELSEWHERE = {
 }
 #: What is not pressed here, and where or why.
 UNPRESSED = {
-    "Compute now": "tests/integration/test_web_whole_chain.py",
     "Open the camera": "on an iPhone alone",
     "Delete and film again": "instead of Keep and send",
 }
+#: Real browsers and the width and height (px) of their windows.
+BROWSERS = {
+    "Chromium 390": (390, 844),
+    "Chromium 1280": (1280, 900),
+    "Firefox 390": (390, 844),
+    "Firefox 1280": (1280, 900),
+}
+#: On the page of a visit with an index.
+RESULT = '<span class="big">'
+NOTHING: Mapping[str, str] = MappingProxyType({})
 PASSWORD = "correct horse battery staple"
 #: `pbl`, which detects and fits by stand-ins.
 STAND_IN = f"""#!{sys.executable}
 import sys
+sys.path.insert(0, {str(ROOT)!r})
+if __name__ != "__main__" or sys.argv[1] in ("run", "populate"):  # also in the processes of `pbl web`
+    import pytest
+    from tests.integration import chain
+    chain.install(pytest.MonkeyPatch())
+    chain.install_on_files(pytest.MonkeyPatch())
 if __name__ == "__main__":
-    sys.path.insert(0, {str(ROOT)!r})
-    if sys.argv[1] in ("run", "populate"):
-        import pytest
-        from tests.integration import chain
-        chain.install(pytest.MonkeyPatch())
-        chain.install_on_files(pytest.MonkeyPatch())
     from pbl_pipeline.cli import main
     main()
 """
@@ -77,8 +92,18 @@ def to_press(page: str) -> list[str]:
     return [name for step in steps for name in re.findall(r"\*\*(.+?)\*\*", step)]
 
 
+class Shown(Protocol):
+    """One browser; `text` is the page that it shows."""
+
+    @property
+    def text(self) -> str: ...
+    def open(self, path: str) -> None: ...
+    def press(self, name: str, typed: Mapping[str, str] = NOTHING, file: Path | None = None) -> None: ...
+    def film(self) -> None: ...
+
+
 class Browser:
-    """One browser, without scripts; `text` is the page that it shows."""
+    """A browser without scripts."""
 
     def __init__(self, address: str, trusted: Path, host: str | None = None) -> None:
         """trusted: certificate of the authority, which need not be there; host: name by which it asks."""
@@ -92,8 +117,12 @@ class Browser:
         self.text = answer.text
         assert answer.status_code == 200 or "<h1>Sign in</h1>" in self.text, (answer.url, self.text)
 
-    def press(self, name: str, /, files: Any = None, **typed: str) -> None:
-        """Follow the link, or send the form with the button, of this name."""
+    def open(self, path: str) -> None:
+        self.show(self.client.get(path))
+
+    def press(self, name: str, typed: Mapping[str, str] = NOTHING, file: Path | None = None) -> None:
+        """Follow the link, or send the form with the button, of this name; wait for the result of a computation."""
+        files = {"files": (file.name, file.read_bytes())} if file else None
         if link := re.search(rf'<a [^>]*href="([^"]+)"[^>]*>{re.escape(name)}</a>', self.text):
             self.show(self.client.get(html.unescape(link[1])))
             return
@@ -103,17 +132,75 @@ class Browser:
         assert action
         boxes = re.compile(r'<(input type="(checkbox|radio)"|option)[^>]*>')
         fields = dict(re.findall(r'name="([\w:]+)" value="([^"]*)"', boxes.sub("", form)))
-        self.show(self.client.post(action[1], data={**fields, **typed}, files=files))
+        answer = self.client.post(action[1], data={**fields, **typed}, files=files)
+        self.show(answer)
+        end = time.monotonic() + 300
+        while name == "Compute now" and RESULT not in self.text:
+            assert time.monotonic() < end, self.text
+            time.sleep(0.5)
+            self.open(str(answer.url.path))
+
+    def film(self) -> None:
+        """Send a film as the script of the phone's page does, which makes one part of it."""
+        film = small_film()
+        n, part = len(film), hashlib.sha256(film)
+        stated = {"sha256": hashlib.sha256(part.digest()).hexdigest(), "video_bytes": n, "log_bytes": 0}
+        number = self.client.post("/phone/recordings.json", json=stated).json()["number"]
+        headers = {"content-range": f"bytes 0-{n - 1}/{n}", "x-sha256": part.hexdigest()}
+        headers |= {"content-type": "application/octet-stream"}
+        answer = self.client.put(f"/phone/recordings/{number}.json", content=film, headers=headers)
+        assert answer.status_code == 204, answer.text
+        assert self.client.post(f"/phone/finish/{number}.json", json={}).json()["state"] == "received"
+
+
+class Real:
+    """A window of a real browser."""
+
+    def __init__(self, address: str, window: windows.Window) -> None:
+        self.base, self.window = address.partition("/enter")[0].rstrip("/"), window
+
+    @property
+    def text(self) -> str:
+        told = "() => document.readyState === 'complete' && document.documentElement.outerHTML"
+        return windows.until(lambda: self.window.evaluate(told), "a page")
+
+    def open(self, path: str) -> None:
+        self.window.goto(path if path.startswith("http") else self.base + path)
+
+    def press(self, name: str, typed: Mapping[str, str] = NOTHING, file: Path | None = None) -> None:
+        """Click what has this name, with its fields filled in; wait for the next page, or for a computed result."""
+        fill = "([name, value]) => { document.querySelector(`[name=${name}]`).value = value; return true; }"
+        for field in typed.items():
+            windows.until(functools.partial(self.window.evaluate, fill, list(field)), field)
+        if file:
+            self.window.choose_file("input[type=file]", file)
+        self.window.evaluate("() => { globalThis.before = true; }")
+        windows.click(self.window, name)
+        follow = "() => !globalThis.before && document.readyState === 'complete'"
+        windows.until(lambda: self.window.evaluate(follow), name)
+        if name == "Compute now":  # the page loads itself
+            windows.until(lambda: RESULT in self.text, RESULT)
+
+    def film(self) -> None:
+        """Press Start, Stop and Keep and send; wait for the result below the button."""
+        windows.click(self.window, "Start")
+        filming = "() => document.querySelector('main').dataset.filming === 'yes'"
+        windows.until(lambda: self.window.evaluate(filming), "filming")
+        time.sleep(3)
+        windows.click(self.window, "Stop")
+        windows.click(self.window, "Keep and send")
+        latest = "() => document.querySelector('.latest').textContent"
+        windows.until(lambda: re.match("Usable|Film again:", self.window.evaluate(latest)), "the result")
 
 
 class Reader:
     """Does what a page prints, in an empty folder with an empty home."""
 
-    def __init__(self, page: str, folder: Path, home: Path) -> None:
-        self.page, self.folder, self.home, self.address = page, folder, home, ""
+    def __init__(self, page: str, folder: Path, home: Path, window: Callable[[], windows.Window] | None = None) -> None:
+        """window: opens one of a real browser."""
+        self.page, self.folder, self.home, self.address, self.window = page, folder, home, "", window
         self.env = {**os.environ, "PBL_HOME": str(home), "PATH": f"{folder.parent / 'bin'}:{os.environ['PATH']}"}
-        self.served, self.left = contextlib.ExitStack(), to_press(page)
-        self.film = (folder / "walk.mp4").read_bytes()
+        self.served, self.left, self.last = contextlib.ExitStack(), to_press(page), ""
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[None]:
@@ -158,7 +245,9 @@ class Reader:
                 rest = process.stdout.read()
         assert process.returncode == 0, rest
 
-    def browser(self) -> Browser:
+    def browser(self) -> Shown:
+        if self.window and "gait.example.org" not in self.address:
+            return Real(self.address, self.window())
         if "gait.example.org" not in self.address:
             return Browser(self.address, self.home / "web" / "tls" / "authority.crt")
         # A name that the network of an institution finds.
@@ -168,44 +257,37 @@ class Reader:
     def look(self, command: str) -> None:
         """Open the address; press there what the page says, the first time."""
         browser = self.browser()
-        browser.show(browser.client.get(httpx2.URL(self.address).raw_path.decode()))
+        browser.open(httpx2.URL(self.address).raw_path.decode())
         if "--folder" in command:
             assert "/visits/1" in browser.text
             return
         if "Sign in" in browser.text:
-            browser.press("Sign in", name="R.Viewer", password=PASSWORD)
+            browser.press("Sign in", {"name": "R.Viewer", "password": PASSWORD})
         assert ("<h1>P017" in browser.text) == ("--visit" in command)
         while self.left:
             browser = self.press(browser, self.left.pop(0))
+            self.last = browser.text
 
-    def press(self, browser: Browser, name: str) -> Browser:
+    def press(self, browser: Shown, name: str) -> Shown:
         """Press what has this name, with what belongs into the fields before it; the browser in which it goes on."""
         if name in UNPRESSED or name in ("Start", "Stop"):
             assert name in browser.text
         elif name == "Keep and send":
-            self.send(browser)
+            browser.film()
         elif name == "Send":
-            browser.press(name, files={"files": ("walk.mp4", self.film)})
+            browser.press(name, file=self.folder / "walk.mp4")
         else:
-            browser.press(name, **({"subject": "P017"} if name == "Register the visit" else {}))
+            browser.press(name, {"subject": "P017"} if name == "Register the visit" else NOTHING)
         if name != "Film with a phone":
             return browser
         link, phone = re.search(r"<code>(http[^<]+)", browser.text), self.browser()
         assert link
-        phone.show(phone.client.get(link[1]))
-        phone.press("Film with this phone")  # a script of the page does
+        phone.open(html.unescape(link[1]))
+        if isinstance(phone, Browser):
+            phone.press("Film with this phone")  # a script of the page does
+        else:
+            windows.until(lambda: "data-ready" in phone.text, "the phone's page")
         return phone
-
-    def send(self, phone: Browser) -> None:
-        """Send the film as the script of the phone's page does, which makes one part of it."""
-        n, part = len(self.film), hashlib.sha256(self.film)
-        stated = {"sha256": hashlib.sha256(part.digest()).hexdigest(), "video_bytes": n, "log_bytes": 0}
-        number = phone.client.post("/phone/recordings.json", json=stated).json()["number"]
-        headers = {"content-range": f"bytes 0-{n - 1}/{n}", "x-sha256": part.hexdigest()}
-        headers |= {"content-type": "application/octet-stream"}
-        answer = phone.client.put(f"/phone/recordings/{number}.json", content=self.film, headers=headers)
-        assert answer.status_code == 204, answer.text
-        assert phone.client.post(f"/phone/finish/{number}.json", json={}).json()["state"] == "received"
 
     def rows(self, table: str) -> int:
         with embedded.admin(embedded.Folder(self.home / "db")) as connection, connection.cursor() as cursor:
@@ -213,21 +295,46 @@ class Reader:
             return cursor.fetchone()[0]
 
 
+@functools.cache
+def small_film() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return write_video(Path(folder) / "walk.mp4", numbered_frames(240, 360, 640), constant_rate(240)).read_bytes()
+
+
+@pytest.fixture(params=["", *(pytest.param(name, marks=pytest.mark.long) for name in BROWSERS)])
+def window(request: pytest.FixtureRequest) -> Iterator[Callable[[], windows.Window] | None]:
+    """Opens windows of a real browser; None where none is needed."""
+    name, size = request.param, BROWSERS.get(request.param, (0, 0))
+    if "Firefox" in name:
+        with windows.firefox() as opened:
+            yield lambda: opened(*size)
+    elif name:
+        browser = request.getfixturevalue("chromium")
+        camera = ["--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream", "--no-sandbox"]
+        program = shutil.which("chromium") or shutil.which("google-chrome")
+        with browser.browser_type.launch(executable_path=program, args=camera) as own:
+            yield lambda: windows.Chromium(own, *size)
+    else:
+        yield None
+
+
 @pytest.fixture
-def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Reader]]:
+def reader(
+    tmp_path: Path, environment: Environment, window: Callable[[], windows.Window] | None
+) -> Iterator[Callable[[str], Reader]]:
     folder, home = tmp_path / "empty", database.new_home()
     for made in (folder, tmp_path / "bin"):
         made.mkdir()
     (tmp_path / "bin" / "pbl").write_text(STAND_IN)
     (tmp_path / "bin" / "pbl").chmod(0o755)
-    write_video(folder / "walk.mp4", numbered_frames(240, 360, 640), constant_rate(240))
+    (folder / "walk.mp4").write_bytes(small_film())
     (sheet,) = (b.code for b in pages.blocks("docs/capture.md") if b.language == "text")
     (folder / "clinic.csv").write_text(sheet)
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "institution"))
+    environment(PBL_HOME=tmp_path / "institution")
     cert, key = certificates.server_certificate(("gait.example.org", "127.0.0.1"))
     for path, name in ((cert, "cert.pem"), (key, "key.pem"), (certificates.authority(), "authority.pem")):
         shutil.copy(path, folder / name)
-    yield lambda page: Reader(page, folder, home)
+    yield lambda page: Reader(page, folder, home, window)
     database.remove_home(home)
 
 
@@ -241,7 +348,9 @@ def test_readme(reader: Callable[[str], Reader]):
 def test_the_page_from_nothing(reader: Callable[[str], Reader]):
     one = reader("docs/web.md")
     with one.reading():
-        assert one.rows("pbl_video.video") == one.rows("pbl_video.`~~video_info`") == 1
+        assert one.rows("pbl_video.video") == one.rows("pbl_gdi.`__session_gdi`") == 1
+        assert "<h1>Letter for the record</h1>" in one.last
+        assert RESULT in one.last
 
 
 def test_filming_from_nothing(reader: Callable[[str], Reader]):

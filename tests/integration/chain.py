@@ -5,7 +5,9 @@ and the fit give a synthetic walker; the real ones run in tests/end_to_end.
 """
 
 import dataclasses
+import functools
 import json
+import tempfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +28,7 @@ from pbl_pipeline.kinetics import compute
 from pbl_pipeline.qc import Check
 from pbl_pipeline.synthetic import plain_walk
 from pbl_pipeline.tracking import PersonTrack, Tracking
-from pbl_pipeline.video import VideoInfo, check_lens, probe
+from pbl_pipeline.video import VideoInfo, check_lens, probe, read_frames
 from tests.exported import with_markers
 from tests.remembered import remembered
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -39,9 +41,16 @@ N_FRAMES = 240
 def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walker and bystander") -> Path:
     """A real video of coloured frames; the stand-in detector reads who is in it from the file's name."""
     suffix = {"walker and bystander": "", "two alike": "_alike", "nobody": "_nobody"}[people]
-    shift = zlib.crc32(name.encode()) % 127  # other bytes for other names
-    frames = (np.roll(f, shift, axis=1) for f in numbered_frames(n, 72, 128))
-    return write_video(folder / f"{name}{suffix}.mp4", frames, constant_rate(n))
+    path = folder / f"{name}{suffix}.mp4"
+    path.write_bytes(_film(zlib.crc32(name.encode()) % 127, n))  # other bytes for other names
+    return path
+
+
+@functools.cache
+def _film(shift: int, n: int) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        frames = (np.roll(f, shift, axis=1) for f in numbered_frames(n, 72, 128))
+        return write_video(Path(folder) / "film.mp4", frames, constant_rate(n)).read_bytes()
 
 
 def camera_file(folder: Path, **more: float) -> Path:
@@ -75,8 +84,8 @@ def detect_keypoints(video_path, tracking, person_id, camera, params=None) -> Ke
     time = tracking.time_s
     found = observe(plain_walk(time, start_m=(7.0 if person_id == 1 else 9.0, -3.0)), time)
     # The small video's lens, at the same place of the walker's picture.
-    info, matrix = probe(video_path), camera.matrix.copy()
-    matrix[:2, 2] *= np.array(found.image_size_px) / (info.width_px, info.height_px)
+    (first,), matrix = read_frames(video_path, stop=1), camera.matrix.copy()
+    matrix[:2, 2] *= np.array(found.image_size_px) / first.image.shape[1::-1]
     camera = dataclasses.replace(camera, matrix=matrix)
     try:
         check_lens(camera.matrix, camera.distortion, found.image_size_px)

@@ -1,5 +1,6 @@
 """The tables as most tests of this folder want them."""
 
+import functools
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 import pbl_schemas
+from tests import Environment
 from tests.rows import Saved, remove_all
 
 from . import chain
@@ -20,9 +22,20 @@ def declared(database: Path) -> None:
 
 
 @pytest.fixture
-def tables(declared: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Empty tables with the method rows, and stand-ins for the slow stages."""
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins for the slow stages (`chain`)."""
     chain.install(monkeypatch)
+
+
+@pytest.fixture
+def change_fits(stand_ins: None, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Lets the library fit what a function makes of the fits of the stand-in (`chain.change_fits`)."""
+    return functools.partial(chain.change_fits, monkeypatch)
+
+
+@pytest.fixture
+def tables(declared: None, stand_ins: None) -> Iterator[None]:
+    """Empty tables with the method rows, and stand-ins for the slow stages."""
     yield
     remove_all()
 
@@ -61,18 +74,18 @@ def module_tables(
 
 
 @pytest.fixture
-def drop(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def drop(tables: None, tmp_path: Path, environment: Environment) -> Path:
     """An empty drop folder, which PBL_INCOMING names."""
     folder = tmp_path / "uploads"
     folder.mkdir()
-    monkeypatch.setenv("PBL_INCOMING", str(folder))
+    environment(PBL_INCOMING=folder)
     return folder
 
 
 @pytest.fixture
-def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def archive(tmp_path: Path, environment: Environment) -> Path:
     """The folder of the archive, which PBL_ARCHIVE names; whoever writes first makes it."""
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     return tmp_path / "archive"
 
 

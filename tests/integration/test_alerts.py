@@ -19,6 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pbl_pipeline import settings
 from pbl_schemas import connection, video, worker
 from pbl_workers import heartbeat, metrics
+from tests import Environment
 from tests.command import pbl
 
 from .jobs import beat, queued
@@ -107,9 +108,9 @@ def later(seconds: float, column: str = "worker_seen", where: str = "worker_reso
 
 
 @pytest.fixture
-def healthy(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def healthy(tables: None, tmp_path: Path, environment: Environment) -> Iterator[Path]:
     """An installation whose regular work ran and one worker lives; yields PBL_BACKUP."""
-    monkeypatch.setenv("PBL_BACKUP", str(tmp_path / "backups"))
+    environment(PBL_BACKUP=tmp_path / "backups")
     for name in ("refresh", "release", "disk", "backup"):
         done = pbl("cron", name, *(["--least-free", "0"] if name == "disk" else []))
         assert done.code == 0, done.err

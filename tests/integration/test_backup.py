@@ -24,6 +24,7 @@ from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.reading import frames
 from pbl_workers import backups
 from pbl_workers.populate import populate
+from tests import Environment
 from tests.command import PBL, pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes
@@ -326,10 +327,10 @@ def test_paths_that_leave_the_store_are_refused(path: str):
 
 
 def test_regular_backups_hold_recordings_once_and_the_oldest_go(
-    filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment
 ):
     films, root = registered(), tmp_path / "backups"
-    monkeypatch.setenv("PBL_BACKUP", str(root))
+    environment(PBL_BACKUP=root)
     for name in ("notes", "2026-01-01T000000Z"):  # somebody's, and an interrupted one
         (root / name).mkdir(parents=True)
     # As cron starts it: in a process that knows no table yet.

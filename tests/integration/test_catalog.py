@@ -6,6 +6,7 @@ import pytest
 
 import pbl_schemas
 from pbl_schemas.operations import catalog
+from tests import Environment
 
 
 def test_tables_and_columns_of_this_installation(declared: None):
@@ -18,9 +19,9 @@ def test_tables_and_columns_of_this_installation(declared: None):
     assert ("pbl_lab", "~lineage") in tables
 
 
-def test_another_installation_is_not_seen(declared: None, database: Path, monkeypatch: pytest.MonkeyPatch):
+def test_another_installation_is_not_seen(declared: None, database: Path, environment: Environment):
     """`pb_` as a pattern would match `pbl`: an underscore stands for any character there."""
-    monkeypatch.setenv("PBL_DB_PREFIX", "pb")
+    environment(PBL_DB_PREFIX="pb")
     assert catalog.pattern() == r"pb\_"
     assert catalog.schemas() == []
     assert catalog.tables() == {}

@@ -16,6 +16,7 @@ from pbl_schemas import connection
 from pbl_schemas.datajoint_setup import dj
 from pbl_schemas.operations import client_config
 from pbl_schemas.store import further_stores
+from tests import Environment
 from tests.command import pbl
 from tests.database import embedded_only
 
@@ -39,11 +40,11 @@ own.Tried().delete()
 
 
 @pytest.fixture
-def stores(monkeypatch: pytest.MonkeyPatch, database: Path, tmp_path: Path) -> None:
+def stores(environment: Environment, database: Path, tmp_path: Path) -> None:
     """Stores of the lab's own, one with a key."""
     far = {"protocol": "s3", "endpoint": "s.example:9000", "bucket": "b", "location": "x", "access_key": "acc3ss"}
     raw = {"protocol": "file", "location": str(tmp_path / "raw")}
-    monkeypatch.setenv("DJ_STORES", json.dumps({"default": "raw", "raw": raw, "far": {**far, "secret_key": "s3cret"}}))
+    environment(DJ_STORES=json.dumps({"default": "raw", "raw": raw, "far": {**far, "secret_key": "s3cret"}}))
 
 
 @pytest.fixture
@@ -127,8 +128,8 @@ except dj.DataJointError as error:
 
 
 @embedded_only
-def test_the_user_of_the_embedded_database_creates_schemas_of_the_users_own(database, tmp_path, monkeypatch):
-    monkeypatch.setenv("LOGNAME", "Maria.B")
+def test_the_user_of_the_embedded_database_creates_schemas_of_the_users_own(database, tmp_path, environment):
+    environment(LOGNAME="Maria.B")
     done = pbl("db", "config", "--out", tmp_path)
     assert "Your own schemas begin with maria_b_ or pbl_, such as dj.Schema('maria_b_mylab')" in done.out
     env = {k: v for k, v in os.environ.items() if not k.startswith(("DJ_", "PBL_", "PYTHONPATH"))}
@@ -158,8 +159,8 @@ def test_a_labs_own_stores_stand_beside_ours(tried):
 
 
 @pytest.mark.parametrize("value", ["[1]", "no json s3cret", '{"arrays": {"protocol": "file"}}'])
-def test_stores_that_cannot_be_are_refused_without_their_keys(monkeypatch, value):
-    monkeypatch.setenv("DJ_STORES", value)
+def test_stores_that_cannot_be_are_refused_without_their_keys(environment, value):
+    environment(DJ_STORES=value)
     with pytest.raises(PblError, match="USAGE") as caught:
         further_stores(connection.STORE)
     assert "s3cret" not in caught.value.text()

@@ -10,8 +10,13 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 import pbl_schemas
+from pbl_pipeline.errors import PblError
+from pbl_pipeline.files import sha256_of
 from pbl_schemas import connection, lab, session, tracking, video
-from pbl_schemas.intake import uploads
+from pbl_schemas.datajoint_setup import full_path
+from pbl_schemas.intake import VisitRecord, uploads
+from pbl_schemas.intake import register as register_all
+from pbl_schemas.operations.archive import PHONE, folder_of
 from pbl_schemas.operations.orphans import orphans, remove
 from pbl_workers import incoming
 from pbl_workers.heartbeat import Silent
@@ -192,8 +197,8 @@ def test_places_that_an_object_store_can_hold_but_the_layout_does_not(name: str)
     assert incoming._misplaced(uploads.Upload(PurePosixPath(name)))
 
 
-def test_the_command_says_what_it_needs(tables: None, monkeypatch):
-    monkeypatch.delenv("PBL_INCOMING", raising=False)
+def test_the_command_says_what_it_needs(tables: None, environment):
+    environment(PBL_INCOMING=None)
     assert pbl("cron", "import").error_code == "USAGE"
 
 
@@ -228,3 +233,84 @@ def test_files_without_a_row_are_found_and_rows_without_a_file(tables: None, tmp
     assert remove(left, older_than_s=1e6) == 0
     assert remove(left, older_than_s=0.0) == len(left.orphans)
     assert orphans(young_s=0.0).orphans == []
+
+
+def test_a_file_that_a_killed_process_was_writing_is_removed(tables: None):
+    before = len(orphans(young_s=0.0).orphans)
+    store = connection.store_backend()
+    paths = [f"{connection.store_root()}/pbl_tracking/tracking/{n}.npy{end}" for n, end in ((1, ".saving"), (2, ""))]
+    for path in paths:
+        file = Path(full_path(store, path))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"0")
+        os.utime(file, times=2 * (time.time() - 8 * 86_400,))
+    done = pbl("cron", "disk", "--least-free", 0)
+    assert "removed 1 that a killed process was writing" in done.out
+    assert [f.path for f in orphans(young_s=0.0).orphans if f.path in paths] == paths[1:]
+    assert remove(orphans(), 86_400.0) == 1
+    assert len(orphans(young_s=0.0).orphans) == before
+
+
+def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(tables: None, tmp_path: Path, archive: Path):
+    """Killed between the move to its place and the row, by a sender that never returns."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(*_: object) -> None:
+        raise Killed
+
+    def take(name: str, *, killed: bool) -> None:
+        came = [folder_of(archive, PHONE, "P001") / f"browser-{name}{end}" for end in (".mp4", ".csv")]
+        came[0].write_bytes(chain.small_video(tmp_path, name).read_bytes())
+        came[1].write_text(LOG)
+        copies = [incoming.Copy(came[0], sha256_of(came[0])), incoming.Copy(came[1], "")]
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed) if killed else contextlib.nullcontext():
+            if killed:
+                patch.setattr(incoming, "register", die)
+            incoming.register_copies(VisitRecord("P001", "1"), f"{name}.mp4", copies, archive)
+
+    def age() -> None:
+        for note in (archive / PHONE).rglob("*"):
+            os.utime(note, times=2 * (time.time() - 8 * 86_400,))
+
+    take("walk", killed=False)
+    whole = files(archive)
+    take("lost", killed=True)
+    left = sorted({*files(archive)} - {*whole})
+    assert [Path(name).suffix for name in left] == [".csv", ".mp4", ".placed"]
+    n = sum((archive / name).stat().st_size for name in left[:2])
+    assert f"1 recordings begun and not registered: {n / 1e9:.1f} GB" in pbl("status").out
+    assert "removed" not in pbl("cron", "release").out
+    age()
+    assert f"removed 1 recordings that were begun and did not go on ({n / 1e6:.0f} MB)" in pbl("cron", "release").out
+    assert files(archive) == whole
+    take("lost", killed=True)
+    take("lost", killed=False)  # it was sent again
+    assert len(files(archive)) == len(whole) + 2
+    with pytest.MonkeyPatch.context() as patch:  # killed once the row was there
+        patch.setattr(incoming, "register", lambda given: register_all(given) and die())
+        with pytest.raises(Killed):
+            take("third", killed=False)
+    there = files(archive)
+    age()
+    pbl("cron", "release")
+    assert [name for name in there if not name.endswith(".placed")] == files(archive)
+
+
+def test_a_recording_that_is_refused_leaves_nothing_in_the_archive(tables: None, tmp_path: Path, archive: Path):
+    came = folder_of(archive, PHONE, "P001") / "browser-1.mp4"
+    content = chain.small_video(tmp_path, "walk").read_bytes()
+    incoming.register_copies(VisitRecord("P001", "1"), "a.mp4", [placed(came, content)], archive)
+    before = files(archive)
+    with pytest.raises(PblError, match="VIDEO_DUPLICATE"):
+        incoming.register_copies(VisitRecord("P002", "1"), "a.mp4", [placed(came, content)], archive)
+    assert came.read_bytes() == content  # its sender removes it
+    came.unlink()
+    assert files(archive) == before
+
+
+def placed(path: Path, content: bytes) -> incoming.Copy:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return incoming.Copy(path, sha256_of(path))

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pymysql
@@ -23,7 +23,7 @@ from pbl_schemas.cli.db import db
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import binaries, process, server
 from pbl_schemas.operations.embedded.folder import UNPRIVILEGED, server_account
-from tests import refused
+from tests import Environment, refused
 from tests.command import PBL, program
 from tests.database import new_home, remove_home
 
@@ -351,34 +351,38 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
 # ---------------------------------------------------------------- getting the server
 
 
-def without_server(monkeypatch: pytest.MonkeyPatch, home: Path, apt: str = "") -> None:
-    """Make this machine look like one without MariaDB, whose apt is the script `apt` ("": it has none)."""
-    (home / "bin").mkdir()
-    for name in ("apt-get", "dpkg", "env", "sudo") if apt else ():
-        program(home / "bin", name, apt)
-    monkeypatch.setenv("PBL_HOME", str(home))
-    monkeypatch.setenv("PATH", str(home / "bin"))
-    monkeypatch.setattr(binaries, "PLACES", ())
+@pytest.fixture
+def without_server(monkeypatch: pytest.MonkeyPatch, environment: Environment) -> Callable[..., None]:
+    """Makes this machine look like one without MariaDB, whose apt is the script `apt` ("": it has none)."""
+
+    def take_away(home: Path, apt: str = "") -> None:
+        (home / "bin").mkdir()
+        for name in ("apt-get", "dpkg", "env", "sudo") if apt else ():
+            program(home / "bin", name, apt)
+        environment(PBL_HOME=home, PATH=home / "bin")
+        monkeypatch.setattr(binaries, "PLACES", ())
+
+    return take_away
 
 
-def test_no_server_and_no_apt_points_to_docker(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    without_server(monkeypatch, tmp_path)
+def test_no_server_and_no_apt_points_to_docker(without_server: Callable[..., None], tmp_path: Path):
+    without_server(tmp_path)
     with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
         embedded.get_server()
     assert "no apt" in caught.value.found
     assert "docker compose" in caught.value.next_step
 
 
-def test_offline_fetches_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    without_server(monkeypatch, tmp_path, "exit 1\n")
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+def test_offline_fetches_nothing(without_server: Callable[..., None], environment: Environment, tmp_path: Path):
+    without_server(tmp_path, "exit 1\n")
+    environment(PBL_OFFLINE="1")
     with pytest.raises(PblError, match="PBL_OFFLINE"):
         embedded.get_server()
 
 
-def test_what_apt_says_reaches_the_reader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_what_apt_says_reaches_the_reader(without_server: Callable[..., None], tmp_path: Path):
     refusal = "E: Unable to locate package mariadb-server-core"
-    without_server(monkeypatch, tmp_path, f"echo Reading package lists...\necho '{refusal}' >&2\nexit 100\n")
+    without_server(tmp_path, f"echo Reading package lists...\necho '{refusal}' >&2\nexit 100\n")
     said: list[str] = []
     with pytest.raises(PblError, match="Unable to locate package") as caught:
         embedded.get_server(said.append)
@@ -388,8 +392,8 @@ def test_what_apt_says_reaches_the_reader(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert not (tmp_path / "server.tmp").exists()
 
 
-def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    without_server(monkeypatch, tmp_path)
+def test_an_unpacked_server_is_found_with_its_libraries(without_server: Callable[..., None], tmp_path: Path):
+    without_server(tmp_path)
     library = tmp_path / "server/usr/lib/x86_64-linux-gnu/liburing.so.2"
     for path in (tmp_path / "server/usr/sbin/mariadbd", tmp_path / "server/usr/bin/mariadb-install-db", library):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -400,8 +404,8 @@ def test_an_unpacked_server_is_found_with_its_libraries(monkeypatch: pytest.Monk
     assert found.environment()["LD_LIBRARY_PATH"] == str(library.parent)
 
 
-def test_the_servers_environment_holds_none_of_ours(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("DJ_PASS", "secret")
+def test_the_servers_environment_holds_none_of_ours(environment: Environment):
+    environment(DJ_PASS="secret")
     assert "secret" not in embedded.Binaries(Path("a"), Path("b"), Path("c")).environment().values()
     assert binaries.PACKAGES == ("mariadb-server-core", "mariadb-client-core")
 

@@ -1,6 +1,7 @@
 """`pbl export --subject`: a visit of the tables, with what is stored and nothing computed anew."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,11 @@ from tests.rows import register
 from . import chain
 
 
-def test_a_visit_of_the_tables(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_visit_of_the_tables(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change_fits: Callable[..., None]
+):
     ezc3d = pytest.importorskip("ezc3d")
-    chain.change_fits(monkeypatch, chain.with_all_markers)
+    change_fits(chain.with_all_markers)
     time = np.arange(-0.5, 9.0, 0.02)
     log = {"time_s": time, "qw": 0.5, "qx": -0.5, "qy": 0.5, "qz": -0.5, "ax": 0.0, "ay": 9.81, "az": time}
     pd.DataFrame(log).to_csv(tmp_path / "log.csv", index=False)
@@ -61,8 +64,10 @@ def _files(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    chain.change_fits(monkeypatch, chain.with_all_markers)
+def test_many_visits_are_each_as_alone(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change_fits: Callable[..., None]
+):
+    change_fits(chain.with_all_markers)
     visits = [("P001", "2026-03-01"), ("P001", "nach OP é"), ("P002", "2026-03-01"), ("P003", "2026-03-01")]
     for i, (subject, label) in enumerate(visits):
         register(chain.small_video(tmp_path, f"walk{i}"), subject=subject, session_label=label)

@@ -12,6 +12,7 @@ from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.operations import forget
 from pbl_schemas.operations.declare import declare_all
 from pbl_workers.populate import populate
+from tests import Environment
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 
@@ -33,10 +34,9 @@ def stored() -> set[str]:
 
 
 @pytest.fixture
-def two(database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[dict, set[str], list[Path]]]:
+def two(database: Path, tmp_path: Path, stand_ins: None) -> Iterator[tuple[dict, set[str], list[Path]]]:
     """P001 alone through the chain; then P017 as well, with everything a person can have. What was there before P017,
     the files, and P017's videos."""
-    chain.install(monkeypatch)
     declare_all()
     shutil.rmtree(Path(connection.store_backend().spec["location"]) / "_schema", ignore_errors=True)
     shared, own = camera(tmp_path, "shared", 900), camera(tmp_path, "own", 905)
@@ -72,7 +72,7 @@ def _queue(table: type, status: str, number: int | None) -> None:
 
 
 def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
-    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path, environment: Environment
 ):
     rows, files, videos = two
     full, all_files = everything_but_refreshes(), stored()
@@ -101,7 +101,7 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     for path in ("P017/visit/ab-walk.csv", "P0171/visit/cd-walk.csv"):
         (archive / path).parent.mkdir(parents=True)
         (archive / path).write_text("log")
-    monkeypatch.setenv("PBL_ARCHIVE", str(archive))
+    environment(PBL_ARCHIVE=archive)
     again = pbl("forget", "P017", "--yes", "--videos")
     assert again.code == 0, again.err
     assert not any(v.exists() for v in videos)
@@ -180,7 +180,7 @@ def test_a_video_in_whose_place_another_lies_stays(two: tuple[dict, set[str], li
 
 
 def test_a_file_that_somebody_elses_row_names_stays(
-    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    two: tuple[dict, set[str], list[Path]], tmp_path: Path, environment: Environment
 ):
     _, _, videos = two
     other = (video.Video & (session.Session & {"subject": "P001"})).fetch1("video_id")
@@ -193,7 +193,7 @@ def test_a_file_that_somebody_elses_row_names_stays(
     archived = tmp_path / "archive" / "P017" / "visit" / "ab-walk.mp4"
     archived.parent.mkdir(parents=True)
     archived.write_bytes(b"another recording")
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     video.Video.update1({"video_id": other, "video_path": str(archived)})
     assert pbl("forget", "P017", "--yes", "--videos").code == 0
     assert archived.exists()

@@ -17,7 +17,7 @@ from pbl_schemas.plan import plan_fit_sets
 from pbl_workers import requeue
 from pbl_workers.populate import populate
 from research.benchmarks import growth, worker_standins, workers
-from tests import mysql, not_none
+from tests import Environment, mysql, not_none
 from tests.database import embedded_only
 from tests.integration import chain
 
@@ -32,12 +32,16 @@ EACH_PART = 16
 
 
 def test_statements_stay_as_short_as_they_are(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    tables: None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    environment: Environment,
+    capsys: pytest.CaptureFixture,
 ):
     monkeypatch.setattr(rows, "PART", PART)
     monkeypatch.setattr(requeue, "CHUNK", PART)
     monkeypatch.setattr(workers, "EACH", 1)  # a video a visit
-    monkeypatch.setenv(worker_standins.RECORDED, str(chain.small_video(tmp_path, "recorded")))
+    environment(**{worker_standins.RECORDED: chain.small_video(tmp_path, "recorded")})
     worker_standins.install(monkeypatch)
     first = [t.__name__ for t in computed_tables() if t.__name__ not in ON_REQUEST]
     costs: list[dict[str, growth.Cost]] = []

@@ -70,8 +70,8 @@ def labels() -> list[str]:
 
 @pytest.mark.parametrize("door", DOORS)
 @pytest.mark.parametrize("label", SAME)
-def test_labels_that_read_alike_are_one_visit(tables, tmp_path, monkeypatch, door, label):
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+def test_labels_that_read_alike_are_one_visit(tables, tmp_path, environment, door, label):
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     ingest([chain.small_video(tmp_path, "one", n=40)], VisitRecord("P001", LABEL))
     door(label, tmp_path)
     assert labels() == [LABEL]
@@ -80,8 +80,8 @@ def test_labels_that_read_alike_are_one_visit(tables, tmp_path, monkeypatch, doo
 
 @pytest.mark.parametrize("door", DOORS)
 @pytest.mark.parametrize("label", OTHER)
-def test_case_accents_and_single_spaces_distinguish_visits(tables, tmp_path, monkeypatch, door, label):
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+def test_case_accents_and_single_spaces_distinguish_visits(tables, tmp_path, environment, door, label):
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     ingest([chain.small_video(tmp_path, "one", n=40)], VisitRecord("P001", LABEL))
     door(label, tmp_path)
     assert labels() == sorted((LABEL, label))

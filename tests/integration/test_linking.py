@@ -19,7 +19,7 @@ from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.operations import backup, catalog, embedded, forget
 from pbl_schemas.stages import STAGES
 from pbl_workers.populate import populate
-from tests import mysql, pages
+from tests import Environment, mysql, pages
 from tests.command import pbl
 from tests.database import installation
 from tests.rows import everything_but_refreshes, new_visit, register
@@ -170,10 +170,10 @@ main()
 
 
 def test_without_the_module_nothing_unlinked_is_registered(
-    mylab: Any, visits: list[int], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mylab: Any, visits: list[int], folder: Path, tmp_path: Path, environment: Environment
 ):
     """As a worker's account, which may not change the laboratory's tables."""
-    monkeypatch.setenv("PBL_LINKING_MODULE", "mylab")
+    environment(PBL_LINKING_MODULE="mylab")
     assert pbl("db", "roles", "--role", "worker", "--from", "127.0.0.1", "--secrets", tmp_path).code == 0
     port = str(connection.connect().conn_info["port"])
     login = {"DJ_HOST": "127.0.0.1", "DJ_PORT": port, "DJ_USER": "pbl_worker"}

@@ -117,9 +117,8 @@ def home() -> Iterator[Home]:
 
 
 @pytest.fixture
-def forget(home: Home, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+def forget(home: Home, monkeypatch: pytest.MonkeyPatch, stand_ins: None) -> Iterator[Callable[[], None]]:
     """The server of this module, in use. Calling it makes the classes forget the server, as in a new process."""
-    chain.install(monkeypatch)
     with monkeypatch.context() as patch:
         for name, value in home.variables.items():
             patch.setenv(name, value)

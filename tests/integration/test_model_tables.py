@@ -24,7 +24,7 @@ from pbl_schemas.method_rows import insert_methods, resolve_method
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
-from tests import dot_models
+from tests import Environment, dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
 
@@ -48,10 +48,10 @@ def track_people(video_path, params=None, info=None) -> Tracking:
 
 
 @pytest.fixture
-def tables(database: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+def tables(database: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path) -> Iterator[None]:
     """Empty tables, a registry of its own, the people where they are."""
     pbl_schemas.activate()
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    environment(PBL_MODELS=tmp_path / "models")
     monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
     yield
     remove_all()
@@ -137,9 +137,8 @@ DEFAULT_FITS = {
 }
 
 
-def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, stand_ins: None):
     """As `pbl run` chooses (tests/unit/test_models.py): of one visit each keypoint method has its own fit."""
-    chain.install(monkeypatch)
     for name, (kind, markers) in SEEN_BY.items():
         register_spec(tmp_path / "models", kind, markers, name)
     path = chain.small_video(tmp_path, "walk")
@@ -157,10 +156,7 @@ def test_the_fit_that_suits_the_points_is_planned(tables: None, tmp_path: Path, 
     assert {p for p in plans() if p[1] == MARKERS} == {(p[0], MARKERS) for p in DEFAULT_FITS}
 
 
-def test_a_new_keypoint_method_for_all_comes_with_its_fit(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    chain.install(monkeypatch)
+def test_a_new_keypoint_method_for_all_comes_with_its_fit(tables: None, tmp_path: Path, stand_ins: None):
     register_spec(tmp_path / "models", "crop3d", "bml_movi_87", "metrabs-87")
     for subject in ("P001", "P002"):
         ingest([chain.small_video(tmp_path, subject)], VisitRecord(subject))
@@ -172,9 +168,8 @@ def test_a_new_keypoint_method_for_all_comes_with_its_fit(
     assert fitted() == plans()
 
 
-def test_own_parameters_under_a_name_of_their_own(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_own_parameters_under_a_name_of_their_own(tables: None, tmp_path: Path, stand_ins: None):
     """As docs/extending.md says: the row names its family, so the tables find its function."""
-    chain.install(monkeypatch)
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord("P001"))
     mine = EVENT_METHODS.make("mine", 1, EventParams(cutoff_hz=4.0))
     insert_methods(gait.GaitEventMethod, [mine])
@@ -187,11 +182,8 @@ def test_own_parameters_under_a_name_of_their_own(tables: None, tmp_path: Path, 
     (gait.GaitEventMethod & {"gait_method": "mine-v1"}).delete(prompt=False)
 
 
-def test_a_method_that_this_version_does_not_know_is_an_error_row(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_method_that_this_version_does_not_know_is_an_error_row(tables: None, tmp_path: Path, stand_ins: None):
     """Rows of a newer version: each stage ends with the code, at once."""
-    chain.install(monkeypatch)
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord("P001"))
     stages = {
         "Tracking": (tracking.TrackingMethod, {"detector": "newer"}),

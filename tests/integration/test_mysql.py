@@ -91,8 +91,9 @@ def _value(value: Any) -> Any:
     return value
 
 
-def test_a_backup_of_mysql_is_restored_into_mariadb(on_mysql: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    chain.install(monkeypatch)
+def test_a_backup_of_mysql_is_restored_into_mariadb(
+    on_mysql: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stand_ins: None
+):
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001", project="gait"))
     assert not [t for t in populate().tables if t.errors]
     version = str(connection.connect().query("SELECT VERSION()").fetchone()[0])

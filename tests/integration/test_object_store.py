@@ -16,6 +16,7 @@ from pbl_schemas.operations import backup, forget
 from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.incoming import import_uploads
+from tests import Environment
 from tests.rows import remove_all
 
 from . import chain
@@ -34,16 +35,20 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture
-def remote(database: Path, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def remote(
+    database: Path, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment
+) -> Iterator[None]:
     """The store `arrays` is a bucket; key and secret come from files, as containers mount them."""
     (tmp_path / "key").write_text("pbl-worker\n")
     (tmp_path / "secret").write_text(SECRET + "\n")
     pbl_schemas.activate()
     chain.install(monkeypatch)
-    monkeypatch.setenv("PBL_S3_ENDPOINT", server)
-    monkeypatch.setenv("PBL_S3_BUCKET", "walks")
-    monkeypatch.setenv("PBL_S3_KEY_FILE", str(tmp_path / "key"))
-    monkeypatch.setenv("PBL_S3_SECRET_FILE", str(tmp_path / "secret"))
+    environment(
+        PBL_S3_ENDPOINT=server,
+        PBL_S3_BUCKET="walks",
+        PBL_S3_KEY_FILE=tmp_path / "key",
+        PBL_S3_SECRET_FILE=tmp_path / "secret",
+    )
     connection.connect()
     yield
     monkeypatch.undo()  # also what the test itself set: what follows is for the store in the folder
@@ -114,15 +119,14 @@ def test_a_backup_and_a_person_who_is_forgotten(remote: None, tmp_path: Path):
     assert len([p for p in backend.fs.find("walks") if f"video_id={number}/" in p]) == 2
 
 
-def test_phones_may_upload_into_a_bucket(remote: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_phones_may_upload_into_a_bucket(remote: None, tmp_path: Path, environment: Environment):
     fs = connection.store_backend().fs
     if not fs.exists("phones"):
         fs.mkdir("phones")
     content = chain.small_video(tmp_path, "walk", n=5).read_bytes()
     for name in ("P001/1/walk.mp4", "P017/1/walk.mp4", "P001//1/walk.mp4", "P001/1/empty.mp4"):
         fs.pipe_file(f"phones/in/{name}", b"" if "empty" in name else content)
-    monkeypatch.setenv("PBL_INCOMING", "s3://phones/in")
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_INCOMING="s3://phones/in", PBL_ARCHIVE=tmp_path / "archive")
     import_uploads(settled_s=0.0)
     taken = import_uploads(settled_s=0.0)
     assert taken is not None
@@ -139,9 +143,8 @@ def test_phones_may_upload_into_a_bucket(remote: None, tmp_path: Path, monkeypat
     assert not fs.find("phones/in/P020")
 
 
-def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PBL_S3_ENDPOINT", "http://127.0.0.1:1")
-    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, environment: Environment):
+    environment(PBL_S3_ENDPOINT="http://127.0.0.1:1", AWS_MAX_ATTEMPTS="1")
     connection.connect()
     with pytest.raises(PblError) as error:
         store.check_store(connection.store_backend())
@@ -162,9 +165,8 @@ def test_a_store_that_does_not_answer_is_said_without_the_secret(remote: None, m
         ({"PBL_S3_ENDPOINT": "http://minio:9000", "PBL_S3_SECRET_FILE": "/nowhere"}, "FILE_MISSING"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(changes: dict[str, str], code: str, monkeypatch: pytest.MonkeyPatch):
-    for name, value in changes.items():
-        monkeypatch.setenv(name, value)
+def test_settings_that_cannot_work_are_refused(changes: dict[str, str], code: str, environment: Environment):
+    environment(**changes)
     with pytest.raises(PblError) as error:
         store.store_spec()
     assert error.value.code == code

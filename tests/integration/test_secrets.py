@@ -19,6 +19,7 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas import connection
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import Folder, process
+from tests import Environment
 from tests.command import PBL
 from tests.database import new_home, remove_home
 
@@ -81,16 +82,15 @@ def encrypted() -> Iterator[tuple[Path, dict[str, Path]]]:
 
 
 @pytest.fixture
-def use(monkeypatch: pytest.MonkeyPatch) -> Use:
+def use(environment: Environment) -> Use:
     """Point the tables at the server of a home by the variables of an external one."""
 
     def point(home: Path, host: str = "127.0.0.1", **more: str) -> None:
         folder = Folder(home / "db")
         file = home / "password"
         file.write_text(folder.credentials().app_password + "\n")
-        values = {"DJ_HOST": host, "DJ_PORT": str(folder.state()["port"]), "DJ_USER": "pbl", "DJ_PASS_FILE": str(file)}
-        for name, value in {**values, **more}.items():
-            monkeypatch.setenv(name, value)
+        values = {"DJ_HOST": host, "DJ_PORT": folder.state()["port"], "DJ_USER": "pbl", "DJ_PASS_FILE": file}
+        environment(**values | more)
 
     return point
 
@@ -197,10 +197,9 @@ def test_no_secret_is_printed_or_logged(database: Path, use: Use, tmp_path: Path
         assert secret not in said
 
 
-def test_a_refused_login_names_no_password(database: Path, use: Use, monkeypatch: pytest.MonkeyPatch):
+def test_a_refused_login_names_no_password(database: Path, use: Use, environment: Environment):
     use(database)
-    monkeypatch.delenv("DJ_PASS_FILE")
-    monkeypatch.setenv("DJ_PASS", WRONG)
+    environment(DJ_PASS_FILE=None, DJ_PASS=WRONG)
     with pytest.raises(PblError) as error:
         connection.plain_connection()
     assert error.value.code == "DB_REFUSED"
@@ -209,7 +208,7 @@ def test_a_refused_login_names_no_password(database: Path, use: Use, monkeypatch
     assert isinstance(error.value.__cause__, pymysql.err.OperationalError)
     assert WRONG not in str(error.value.__cause__)
     assert "DB_REFUSED" in in_new_process(SHOW).stderr
-    monkeypatch.delenv("DJ_PASS")
+    environment(DJ_PASS=None)
     with pytest.raises(PblError, match=r"^DB_REFUSED: "):
         connection.plain_connection()
 

@@ -17,7 +17,7 @@ from pbl_pipeline.bench.detect import numbered
 from pbl_schemas import tracking, video
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.orphans import orphans
-from tests import slurm, until
+from tests import Environment, slurm, until
 from tests.rows import register
 
 from . import chain
@@ -42,7 +42,7 @@ def cluster() -> Iterator[slurm.Cluster]:
 
 
 @pytest.fixture
-def settings(declared: None, database: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def settings(declared: None, database: Path, tmp_path: Path, environment: Environment) -> None:
     """The file that the script reads, as docs/deployment.md has it, and the script's own variables."""
     folder = embedded.Folder(database / "db")
     (tmp_path / "password").write_text(folder.credentials().app_password)
@@ -55,8 +55,7 @@ def settings(declared: None, database: Path, tmp_path: Path, monkeypatch: pytest
         "PYTHONPATH": ROOT,
     }
     (tmp_path / "worker.env").write_text("".join(f"{name}={value}\n" for name, value in written.items()))
-    monkeypatch.setenv("PBL_SETTINGS", str(tmp_path / "worker.env"))
-    monkeypatch.setenv("PBL_VENV", sys.prefix)
+    environment(PBL_SETTINGS=tmp_path / "worker.env", PBL_VENV=sys.prefix)
 
 
 def videos(folder: Path, n: int) -> Iterator[Path]:

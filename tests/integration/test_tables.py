@@ -37,7 +37,7 @@ from pbl_schemas.plan import plan_fit_sets
 from pbl_schemas.reading import frames
 from pbl_schemas.reading.status import pipeline_status
 from pbl_workers.populate import populate
-from tests import not_none
+from tests import Environment, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.rows import register, remove_all
@@ -143,8 +143,8 @@ def test_a_bad_file_leaves_one_error_row_while_the_others_finish(tables: None, t
     assert not errors(again)
 
 
-def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, trials=tuple(map(still, fits.trials))))
+def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, change_fits: Callable[..., None]):
+    change_fits(lambda fits: dataclasses.replace(fits, trials=tuple(map(still, fits.trials))))
     register(chain.small_video(tmp_path, "stands"), chain.small_video(tmp_path, "empty", people="nobody"))
     run = populate()
     assert not errors(run)
@@ -165,13 +165,13 @@ def test_nobody_walks_and_nobody_there(tables: None, tmp_path: Path, monkeypatch
 
 
 def test_one_recording_without_gait_does_not_empty_the_visit(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, change_fits: Callable[..., None]
 ):
     def one_stands(fits: SessionFit) -> SessionFit:
         walks, other = fits.trials
         return dataclasses.replace(fits, trials=(walks, still(other)))
 
-    chain.change_fits(monkeypatch, one_stands)
+    change_fits(one_stands)
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "stands", n=210))
     populate()
     assert gdi.SessionGdi.fetch1("session_status") == "PASS"
@@ -181,10 +181,10 @@ def test_one_recording_without_gait_does_not_empty_the_visit(
 
 
 def test_a_failed_fit_gives_no_measures_in_tables_and_files(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, change_fits: Callable[..., None]
 ):
     bad = Check("residual_3d_cm", "FAIL", 21.0, 6.0, "the body and the 3D points disagree")
-    chain.change_fits(monkeypatch, lambda fits: dataclasses.replace(fits, qc=(bad,)))
+    change_fits(lambda fits: dataclasses.replace(fits, qc=(bad,)))
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2", n=210))
     assert not errors(populate())
     why = "the fit failed its check residual_3d_cm"
@@ -296,9 +296,9 @@ def test_one_persons_number_for_several_videos_is_refused(tables: None, tmp_path
         ingest([tmp_path / "a.mp4", tmp_path / "b.mp4"], VisitRecord("P001", person=2))
 
 
-def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_registered_person_detector_becomes_a_method(tables: None, tmp_path: Path, environment: Environment):
     """Its parameters freeze the hashes of graph and spec; another spec under its name is another version."""
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+    environment(PBL_MODELS=tmp_path / "models")
     folder = tmp_path / "models" / "crowd"
     folder.mkdir(parents=True)
     entry = {"name": "images", "width": 416, "height": 416, "layout": "NCHW", "mean": [0, 0, 0], "std": [1, 1, 1]}

@@ -23,6 +23,7 @@ from pbl_workers.web import Options, Where, accounts, certificates, connections,
 from pbl_workers.web.access import IDLE_HOURS, Sessions
 from pbl_workers.web.accounts import Accounts, Attempts
 from pbl_workers.web.serve import config
+from tests import Environment
 from tests.integration.web import post, running
 from tests.rows import new_visit
 
@@ -106,8 +107,8 @@ def test_accounts_that_cannot_be(known: Accounts, name: str, roles: list[str], p
     assert known.path.read_bytes() == before
 
 
-def test_the_commands(cheap: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PBL_HOME", str(tmp_path))
+def test_the_commands(cheap: None, tmp_path: Path, environment: Environment):
+    environment(PBL_HOME=tmp_path)
     run = lambda *args, **more: CliRunner().invoke(web, ["account", *args], **more)  # noqa: E731
     typed = f"{WORDS}\n{WORDS}\n"
     done = run("add", "R.Viewer", "--role", "reviewer", "--role", "operator", input=typed)
@@ -353,9 +354,9 @@ def asked(connection: socket.socket, host: str = "gait.example", more: str = "")
 
 
 @pytest.fixture
-def by_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Where:
+def by_tls(tmp_path: Path, environment: Environment) -> Where:
     """A page with a certificate."""
-    monkeypatch.setenv("PBL_HOME", str(tmp_path))
+    environment(PBL_HOME=tmp_path)
     return Where("127.0.0.1", 0, *certificates.server_certificate(["gait.example"]), hostnames=("gait.example",))
 
 

@@ -10,6 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas.operations import embedded, forget
 from pbl_schemas.review import Viewing
 from pbl_workers.web import Where, audit, serve
+from tests import Environment
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
@@ -17,9 +18,9 @@ from tests.rows import register
 
 
 @pytest.fixture
-def audited(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+def audited(tables: None, tmp_path: Path, environment: Environment) -> int:
     """A video, and a page that has to write looks down."""
-    monkeypatch.setenv("PBL_AUDIT_LOOKS", "1")
+    environment(PBL_AUDIT_LOOKS="1")
     return register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
 
 
@@ -70,13 +71,13 @@ def test_a_page_as_json_is_a_look_as_the_page_is(audited: int):
     assert len(rows()) == 2
 
 
-def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, monkeypatch: pytest.MonkeyPatch):
+def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, environment: Environment):
     assert web.client(signed_in=False).get(f"/recordings/{audited}/video").status_code == 401
     assert web.client("operator").get(f"/recordings/{audited}/video").status_code == 403
     assert web.client().get("/recordings/999/video").status_code == 404
     assert web.client().get(f"/recordings/{10**30}/video").status_code == 404
     assert rows() == []
-    monkeypatch.setenv("PBL_AUDIT_LOOKS", "0")
+    environment(PBL_AUDIT_LOOKS="0")
     assert web.client().get(f"/recordings/{audited}/video").status_code == 200
     assert rows() == []
 
@@ -96,8 +97,8 @@ def test_what_cannot_be_written_down_is_not_shown(audited: int, monkeypatch: pyt
     assert [r[1] for r in rows()] == ["video", "page"]
 
 
-def test_a_folder_is_not_shown_where_rows_are_asked_for(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PBL_AUDIT_LOOKS", "1")
+def test_a_folder_is_not_shown_where_rows_are_asked_for(environment: Environment):
+    environment(PBL_AUDIT_LOOKS="1")
     folder: Any = object()  # refused before it is looked into
     with pytest.raises(PblError, match="--folder with PBL_AUDIT_LOOKS"):
         serve(Where(port=0), folder=folder)

@@ -15,18 +15,18 @@ from pbl_schemas.reading.visit_progress import visit_progress
 from pbl_workers import queue, refresh, run_job
 from pbl_workers.populate import populate
 from pbl_workers.web.computing import told
-from tests import until
+from tests import Environment, until
 from tests.integration import compute_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 
 
 @pytest.fixture
-def hold(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def hold(environment: Environment, tmp_path: Path) -> Path:
     """A folder that holds up what computes visits."""
     folder = tmp_path / "hold"
     folder.mkdir()
-    monkeypatch.setenv("PBL_TEST_HOLD", str(folder))
+    environment(PBL_TEST_HOLD=folder)
     return folder
 
 

@@ -23,6 +23,7 @@ from pbl_schemas.rows import delete_below
 from pbl_schemas.transactions import in_transaction
 from pbl_workers.populate import populate
 from pbl_workers.web.source import TablesSource
+from tests import Environment
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
@@ -128,12 +129,12 @@ def test_a_reader_looks_and_does_not_decide(two_alike: int):
     assert everything() == before
 
 
-def test_the_picture_of_the_people(two_alike: int, monkeypatch: pytest.MonkeyPatch):
+def test_the_picture_of_the_people(two_alike: int, environment: Environment):
     browser = web.client()
     picture = browser.get(f"/recordings/{two_alike}/people?method=0")
     assert (picture.status_code, picture.content[:3]) == (200, b"\xff\xd8\xff")
     assert browser.get(f"/recordings/{two_alike}/people?method=7").status_code == 404
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")  # it shows faces
+    environment(PBL_DEIDENTIFY="blur")  # it shows faces
     assert browser.get(f"/recordings/{two_alike}/people?method=0").status_code == 404
     assert "/people?" not in browser.get(f"/recordings/{two_alike}").text
 

@@ -15,11 +15,13 @@ import pytest
 import pbl_pipeline
 import pbl_pipeline.fit
 from pbl_pipeline import texts
-from pbl_pipeline.errors import CODES
+from pbl_pipeline.errors import CALL, CODES
 from pbl_pipeline.kinetics import REASONS
 from pbl_schemas import session, study
 from pbl_schemas.intake.records import set_condition
+from pbl_schemas.video import Video
 from pbl_workers.populate import populate
+from pbl_workers.web.remedies import AT_THE_MACHINE, IN_WORDS, WAYS, remedies
 from tests import not_none
 from tests.german import english_of, english_words
 from tests.html_page import commands_in
@@ -102,6 +104,36 @@ def test_a_german_page_has_no_english_word_and_none_names_a_command(clinic: None
     assert not english_of(pages["de"], english, NAMES + r"|VIDEO_SCREEN|\S+/store" * (path == "/operate"))
     for page in pages.values():
         assert not commands_in(page)
+
+
+def test_what_an_error_or_a_check_asks_for_is_a_link_to_where_it_is_done(clinic: None):
+    """Choosing the person, another recording, the mark, the height; in both languages, and not for who may not."""
+    number = {s: int((session.Session & {"subject": s}).fetch1("session_id")) for s in ("P004", "P005")}
+    video = {s: int((Video & {"session_id": n}).fetch1("video_id")) for s, n in number.items()}
+    asked = {
+        f"/visits/{number['P004']}": [("decide.person", f"/recordings/{video['P004']}#decide")],
+        f"/recordings/{video['P004']}": [("decide.person", f"/recordings/{video['P004']}#decide")],
+        f"/visits/{number['P005']}": [
+            ("upload.open", f"/visits/{number['P005']}/upload"),
+            ("usable.mark", f"/recordings/{video['P005']}#usable"),
+        ],
+        f"/recordings/{video['P005']}": [("upload.open", f"/visits/{number['P005']}/upload")],
+        "/visits/1": [("register.facts", "/visits/1/facts")],
+        f"/visits/{number['P005']}/report": [("film.back", f"/visits/{number['P005']}"), ("visits.title", "/visits")],
+    }
+    browser, reader = web.client(), web.client(role="reader")
+    for (page, links), language in itertools.product(asked.items(), texts.LANGUAGES):
+        shown = {b: b.get(page, headers={"accept-language": language}).text for b in (browser, reader)}
+        said = re.findall(r'<(?:p|dd)(?! class="buttons)[^>]*>.*?</(?:p|dd)>', shown[browser])
+        for words, address in links:
+            link = f'<a href="{address}">{texts.text(language, words)}</a>'
+            assert any(link in one for one in said), (page, link)
+            place, _, anchor = address.partition("#")
+            assert not anchor or f'id="{anchor}"' in browser.get(place).text
+        if "film.back" not in dict(links):
+            assert texts.text(language, "error.click") not in "".join(s for s in said if "problem" in s), page
+        if page != "/visits/1":
+            assert not any(f'{a}">{texts.text(language, w)}</a></p>' in shown[reader] for w, a in links)
 
 
 def test_pages_of_a_phone_and_without_a_session_are_german(clinic: None, english: set[str]):
@@ -336,6 +368,18 @@ def test_no_reason_on_a_page_has_a_code_or_a_command():
             if commands_in(shown) or re.search(rf"(?<![\w-])--[a-z]|\bpbl [a-z]|\b({'|'.join(CODES)}):", shown):
                 wrong.append((reason, shown))
     assert not wrong, wrong[:3]
+
+
+@pytest.mark.parametrize("code", sorted(CODES))
+def test_every_code_is_a_link_or_is_said_in_words(code: str):
+    """A call has no link by its cause: its author places a new code. A step is never only a command without a link."""
+    ways = remedies(code, visit=3, recording=7)
+    assert bool(ways) != (code in AT_THE_MACHINE + IN_WORDS)
+    assert code in WAYS or CODES[code].cause != CALL
+    for language, (_, _, step) in itertools.product(texts.LANGUAGES, (r for r in refusals() if r[0] == code)):
+        shown = texts.on_page(language, step, click=not ways)
+        assert not commands_in(shown)
+        assert ways or shown
 
 
 def test_a_choice_carried_to_another_tracking_has_its_german():

@@ -41,7 +41,7 @@ def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[i
     browser = web.client("operator", name="O. Perator")
     page = html.unescape(browser.get("/operate").text)
     assert "VIDEO_MISSING" in page
-    assert "bring the file or its disk back" in page
+    assert "Bring the file or its disk back" in page
     assert "Try all of this kind again (3)" in page
     assert "GB free of" in page
     one = {"table": "VideoInfo", "code": "VIDEO_MISSING", "key": json.dumps({"video_id": three_gone[1]})}

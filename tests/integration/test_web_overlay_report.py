@@ -18,7 +18,7 @@ from pbl_schemas.reading.visit_state import state_of
 from pbl_schemas.rows import delete_below
 from pbl_workers.populate import populate
 from pbl_workers.web import reports, source
-from tests import until
+from tests import Environment, until
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.html_page import commands_in
 from tests.integration import web
@@ -96,13 +96,13 @@ def test_a_report_is_in_the_language_of_its_reader(visit: Path, browser: Any, mo
 
 @pytest.mark.long
 def test_where_heads_are_to_be_hidden_nothing_of_the_original_is_drawn(
-    visit: Path, browser: Any, monkeypatch: pytest.MonkeyPatch
+    visit: Path, browser: Any, environment: Environment
 ):
     """The copy here is black; what is drawn over it must not show the grey of the original."""
     browser.get("/recordings/1/overlay")
     ended(browser, "/recordings/1/overlay/state")
     assert browser.get("/recordings/1/overlay/file", follow_redirects=False).status_code == 200  # of the original
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     for address in ("/recordings/1/overlay", "/visits/1/report"):
         answer = browser.get(address)
         assert (answer.status_code, "no de-identified copy" in answer.text) == (404, True)
@@ -137,7 +137,7 @@ def copied(path: Path) -> dict[str, Any]:
     }
 
 
-def test_each_input_of_what_is_kept_changes_its_key(visit: Path, monkeypatch: pytest.MonkeyPatch):
+def test_each_input_of_what_is_kept_changes_its_key(visit: Path, environment: Environment):
     """The movement of a recording's page, its overlay, the report of its visit, a phone's answer."""
     of_recording = {"movement": lambda: shown.computations(1), "overlay": lambda: reports.overlay_key(1)}
     of_visit = {"report": lambda: reports.report_key(1, 0, "en"), "phone": lambda: state_of(1)}
@@ -174,7 +174,7 @@ def test_each_input_of_what_is_kept_changes_its_key(visit: Path, monkeypatch: py
     assert changed(of_visit, lambda: video.NotUsable.insert1({"video_id": 1, **mark})) == set(of_visit)
     assert every["report"]() != reports.report_key(1, 0, "de")
     before = {name: every[name]() for name in ("overlay", "report")}
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     assert all(every[name]() != key for name, key in before.items())
 
 
@@ -186,9 +186,9 @@ def test_a_page_opened_while_cycles_were_pending_is_made_again_with_them(visit: 
 
 
 def test_another_copy_with_hidden_heads_replaces_the_one_that_is_kept(
-    visit: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    visit: Path, tmp_path: Path, environment: Environment
 ):
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     videos = source.Videos()
     try:
         for shade in (0, 1):

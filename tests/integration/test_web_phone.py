@@ -42,7 +42,7 @@ from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, usual_words, verdict
-from tests import not_none
+from tests import Environment, not_none
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
@@ -50,9 +50,9 @@ from tests.rows import new_visit, register
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
     """A visit without recordings; the archive is a folder of the test, and its parts are small."""
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads):
         monkeypatch.setattr(module, "PART_BYTES", 4096)
     return new_visit("2026-01-10")

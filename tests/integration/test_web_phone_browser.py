@@ -25,6 +25,7 @@ from pbl_schemas.intake.protocols import ProtocolStep, add_protocol
 from pbl_schemas.reading.usable import Usable
 from pbl_workers import phone_uploads
 from pbl_workers.web import Options, Where, certificates, create_app, phone
+from tests import Environment
 from tests.integration import web
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
@@ -91,8 +92,8 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads, phone):
         monkeypatch.setattr(module, "PART_BYTES", 65536)
     return new_visit("2026-01-10")

@@ -9,7 +9,7 @@ from pbl_pipeline.render import body_track
 from pbl_schemas import fit, reading, video
 from pbl_workers.populate import populate
 from pbl_workers.web.movement import METRE_STEPS, TURN_STEPS
-from tests import not_none
+from tests import Environment, not_none
 from tests.integration import web
 from tests.integration.chain import N_FRAMES, small_video
 from tests.rows import register
@@ -120,9 +120,9 @@ def test_a_video_that_is_gone_leaves_the_rest(looked_at):
         away.rename(path)
 
 
-def test_where_heads_are_to_be_hidden_the_original_is_never_sent(looked_at, monkeypatch: pytest.MonkeyPatch):
+def test_where_heads_are_to_be_hidden_the_original_is_never_sent(looked_at, environment: Environment):
     _, walk, _ = looked_at
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     browser = web.client()
     assert browser.get(f"/recordings/{walk}/video").status_code == 404
     page = browser.get(f"/recordings/{walk}").text

@@ -17,6 +17,7 @@ from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import FACTS, NEW, facts_form
 from pbl_workers.populate import populate
 from pbl_workers.web import multipart
+from tests import Environment
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -25,8 +26,8 @@ VISIT = {"subject": "P001", "visit": "2026-01-10"}
 
 
 @pytest.fixture(autouse=True)
-def archive(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
+def archive(tables: None, tmp_path: Path, environment: Environment) -> Path:
+    environment(PBL_ARCHIVE=tmp_path / "archive")
     return tmp_path / "archive"
 
 

@@ -1,7 +1,9 @@
 """Right and look of every address, in each spelling that the page may take for it: by the page's own list of routes."""
 
+import contextlib
 import re
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
@@ -114,8 +116,9 @@ def one_visit(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def browsers(one_visit: None) -> dict[str, TestClient]:
-    return {role: web.client(role) for role in ROLES}
+def browsers(one_visit: None) -> Iterator[dict[str, TestClient]]:
+    with contextlib.ExitStack() as stack:  # one event loop for all requests of a browser
+        yield {role: stack.enter_context(web.client(role)) for role in ROLES}
 
 
 def looks() -> list[tuple[str, int | None, int | None]]:

@@ -14,7 +14,7 @@ from pbl_schemas.reading import comparison
 from pbl_schemas.reading.trend import trend_of
 from pbl_schemas.studies.visit_forms import enter_scores, scores_form
 from pbl_workers.populate import populate
-from tests import not_none
+from tests import Environment, not_none
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import register
@@ -134,6 +134,19 @@ def test_the_page_of_the_trend(visits: None):
     assert told["points"][2]["before"]["sure"] is True
 
 
+def test_every_page_with_an_index_says_once_of_whom_its_norm_is(visits: None):
+    told = {
+        "en": "with 166 typically developing children, an adult as well (there is no index of adults)",
+        "de": "mit 166 Kindern ohne Auffälligkeiten, auch einen Erwachsenen (einen Index von Erwachsenen gibt es nicht",
+    }
+    browser = web.client()
+    for page in ("/visits", "/visits/3", "/visits/3/letter", "/visits/3/trend", "/compare?v=1&v=3"):
+        for language, children in told.items():
+            shown = browser.get(page, headers={"accept-language": language}).text
+            assert shown.count(children) == 1, (page, language)
+    assert told["en"] not in browser.get("/visits/3/trend?measure=step_time_s").text
+
+
 def test_the_letter_is_one_visit_on_a_page(visits: None):
     browser = web.client()
     page = " ".join(browser.get("/visits/3/letter?result=0").text.split())
@@ -151,9 +164,9 @@ def test_the_letter_is_one_visit_on_a_page(visits: None):
 
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_the_letter_has_the_clinic_the_scores_a_comment_and_the_body(
-    visits: None, language: str, monkeypatch: pytest.MonkeyPatch
+    visits: None, language: str, environment: Environment
 ):
-    monkeypatch.setenv("PBL_LETTER_HEAD", "Clinic <North>; Station 1, 12345 Town")
+    environment(PBL_LETTER_HEAD="Clinic <North>; Station 1, 12345 Town")
     form = scores_form(2)
     enter_scores(2, form.values | {"role": "6_months", "mJOA": "14"}, "A", form.seen)
     browser = web.client()

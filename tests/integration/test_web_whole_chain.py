@@ -10,6 +10,7 @@ from pbl_schemas import gdi, lab, session, video
 from pbl_schemas.reading import comparison
 from pbl_schemas.review import Decision
 from pbl_workers.on_request import compute_visit
+from tests import Environment
 from tests.integration import compute_target, web
 from tests.integration.chain import small_video
 from tests.unit.test_blazepose import asset
@@ -31,11 +32,12 @@ def clips(real: bool, tmp_path: Path) -> list[Path]:
 
 
 @pytest.fixture
-def place(real: bool, declared: None, tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def place(
+    real: bool, declared: None, tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment
+) -> None:
     if real:
         monkeypatch.undo()  # the stand-ins of `tables`
-    monkeypatch.setenv("PBL_ARCHIVE", str(tmp_path / "archive"))
-    monkeypatch.setenv("PBL_TEST_HOLD", str(tmp_path / "hold"))
+    environment(PBL_ARCHIVE=tmp_path / "archive", PBL_TEST_HOLD=tmp_path / "hold")
 
 
 def test_from_an_empty_database_to_two_visits_compared(place: None, real: bool, chromium: Any, clips: list[Path]):

@@ -44,7 +44,7 @@ class Index:
 
 
 @pytest.fixture
-def index(tmp_path, monkeypatch) -> Index:
+def index(tmp_path, monkeypatch, environment) -> Index:
     path = tmp_path / "made.whl"
     with zipfile.ZipFile(path, "w") as archive:
         for member, data in {**CONTENT, "carrier/__init__.py": b"raise SystemExit('never run')"}.items():
@@ -58,8 +58,7 @@ def index(tmp_path, monkeypatch) -> Index:
         for name, member in zip(("one", "two"), CONTENT, strict=True)
     }
     monkeypatch.setattr(assets, "ASSETS", pinned)
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("PBL_OFFLINE", raising=False)
+    environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE=None)
     served = Index(made)
     monkeypatch.setattr(assets.subprocess, "run", served.run)
     return served
@@ -103,8 +102,8 @@ def test_a_member_with_other_bytes_is_refused(index, monkeypatch):
     assert not asset.path.exists()
 
 
-def test_offline_names_the_remedy(index, monkeypatch):
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+def test_offline_names_the_remedy(index, environment):
+    environment(PBL_OFFLINE="1")
     error = refused("ASSET_MISSING", assets.fetch, "one")
     assert "PBL_OFFLINE" in error.found
     assert "pip download --no-deps" in error.next_step
@@ -114,9 +113,9 @@ def test_offline_names_the_remedy(index, monkeypatch):
     assert index.calls == 0
 
 
-def test_the_remedy_works(index, monkeypatch):
+def test_the_remedy_works(index, environment):
     """A wheel copied into the folder by hand serves an offline machine, and a wrong one is refused."""
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+    environment(PBL_OFFLINE="1")
     (assets.folder() / NAME).write_bytes(index.wheel[:-1])
     refused("ASSET_CHECKSUM", assets.fetch, "one")
     (assets.folder() / NAME).write_bytes(index.wheel)
@@ -169,9 +168,9 @@ def test_no_pip(index, monkeypatch):
     assert "ensurepip" in refused("ASSET_MISSING", assets.fetch, "one").text()
 
 
-def test_a_cache_that_cannot_be_written(index, monkeypatch, tmp_path):
+def test_a_cache_that_cannot_be_written(index, environment, tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "file"))
+    environment(PBL_CACHE=tmp_path / "file")
     assert "PBL_CACHE" in refused("ASSET_MISSING", assets.fetch, "one").next_step
 
 
@@ -239,7 +238,7 @@ def test_pip_is_asked_for_one_wheel_and_no_index():
 
 
 @pytest.fixture
-def npm(tmp_path, monkeypatch) -> Index:
+def npm(tmp_path, monkeypatch, environment) -> Index:
     """A registry that serves one tarball, and a machine with npm."""
     data, file = b"heavy" * 999, "carrier-1.0.tgz"
     with tarfile.open(tmp_path / file, "w:gz") as archive:
@@ -252,8 +251,7 @@ def npm(tmp_path, monkeypatch) -> Index:
         "heavy", "asset", package, "package/heavy.bin", sha256(data), len(data), "MIT", "here", True, "own-name.bin"
     )
     monkeypatch.setattr(assets, "ASSETS", {"heavy": asset})
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("PBL_OFFLINE", raising=False)
+    environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE=None)
     monkeypatch.setattr(packages.shutil, "which", lambda name: f"/usr/bin/{name}")
     served = Index(made)
 
@@ -282,7 +280,7 @@ def test_a_file_of_an_npm_package(npm):
     refused("ASSET_CHECKSUM", assets.fetch, "heavy")
 
 
-def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
+def test_npm_offline_absent_and_without_connection(npm, monkeypatch, environment):
     npm.error = "npm error code ENOTFOUND\nnpm error syscall getaddrinfo\nnpm error network request failed\n"
     refusal = refused("ASSET_MISSING", assets.fetch, "heavy").text()
     assert "no connection to the package registry (network request failed)" in refusal
@@ -302,7 +300,7 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch):
     monkeypatch.setattr(packages.shutil, "which", lambda name: None)
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
     assert "apt-get install npm" in refused("ASSET_MISSING", assets.fetch, "heavy").text()
-    monkeypatch.setenv("PBL_OFFLINE", "1")
+    environment(PBL_OFFLINE="1")
     error = refused("ASSET_MISSING", assets.fetch, "heavy")
     assert "PBL_OFFLINE" in error.found
     remedy = error.next_step
@@ -320,7 +318,7 @@ def test_without_npm_pip_brings_it(npm, monkeypatch):
     assert assets.fetch("heavy").is_file()
 
 
-def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch):
+def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch, environment):
     calls: list[list[str]] = []
 
     def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
@@ -333,7 +331,7 @@ def test_npm_by_pip_unpacks_and_runs_the_wheel(tmp_path, monkeypatch):
             assert os.access(command[0], os.X_OK)
         return subprocess.CompletedProcess(command, 7 if "pack" in command else 0)
 
-    monkeypatch.setenv("npm_config_cache", str(tmp_path))
+    environment(npm_config_cache=tmp_path)
     monkeypatch.setattr(npm_by_pip.subprocess, "run", run)
     assert npm_by_pip.main(["pack", "@made/carrier@1.0"]) == 7
     node, script, *arguments = calls[1]

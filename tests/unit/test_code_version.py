@@ -9,6 +9,7 @@ import pytest
 
 from pbl_pipeline import __version__, code_version
 from pbl_pipeline.code_version import built_commit, checked_out_commit
+from tests import Environment
 from tests.command import pbl
 
 
@@ -49,8 +50,8 @@ def test_a_folder_inside_of_another_repository_has_no_commit(checkout: Path):
     assert checked_out_commit(checkout / "pbl_pipeline") == ""
 
 
-def test_without_git_there_is_no_commit(checkout: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PATH", "")
+def test_without_git_there_is_no_commit(checkout: Path, environment: Environment):
+    environment(PATH="")
     assert checked_out_commit(checkout) == ""
 
 

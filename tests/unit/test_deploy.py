@@ -18,6 +18,7 @@ import yaml
 from pbl_pipeline import __version__, assets
 from pbl_pipeline.cli.command_line import cli
 from pbl_workers.supervisor import LAST_S
+from tests import Environment
 from tests.command import program
 from tests.image import sent_to_builder
 
@@ -221,13 +222,13 @@ def test_the_entrypoint_seeds_an_empty_cache_and_runs_pbl(tmp_path: Path):
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can become another user")
 @pytest.mark.parametrize("user", ["1000:1000", "10001:10001", "1234:5678"])
-def test_the_image_starts_as_any_user(user: str, monkeypatch: pytest.MonkeyPatch):
+def test_the_image_starts_as_any_user(user: str, monkeypatch: pytest.MonkeyPatch, environment: Environment):
     """The models lie in the image with the rights that root's build leaves, locks included."""
     with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's own folders are closed to others
         folder, before = Path(name), os.umask(0o022)
         folder.chmod(0o755)
         try:
-            monkeypatch.setenv("PBL_CACHE", str(folder / "seed"))
+            environment(PBL_CACHE=folder / "seed")
             monkeypatch.setattr(assets, "_bring", lambda asset: asset.path.write_text("model"))
             monkeypatch.setattr(assets, "_is_pinned", lambda path, sha256: path.is_file())
             model = assets.fetch("blazepose_detector").name

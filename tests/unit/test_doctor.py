@@ -20,18 +20,15 @@ command = module.doctor
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch):
+def machine(tmp_path, monkeypatch, environment):
     """An empty cache and home, and a MariaDB server program on PATH."""
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "home"))
-    monkeypatch.setenv("PBL_OFFLINE", "1")
-    monkeypatch.delenv("DJ_HOST", raising=False)
+    environment(PBL_CACHE=tmp_path / "cache", PBL_HOME=tmp_path / "home", PBL_OFFLINE="1", DJ_HOST=None)
     # It acts once per process: the cache folder of this test must not become that of all other tests.
     monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
     programs = tmp_path / "bin"
     programs.mkdir()
     program(programs, "mariadbd", "")
-    monkeypatch.setenv("PATH", str(programs))
+    environment(PATH=programs)
     monkeypatch.setattr(module, "_SERVER_PLACES", ())
     return tmp_path
 
@@ -120,10 +117,10 @@ def test_no_database(machine, monkeypatch):
     ],
 )
 def test_the_server_that_dj_host_names_is_contacted(
-    machine, monkeypatch, greeting: bytes | None, state: str, said: str
+    machine, environment, greeting: bytes | None, state: str, said: str
 ):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        monkeypatch.setenv("DJ_HOST", f"127.0.0.1:{server.getsockname()[1]}")
+        environment(DJ_HOST=f"127.0.0.1:{server.getsockname()[1]}")
         if greeting is None:
             server.close()
         else:
@@ -158,9 +155,9 @@ def test_absent_package(machine, monkeypatch):
     assert found[1].next_step == "pip install 'no-such-thing>=1'"
 
 
-def test_folders_that_cannot_be_written(machine, monkeypatch):
+def test_folders_that_cannot_be_written(machine, environment):
     (machine / "file").write_text("not a folder")
-    monkeypatch.setenv("PBL_CACHE", str(machine / "file"))
+    environment(PBL_CACHE=machine / "file")
     found = {f.what: f for f in module.examine()}
     assert found["cache folder"].state == module.MISSING
     assert "PBL_CACHE" in found["cache folder"].next_step

@@ -262,7 +262,7 @@ def test_leg_length_is_that_of_the_body_by_mujoco(scale):
 def test_bands_at_the_speed_of_a_group_are_the_groups(group):
     norm = gait_norm()
     speed = float(norm.speed[group] * np.sqrt(GRAVITY * LEG_M))
-    bands = normal_bands(measures(speed_m_per_s=speed, cadence_steps_per_min=60.0), LEG_M, PLUG_IN_GAIT)
+    bands = normal_bands(measures(speed_m_per_s=speed, cadence_steps_per_min=60.0).measures, LEG_M, PLUG_IN_GAIT)
     assert (bands.matched, bands.clipped) == ("speed", False)
     for angle in ("knee_flexion", "pelvis_obliquity"):
         mean, sd = bands.curves[angle]
@@ -274,21 +274,21 @@ def test_bands_at_the_speed_of_a_group_are_the_groups(group):
 def test_without_speed_the_cadence_decides(group):
     norm = gait_norm()
     cadence = 60 * float(norm.cadence[group]) / np.sqrt(LEG_M / GRAVITY)
-    bands = normal_bands(measures(cadence_steps_per_min=cadence), LEG_M)
+    bands = normal_bands(measures(cadence_steps_per_min=cadence).measures, LEG_M)
     assert bands.matched == "cadence"
     assert bands.speed == pytest.approx(norm.speed[group], abs=1e-6)
 
 
 @pytest.mark.parametrize(("cadence", "end"), [(30.0, 0), (200.0, -1)])
 def test_beyond_the_groups_it_says_so(cadence, end):
-    bands = normal_bands(measures(cadence_steps_per_min=cadence), LEG_M)
+    bands = normal_bands(measures(cadence_steps_per_min=cadence).measures, LEG_M)
     assert bands.clipped
     assert bands.speed == pytest.approx(gait_norm().speed[end])
     assert "slower or faster" in bands.words()
 
 
 def test_without_a_leg_the_free_speed():
-    bands = normal_bands(measures(cadence_steps_per_min=60.0))
+    bands = normal_bands(measures(cadence_steps_per_min=60.0).measures)
     assert (bands.matched, bands.speed) == ("", pytest.approx(0.4294))
     assert bands.words() == "at the speed that they choose"
 

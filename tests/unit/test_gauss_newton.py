@@ -22,6 +22,7 @@ from pbl_pipeline.body import (
 )
 from pbl_pipeline.fit import CostParams, GaussNewtonParams, ViewParams
 from pbl_pipeline.fit.feet_terms import later, residual_floor_cm, residual_slide_cm, slide_contact
+from pbl_pipeline.fit.imu_term import segments_at
 from pbl_pipeline.fit.joint_terms import bent, beyond_limit_deg, three_frames
 from pbl_pipeline.fit.keypoint_terms import (
     in_camera,
@@ -34,10 +35,10 @@ from pbl_pipeline.fit.normal_equations import linearise, moved
 from pbl_pipeline.fit.objective import TERMS, total
 from pbl_pipeline.fit.per_frame import limits_of, standing, start_of
 from pbl_pipeline.fit.phone_term import measured_orientation, phone_at, residual_phone_deg
-from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, bend_weights, pack, point_table
+from pbl_pipeline.fit.problem import SAMPLE_S, State, TrialArrays, Wearables, Wearing, bend_weights, pack, point_table
 from pbl_pipeline.fit.session import Session, make_session
 from pbl_pipeline.fit.solvers import linear
-from pbl_pipeline.fit.solvers.gauss_newton import Limits, before_first, minimise
+from pbl_pipeline.fit.solvers.gauss_newton import LevenbergMarquardt, Limits
 from pbl_pipeline.fit.solvers.linear import BorderedBandedSystem, marginal_variance, solve
 from pbl_pipeline.fit.solvers.result import Result
 from pbl_pipeline.fit.term import At, Term, Unknowns
@@ -160,7 +161,8 @@ def test_a_curvature_that_is_wrong_neither_creeps_nor_swings(over):
 
     start = jnp.array([[0.1], [0.1]]), jnp.zeros(1)
     limits = Limits(jnp.asarray(1e-5), jnp.asarray(-1.0), jnp.asarray(50))
-    end = minimise(evaluate, move, before_first(evaluate, start), jnp.ones(2), limits)
+    solver = LevenbergMarquardt(evaluate, move, jnp.ones(2))
+    end = solver.iterate(solver.init(start), limits)
     assert int(end.result) == Result.SMALL_STEP
     assert int(end.iteration) <= 15
     assert float(jnp.max(jnp.abs(end.state[0]))) < 1e-4
@@ -267,7 +269,38 @@ def small_session(kind: str) -> Session:
         p = session.problem
         seen = jnp.asarray(np.random.default_rng(5).random(p.contact.shape) * p.weight[:, None])
         session = dataclasses.replace(session, problem=dataclasses.replace(p, contact=seen))
+    if "sensors" in kind:
+        session = dataclasses.replace(
+            session, problem=dataclasses.replace(session.problem, wearables=wearables(session))
+        )
     return session
+
+
+def wearables(session: Session) -> Wearables:
+    """Sensors on the pelvis and a shank that measured anything, in all frames but a few."""
+    rng, p = np.random.default_rng(12), session.problem
+    frames, trials = len(p.weight), len(p.has_phone)
+    turns = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.02, (trials * 2, 256, 3)), axis=1).reshape(-1, 3))
+    quats = lambda *n: Rotation.random(int(np.prod(n)), rng).as_quat(scalar_first=True).reshape(*n, 4)  # noqa: E731
+    count = (rng.random((frames, 2)) < 0.9) * p.weight[:, None]
+    values = {
+        "body_index": [session.body.body_names.index(n) for n in ("pelvis", "tibia_l")],
+        "quat_wxyz": turns.as_quat(scalar_first=True).reshape(trials, 2, 256, 4),
+        "turned": rng.normal(size=(frames, 2, 3, 3)),
+        "count": count,
+        "follows": 0.8 * count * np.roll(count, -1, axis=0) * (np.diff(p.trial, append=-1) == 0)[:, None],
+        "mount": quats(2),
+        "world": quats(trials, 2),
+        "sd_rad": [0.3, 0.5],
+        "bias_sd_rad_s": [0.02, 0.05],
+        "level_sd_rad": np.full((trials, 2), 0.1),
+        "tilt_sd_rad": np.linspace(0, 0.2, trials),
+        "middle_s": np.full(trials, 0.4),
+        "clock_s": np.zeros(trials),
+        "dispersion": 0.3,
+    }
+    index = values.pop("body_index")
+    return Wearables(jnp.asarray(index), **{k: jnp.asarray(v, jnp.float32) for k, v in values.items()})
 
 
 def away(session: Session, seed: int = 3, detector: bool = False) -> State:
@@ -286,7 +319,14 @@ def away(session: Session, seed: int = 3, detector: bool = False) -> State:
         floor=noise(state.floor - np.array([1.2, 0.0, 0.0]), 0.03),
         lean=noise(np.zeros((d, 3)), 0.1),
         depth_m=noise(np.zeros((d, markers)), 0.05),
+        wearing=None if session.problem.wearables is None else wearing(session, rng),
     )
+
+
+def wearing(session: Session, rng: np.random.Generator) -> Wearing:
+    n = len(session.problem.has_phone)
+    at = lambda sd, *shape: jnp.asarray(rng.normal(0, sd, shape), jnp.float32)  # noqa: E731
+    return Wearing(at(0.1, 2, 3), at(0.1, n, 2, 3), at(0.02, 2, 3), at(0.02, n, 2))
 
 
 def at_state(session: Session, w: Weights, state: State) -> At:
@@ -294,10 +334,12 @@ def at_state(session: Session, w: Weights, state: State) -> At:
     p, scale = session.problem, scale_multipliers(state.s)
     x = marker_positions(session.body, p.points, state.qpos, scale, p.point_offsets(state.site_offset_m))
     markers, soles, _ = p.split(x)
-    return At(p, w, state, markers, soles, phone_at(p, state))
+    return At(p, w, state, markers, soles, phone_at(p, state), segments_at(session.body, p, state))
 
 
-@pytest.mark.parametrize("kind", ["views", "world", "floor pelvis", "moving floor", "moving detector"])
+@pytest.mark.parametrize(
+    "kind", ["views", "world", "floor pelvis", "moving floor", "moving detector", "moving sensors", "detector sensors"]
+)
 def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     session, detector = small_session(kind), "detector" in kind
     params = dataclasses.replace(PARAMS, weight_pelvis=0.5) if "pelvis" in kind else PARAMS
@@ -305,6 +347,11 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
     assert p.moving == ("moving" in kind)
     n = float(jnp.sum(p.weight))
     assert 30 < n < len(p.weight)  # and padding
+
+    def parts(h):
+        """The fields of `Wearing` among the last of the shared unknowns."""
+        sizes = [a.size for a in jax.tree.leaves(state.wearing)]
+        return np.split(np.asarray(h)[-sum(sizes) :], np.cumsum(sizes)[:-1])
 
     def changed(dx, dy):
         return n * total(at_state(session, w, moved(state, dx, dy)))
@@ -322,6 +369,10 @@ def test_normal_equations_hold_the_gradient_of_the_cost(kind):
         pairs |= {"turn": (at.g[:, 40:], want_g[:, 40:]), "clock": (at.h[k : k + 2], want_h[k : k + 2])}
         k += 2
     pairs["floor"] = (at.h[k : k + 6], want_h[k : k + 6])
+    if state.wearing is not None:
+        end = -sum(a.size for a in jax.tree.leaves(state.wearing))
+        pairs |= {f.name: (a, b) for f, a, b in zip(dataclasses.fields(Wearing), *map(parts, (at.h, want_h)))}
+        at, want_h = dataclasses.replace(at, h=at.h[:end]), want_h[:end]
     if detector:
         own, want = (h[k + 6 :].reshape(2, -1) for h in (at.h, want_h))
         pairs |= {"lean": (own[:, :3], want[:, :3]), "depth": (own[:, 3:], want[:, 3:])}

@@ -14,7 +14,7 @@ import pytest
 from pbl_pipeline.models import gpu_address, nvdec
 from pbl_pipeline.models.gpu_server import Server
 from pbl_pipeline.video import decode, frames_kept, gpu_decoding, kept, probe, read_frames, release_frames
-from tests import refused
+from tests import Environment, refused
 from tests.videos import constant_rate, noise_frames, write_video
 
 
@@ -167,13 +167,13 @@ def test_ffmpeg_decodes_all_else(
 
 
 def test_ffmpeg_decodes_where_the_gpu_is_not_wanted_or_has_no_decoder(
-    monkeypatch: pytest.MonkeyPatch, decoder: FFmpegDecoder, tmp_path: Path
+    environment: Environment, decoder: FFmpegDecoder, tmp_path: Path
 ) -> None:
     path = video(tmp_path)
     with frames_kept():
         decoder.server._decoder = None
         assert probe(path).n_frames == 12
-        monkeypatch.setenv("PBL_ONNX_DEVICE", "cpu")
+        environment(PBL_ONNX_DEVICE="cpu")
         assert probe(path).n_frames == 12
     assert not decoder.n_connections
 

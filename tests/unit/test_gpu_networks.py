@@ -25,7 +25,7 @@ from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
 from research.benchmarks.many_videos import differences
 from research.clip_keypoints import clip_keypoints
-from tests import refused
+from tests import Environment, refused
 from tests.videos import write_video
 
 LANDMARKS, MAPS = (195, 117, 1), 64 * 64 * 39
@@ -145,7 +145,7 @@ def test_pictures_of_many_videos_share_batches_and_get_their_own_answers(server:
     assert lite.note == ""
 
 
-def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, environment: Environment) -> None:
     picture = pictures(224, 1)[0]
     network, asked = network_of("blazepose_detector"), network_of("blazepose_detector")
     before = network(picture)
@@ -154,7 +154,7 @@ def test_where_the_gpu_goes_away_litert_goes_on_and_says_so(server: Server, monk
     assert not network.on_gpu
     assert "the GPU does not compute it" in network.note
     assert all(np.allclose(before[s].ravel(), after[s].ravel(), atol=0.01) for s in after)
-    monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
+    environment(PBL_ONNX_DEVICE="cuda")
     refused("DEVICE_UNAVAILABLE", asked, picture)
 
 
@@ -273,14 +273,14 @@ def test_where_the_gpu_gives_no_answer_clients_go_on_on_the_cpu(sums: str, monke
 
 @pytest.mark.long
 def test_keypoints_do_not_depend_on_what_computed_them(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, tmp_path: Path, environment: Environment
 ) -> None:
     """Of a clip from the file on: rounding in an earlier stage moves no crop, so it stays rounding."""
     frames = [f.image for f in read_frames(assets.fetch("demo_video"), 60, 120)]
     video = write_video(tmp_path / "clip.mp4", frames, np.arange(len(frames)) / 30.0, crf=18)
     method = METHODS.find("blazepose-33")
     by_jax = clip_keypoints(video, tmp_path / "people.jpg", method)
-    monkeypatch.setenv("PBL_ONNX_DEVICE", "cpu")
+    environment(PBL_ONNX_DEVICE="cpu")
     by_litert = clip_keypoints(video, tmp_path / "people.jpg", method)
     assert (by_jax.origin, by_litert.origin) == ("blazepose on cpu", "")
     for apart, median, most in zip(differences(by_jax, by_litert), (0.1, 1.0), (0.5, 4.0), strict=True):

@@ -54,7 +54,7 @@ def test_the_oldest_python_is_that_of_the_package():
 
 
 @pytest.fixture
-def checkout(tmp_path, monkeypatch) -> Path:
+def checkout(tmp_path, environment) -> Path:
     """A checkout with what `make` reads before it installs, and a PATH of stand-ins."""
     if shutil.which("make") is None:
         pytest.skip("no make")
@@ -68,9 +68,7 @@ def checkout(tmp_path, monkeypatch) -> Path:
         (here / lock).write_text("")
     for name in ("make", "df", "awk", "id"):  # no links: a stand-in that is written later would go into the real one
         program(programs, name, f'exec {shutil.which(name)} "$@"\n')
-    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "PYTHON"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("PATH", str(programs))
+    environment(MAKEFLAGS=None, MFLAGS=None, MAKELEVEL=None, PYTHON=None, PATH=programs)
     return here
 
 
@@ -125,7 +123,7 @@ def test_make_refuses_a_full_disk(checkout):
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch) -> Path:
+def machine(tmp_path, monkeypatch, environment) -> Path:
     """An empty home and cache, a MariaDB that was never started, and no program that could fetch: `calls` notes those
     that are called."""
     programs = tmp_path / "bin"
@@ -137,12 +135,8 @@ def machine(tmp_path, monkeypatch) -> Path:
     monkeypatch.setattr(sys, "executable", str(programs / "python"))
     monkeypatch.setattr(binaries, "PLACES", ())
     monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
-    monkeypatch.setenv("PATH", f"{programs}:/bin")
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "home"))
-    monkeypatch.setenv("PBL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setenv("PBL_OFFLINE", "1")
-    for name in ("DJ_HOST", "PBL_STORE"):
-        monkeypatch.delenv(name, raising=False)
+    environment(PATH=f"{programs}:/bin", PBL_HOME=tmp_path / "home", PBL_CACHE=tmp_path / "cache")
+    environment(PBL_OFFLINE="1", DJ_HOST=None, PBL_STORE=None)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -195,13 +189,15 @@ E: Failed to fetch http://deb/InRelease  Clearsigned file isn't valid, got 'NOSP
 
 
 @pytest.mark.parametrize(("case", "reason"), [("no network", "Temporary failure resolving"), ("a web page", "NOSPLIT")])
-def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(machine, monkeypatch, case, reason):
+def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(
+    machine, monkeypatch, environment, case, reason
+):
     without_mariadb(machine)
     (machine / "bin/printed").write_text(APT[case])
     update = f"*Error-Mode=any*update*) cat {machine / 'bin/printed'}"
     other = '*) echo "E: Unable to locate package mariadb"'
     program(machine / "bin", "apt-get", f'case "$*" in {update};; {other};; esac; exit 100\n')
-    monkeypatch.delenv("PBL_OFFLINE")
+    environment(PBL_OFFLINE=None)
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     done = pbl("demo")
     assert (done.code, done.error_code) == (1, "DB_UNAVAILABLE"), done.err
@@ -215,16 +211,15 @@ def test_apt_without_root_and_archive_is_told_before_anything_is_fetched(machine
     assert reason in (binaries.install(print) or "")
 
 
-def test_a_home_or_cache_that_is_a_file_is_named_before_anything_is_made(machine, monkeypatch):
+def test_a_home_or_cache_that_is_a_file_is_named_before_anything_is_made(machine, monkeypatch, environment):
     (machine / "walk.mp4").write_text("not a folder")
-    monkeypatch.setenv("PBL_CACHE", str(machine / "walk.mp4"))
+    environment(PBL_CACHE=machine / "walk.mp4")
     done = pbl("demo")
     assert (done.error_code, "set PBL_CACHE" in done.err) == ("ASSET_MISSING", True), done.err
     assert (made(machine), calls(machine)) == (set(), "")
-    monkeypatch.setenv("PBL_CACHE", str(machine / "cache"))
+    environment(PBL_CACHE=machine / "cache")
     for variable in ("PBL_HOME", "HOME"):
-        monkeypatch.setenv("PBL_HOME", str(machine / "walk.mp4") if variable == "PBL_HOME" else "")
-        monkeypatch.setenv("HOME", str(machine / "walk.mp4"))
+        environment(PBL_HOME=machine / "walk.mp4" if variable == "PBL_HOME" else "", HOME=machine / "walk.mp4")
         monkeypatch.setattr(os, "geteuid", lambda: 1000)  # root's home is another
         done = pbl("demo")
         assert (done.error_code, "set PBL_HOME" in done.err) == ("DB_UNAVAILABLE", True), done.err
@@ -259,13 +254,13 @@ def test_a_home_that_may_not_be_entered_is_named(machine, monkeypatch):
     assert made(machine) == set()
 
 
-def test_a_full_disk_is_told_before_any_work(machine, monkeypatch):
+def test_a_full_disk_is_told_before_any_work(machine, monkeypatch, environment):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000_000))
     write_video(machine / "walk.mp4", numbered_frames(5), constant_rate(5))
     done = pbl("run", machine / "walk.mp4", "--out", "results")
     assert (done.error_code, "20 MB are free" in done.err) == ("FILE_UNWRITABLE", True), done.err
     refused("DB_UNAVAILABLE", server.prepare)
-    monkeypatch.delenv("PBL_OFFLINE")
+    environment(PBL_OFFLINE=None)
     error = refused("ASSET_MISSING", assets.fetch, "demo_video")
     assert "20 MB are free in" in error.found
     assert error.found.endswith("sports2d==0.8.34 needs 22")  # MB: the wheel twice, and its two files

@@ -9,13 +9,14 @@ from multiprocessing import forkserver
 import pytest
 
 from pbl_pipeline.limited import LimitExceeded, limited
+from tests import Environment
 
 
-def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(monkeypatch: pytest.MonkeyPatch):
+def test_a_copy_has_the_environment_of_its_call_and_not_of_the_first(environment: Environment):
     for value in ("first", "second"):
-        monkeypatch.setenv("PBL_TEST_COPY", value)
+        environment(PBL_TEST_COPY=value)
         assert limited(os.getenv, "PBL_TEST_COPY", returns=True) == value
-    monkeypatch.delenv("PBL_TEST_COPY")
+    environment(PBL_TEST_COPY=None)
     assert limited(os.getenv, "PBL_TEST_COPY", returns=True) is None
 
 

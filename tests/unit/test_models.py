@@ -24,7 +24,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import METHODS, ModelKeypointParams
 from pbl_pipeline.models import spec
 from pbl_pipeline.paramset import Paramset
-from tests import dot_models, refused
+from tests import Environment, dot_models, refused
 from tests.command import pbl
 from tests.dot_models import changed
 
@@ -40,9 +40,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
-    monkeypatch.delenv("PBL_ONNX_DEVICE", raising=False)
+def registry(tmp_path: Path, environment: Environment) -> Path:
+    environment(PBL_MODELS=tmp_path / "models", PBL_ONNX_DEVICE=None)
     return tmp_path / "models"
 
 
@@ -257,12 +256,12 @@ def test_no_graph_at_all(folder):
 # --- devices
 
 
-def test_cuda_asked_for_and_absent_is_an_error(folder, monkeypatch):
+def test_cuda_asked_for_and_absent_is_an_error(folder, monkeypatch, environment):
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
     assert "onnxruntime-gpu" in refused("DEVICE_UNAVAILABLE", models.OnnxModel, folder, "cuda").next_step
-    monkeypatch.setenv("PBL_ONNX_DEVICE", "cuda")
+    environment(PBL_ONNX_DEVICE="cuda")
     refused("DEVICE_UNAVAILABLE", models.OnnxModel, folder)
-    monkeypatch.setenv("PBL_ONNX_DEVICE", "tpu")
+    environment(PBL_ONNX_DEVICE="tpu")
     refused("USAGE", models.OnnxModel, folder)
 
 
@@ -280,8 +279,8 @@ class Falls:
         return getattr(self.inner, name)
 
 
-def test_cuda_that_does_not_start_is_never_silent(folder, monkeypatch):
-    monkeypatch.delenv("PBL_ONNX_DEVICE", raising=False)
+def test_cuda_that_does_not_start_is_never_silent(folder, monkeypatch, environment):
+    environment(PBL_ONNX_DEVICE=None)
     there = ["CUDAExecutionProvider", "CPUExecutionProvider"]
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: there)
     monkeypatch.setattr(onnxruntime, "InferenceSession", Falls)
@@ -409,9 +408,8 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
         pass
 
 
-def test_add_from_an_address(folder, registry, tmp_path, monkeypatch):
-    monkeypatch.delenv("PBL_OFFLINE", raising=False)
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
+def test_add_from_an_address(folder, registry, tmp_path, environment):
+    environment(PBL_OFFLINE=None, no_proxy="127.0.0.1")
     archive = packed(tmp_path, "zip")
     sha256 = hashlib.sha256(archive.read_bytes()).hexdigest()
     handler = functools.partial(Quiet, directory=str(tmp_path))
@@ -425,7 +423,7 @@ def test_add_from_an_address(folder, registry, tmp_path, monkeypatch):
             for address in ("http://127 0 0 1/a.zip", "http://[::1/a.zip", "https://"):
                 assert pbl("models", "add", address, "--sha256", sha256).error_code == "MODEL_MISSING"
             assert pbl("models", "add", f"{base}/packed.zip", "--sha256", sha256).code == 0
-            monkeypatch.setenv("PBL_OFFLINE", "1")
+            environment(PBL_OFFLINE="1")
             assert pbl("models", "add", f"{base}/packed.zip", "--sha256", sha256).error_code == "MODEL_MISSING"
         finally:
             server.shutdown()

@@ -485,9 +485,9 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracking]:
 
 
 @pytest.fixture
-def registered(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
-    monkeypatch.setenv("PBL_ONNX_DEVICE", "cpu")  # also put back what `--device` sets
+def registered(tmp_path, environment) -> None:
+    environment(PBL_MODELS=tmp_path / "models")
+    environment(PBL_ONNX_DEVICE="cpu")  # also put back what `--device` sets
     models.add(dot_models.write(tmp_path / "a", dot_models.crop3d(person()), dot_models.spec("crop3d")))
     models.add(dot_models.write(tmp_path / "b", dot_models.simcc(), dot_models.spec("simcc", (192, 256))))
 

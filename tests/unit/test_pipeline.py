@@ -14,6 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.report import write_report
 from pbl_pipeline.visit import Recording, Visit
+from tests import Environment
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.integration import chain
 from tests.walking_fit import walking_fit
@@ -114,7 +115,7 @@ def test_a_persons_number_belongs_to_one_video(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["", "blur"])
 def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
-    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, how: str
+    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path, how: str
 ):
     """The stand-in copy is another video; both the overlay and the report's pictures are made from it."""
     import pbl_pipeline.deidentify.video_copy as lib
@@ -125,7 +126,7 @@ def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
         return lib.Deidentified(out, out, way, 1, "CERTAIN", "", ())
 
     used = []
-    monkeypatch.setenv("PBL_DEIDENTIFY", how)
+    environment(PBL_DEIDENTIFY=how)
     monkeypatch.setattr(lib, "deidentify", copied)
     monkeypatch.setattr(pipeline, "render_overlay", lambda path, *_, **__: used.append(path))
     monkeypatch.setattr(pipeline, "overlay_frames", lambda path, *_, **__: used.append(path) or [])

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,27 +18,32 @@ from pbl_pipeline.resources import keep_large_blocks
 from pbl_schemas.operations.embedded import process
 from pbl_workers import supervisor
 from pbl_workers.process import Options
+from tests import Environment
 from tests.command import pbl
 from tests.ended_process import Ended
 
 GB = 2**30
 
 
-def groups(folder: Path, patch: pytest.MonkeyPatch, own: str, files: dict[str, str]) -> None:
-    """A tree of control groups as the kernel shows it."""
-    patch.setattr(resources, "_GROUPS", folder)
-    (folder / "own").write_text(own)
-    patch.setattr(resources, "_OWN", folder / "own")
-    for name, text in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text + "\n")
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, dict[str, str]], None]:
+    """Writes a tree of control groups as the kernel shows it."""
+    monkeypatch.setattr(resources, "_GROUPS", tmp_path)
+    monkeypatch.setattr(resources, "_OWN", tmp_path / "own")
+
+    def write(own: str, files: dict[str, str]) -> None:
+        (tmp_path / "own").write_text(own)
+        for name, text in files.items():
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).write_text(text + "\n")
+
+    return write
 
 
 @pytest.fixture
-def sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
+def sixteen(monkeypatch: pytest.MonkeyPatch, environment: Environment) -> None:
     """A process that is bound to 16 cores of a machine with 64 GB."""
-    for name in (resources.CORES, *resources._THREADS):
-        monkeypatch.delenv(name, raising=False)
+    environment(**dict.fromkeys((resources.CORES, *resources._THREADS)))
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(16)))
     monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 16 * 2**20}.__getitem__)
 
@@ -64,15 +70,15 @@ def sixteen(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
     ],
 )
-def test_limits_of_control_groups_count(sixteen, tmp_path: Path, monkeypatch, own: str, files: dict, expected: tuple):
-    groups(tmp_path, monkeypatch, own, files)
+def test_limits_of_control_groups_count(sixteen, tmp_path: Path, groups, own: str, files: dict, expected: tuple):
+    groups(own, files)
     assert (resources.cores(), resources.memory_bytes()) == expected
 
 
-def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: Path, monkeypatch):
-    groups(tmp_path, monkeypatch, "0::/", {"cpu.max": "400000 100000"})
+def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: Path, groups, environment):
+    groups("0::/", {"cpu.max": "400000 100000"})
     for stated, expected in (("3", 3), ("64", 4), ("0", 1), ("many", 4)):
-        monkeypatch.setenv(resources.CORES, stated)
+        environment(**{resources.CORES: stated})
         assert resources.cores() == expected
 
 
@@ -84,10 +90,12 @@ def test_what_is_stated_counts_but_never_more_than_there_is(sixteen, tmp_path: P
         (("--processes", "auto"), [*["1"] * 16, "16"]),  # the last one is for phones
     ],
 )
-def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, monkeypatch, asked: tuple, shares: list):
-    groups(tmp_path, monkeypatch, "0::/", {})
+def test_a_worker_divides_the_cores_by_its_processes(
+    sixteen, tmp_path: Path, monkeypatch, groups, environment, asked: tuple, shares: list
+):
+    groups("0::/", {})
     monkeypatch.setattr("pbl_schemas.activate", lambda **_: None)
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")  # who sets it means it
+    environment(OMP_NUM_THREADS="7")  # who sets it means it
     seen: list[dict[str, str]] = []
     names = (resources.CORES, *resources._THREADS)
 
@@ -102,29 +110,36 @@ def test_a_worker_divides_the_cores_by_its_processes(sixteen, tmp_path: Path, mo
     assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
 
 
-def worker_options(patch: pytest.MonkeyPatch, gpus: tuple[str, ...], *asked: str) -> Options:
+@pytest.fixture
+def worker_options(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Options]:
     """The options of `pbl worker --processes auto` on a machine with these GPUs."""
     found: list[Options] = []
-    patch.setattr("pbl_schemas.activate", lambda **_: None)
-    patch.setattr("pbl_workers.process.given_gpus", lambda: gpus)
-    patch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
-    assert pbl("worker", "--processes", "auto", *asked).code == 0
-    return found[0]
+    monkeypatch.setattr("pbl_schemas.activate", lambda **_: None)
+    monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
+
+    def asked_for(gpus: tuple[str, ...], *asked: str) -> Options:
+        monkeypatch.setattr("pbl_workers.process.given_gpus", lambda: gpus)
+        assert pbl("worker", "--processes", "auto", *asked).code == 0
+        return found[-1]
+
+    return asked_for
 
 
-def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, monkeypatch):
-    groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(13 * GB)})
-    assert worker_options(monkeypatch, ()).processes == 3
+def test_little_memory_means_fewer_processes(sixteen, tmp_path: Path, worker_options, groups):
+    groups("0::/", {"memory.max": str(13 * GB)})
+    assert worker_options(()).processes == 3
     assert pbl("worker", "--processes", "many").code == 2
 
 
 @pytest.mark.parametrize(("gpu_detects", "n"), [(False, 16), (True, 32)])
-def test_a_machine_with_gpus_is_used_whole(sixteen, tmp_path: Path, monkeypatch, gpu_detects: bool, n: int):
+def test_a_machine_with_gpus_is_used_whole(
+    sixteen, tmp_path: Path, monkeypatch, worker_options, groups, gpu_detects: bool, n: int
+):
     """A process for each core, or two where a GPU detects; of them, and for the fit alone, one for each GPU fits."""
-    groups(tmp_path, monkeypatch, "0::/", {})
+    groups("0::/", {})
     monkeypatch.setattr(resources, "memory_bytes", lambda: 128 * GB)
     monkeypatch.setattr("pbl_pipeline.models.gpu_address.gpu_visible", lambda: gpu_detects)
-    whole, fit = (worker_options(monkeypatch, ("0", "1"), *asked) for asked in ((), ("--resource", "gpu")))
+    whole, fit = (worker_options(("0", "1"), *asked) for asked in ((), ("--resource", "gpu")))
     each = [whole.of_process(n) for n in range(whole.processes)]
     assert [(o.resource, o.gpus) for o in each] == [("all" if i < 2 else "cpu", (str(i % 2),)) for i in range(n)]
     assert {o.processes for o in each} == {n // 2}
@@ -149,8 +164,8 @@ def test_the_numerical_library_keeps_to_its_share():
 
 
 @pytest.mark.parametrize(("limit", "expected"), [(GB, 256), (16 * GB, 2048), (64 * GB, 8192)])
-def test_the_database_is_sized_to_the_machine(sixteen, tmp_path: Path, monkeypatch, limit: int, expected: int):
-    groups(tmp_path, monkeypatch, "0::/", {"memory.max": str(limit)})
+def test_the_database_is_sized_to_the_machine(sixteen, tmp_path: Path, groups, limit: int, expected: int):
+    groups("0::/", {"memory.max": str(limit)})
     assert process.buffer_pool_mb() == expected
 
 

@@ -14,6 +14,7 @@ import pytest
 from pbl_pipeline import temporary
 from pbl_pipeline.files import complete_file
 from pbl_schemas.operations.folders import write_json
+from tests import Environment
 from tests.command import pbl
 from tests.source import PACKAGES, files
 
@@ -25,9 +26,9 @@ KILLED = {
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> Path:
     """The folder of temporary files, of this process and of those that it starts."""
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    environment(TMPDIR=tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", None)
     return tmp_path
 

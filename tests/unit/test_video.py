@@ -7,7 +7,7 @@ import json
 import random
 import shutil
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -778,25 +778,30 @@ def pictures(path: Path) -> list[tuple[int, float, np.ndarray]]:
     return [(f.index, f.time_s, f.image) for f in read_frames(path, 1, 6, 2)]
 
 
-def decodes(monkeypatch: pytest.MonkeyPatch, path: Path) -> bool:
-    opened = []
-    real = frames.Decoder
-    with monkeypatch.context() as patch:
-        patch.setattr(frames, "Decoder", lambda *a: opened.append(a) or real(*a))
+@pytest.fixture
+def decodes(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], bool]:
+    """True if the pictures of a file are decoded to be read."""
+    opened, real = [], frames.Decoder
+    monkeypatch.setattr(frames, "Decoder", lambda *a: opened.append(a) or real(*a))
+
+    def read(path: Path) -> bool:
+        opened.clear()
         list(read_frames(path))
-    return bool(opened)
+        return bool(opened)
+
+    return read
 
 
-def test_kept_pictures_are_those_of_the_file(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+def test_kept_pictures_are_those_of_the_file(decodes: Callable[[Path], bool], video: Path) -> None:
     expected = pictures(video)
     with frames_kept():
         probe(video)
         found = pictures(video)
-        assert not decodes(monkeypatch, video)
+        assert not decodes(video)
     for (i, at_s, image), (j, other_s, other) in zip(expected, found, strict=True):
         assert (i, at_s) == (j, other_s)
         np.testing.assert_array_equal(image, other)
-    assert decodes(monkeypatch, video)
+    assert decodes(video)
 
 
 def test_memory_of_kept_pictures_stays_for_the_next_ones_alone(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
@@ -827,29 +832,31 @@ def other_video(video: Path) -> Path:
     return Path(shutil.copy(video, video.with_name("b.mp4")))
 
 
-def test_nothing_is_kept_unless_asked_for(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+def test_nothing_is_kept_unless_asked_for(decodes: Callable[[Path], bool], video: Path) -> None:
     probe(video)
-    assert decodes(monkeypatch, video)
+    assert decodes(video)
 
 
-def test_another_file_and_a_changed_one_are_decoded(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+def test_another_file_and_a_changed_one_are_decoded(decodes: Callable[[Path], bool], video: Path) -> None:
     other = other_video(video)
     with frames_kept():
         probe(video)
-        assert decodes(monkeypatch, other)
+        assert decodes(other)
         other.replace(video)
-        assert decodes(monkeypatch, video)
+        assert decodes(video)
 
 
-def test_a_released_one_and_one_without_room_are_decoded(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+def test_a_released_one_and_one_without_room_are_decoded(
+    monkeypatch: pytest.MonkeyPatch, decodes: Callable[[Path], bool], video: Path
+) -> None:
     with frames_kept():
         probe(video)
         release_frames()
-        assert decodes(monkeypatch, video)
+        assert decodes(video)
         for room in (2e5, 8e5):  # for none, and for some of the pictures
             monkeypatch.setattr(kept, "share_of_memory", lambda room=room: room)
             probe(video)
-            assert decodes(monkeypatch, video)
+            assert decodes(video)
 
 
 def test_released_pictures_do_not_wait_for_the_collector_of_cycles(video: Path) -> None:

@@ -15,14 +15,14 @@ from pbl_pipeline.errors import PblError
 from pbl_workers.cli.web import web
 from pbl_workers.web import Where, certificates
 from pbl_workers.web.access import host_name
-from tests import refused
+from tests import Environment, refused
 
 NAMES = ("127.0.0.1", "gait.example")
 
 
 @pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("PBL_HOME", str(tmp_path))
+def home(tmp_path: Path, environment: Environment) -> Path:
+    environment(PBL_HOME=tmp_path)
     return tmp_path
 
 
@@ -63,10 +63,10 @@ def test_a_browser_that_trusts_the_authority_accepts_each_name(home: Path):
         handshake(NAMES, "other.example", certificates.authority())
 
 
-def test_another_authority_is_not_accepted(home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_another_authority_is_not_accepted(home: Path, environment: Environment, tmp_path: Path):
     certificates.server_certificate(NAMES)
     other = certificates.authority()
-    monkeypatch.setenv("PBL_HOME", str(tmp_path / "other"))
+    environment(PBL_HOME=tmp_path / "other")
     with pytest.raises(ssl.SSLCertVerificationError):
         handshake(NAMES, "127.0.0.1", other)
 

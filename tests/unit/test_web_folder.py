@@ -20,7 +20,7 @@ from pbl_pipeline.gait import gait_metrics
 from pbl_pipeline.visit import load_visit, save_beside
 from pbl_workers.web import ResultsFolder, Where, serve
 from pbl_workers.web.pages import plain
-from tests import not_none
+from tests import Environment, not_none
 from tests.exported import with_markers
 from tests.integration import web
 from tests.walking_fit import walking_fit
@@ -106,14 +106,14 @@ def test_a_visit_shows_curves_peaks_and_ranges_of_both_sides_beside_the_norm(res
     assert "*" not in re.findall(r"Cadence.*?</tr>", page)[0]
 
 
-def test_what_is_not_there_is_said(browser, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_not_there_is_said(browser, environment: Environment):
     # The second visit has no recording beside it.
     assert "copy the recording beside its results" in browser.get("/recordings/2").text
     assert browser.get("/recordings/2/video").status_code == 404
     for path in ("/visits/9", "/recordings/9", "/recordings/9/movement", "/recordings/2/overlay"):
         assert browser.get(path).status_code == 404, path
     assert "FILE_FORMAT" in browser.get("/visits/3").text
-    monkeypatch.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     assert "PBL_DEIDENTIFY" in browser.get("/recordings/1").text
     assert browser.get("/recordings/1/video").status_code == 404
 

@@ -25,6 +25,7 @@ from pbl_workers.process import VISIBLE, Options, given_gpus
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import Supervisor, _Child
+from tests import Environment
 from tests.command import program
 from tests.ended_process import Ended
 
@@ -243,29 +244,28 @@ CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
     ("listed", "expected"),
     [("2,5", ("2", "5")), ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")), ("", ()), ("-1", ()), ("NoDevFiles", ())],
 )
-def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv(VISIBLE, listed)
+def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, environment: Environment):
+    environment(**{VISIBLE: listed})
     assert given_gpus() == expected
 
 
 @pytest.mark.parametrize(
     ("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), ("exec /bin/sleep 60", ()), (None, ())]
 )
-def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch):
-    monkeypatch.delenv(VISIBLE, raising=False)
-    monkeypatch.setenv("PATH", str(tmp_path))
+def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch, environment):
+    environment(**{VISIBLE: None}, PATH=tmp_path)
     monkeypatch.setattr(process, "QUERY_S", 0.5)
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected
 
 
-def test_use_and_memory_of_gpus_are_among_the_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_use_and_memory_of_gpus_are_among_the_figures(tmp_path: Path, environment: Environment):
     def found() -> dict[tuple[str, str], float]:
         samples = [s for figure in metrics.machine_figures() for s in figure.samples if s.name.startswith("pbl_gpu")]
         return {(s.name, s.labels["gpu"]): s.value for s in samples}
 
-    monkeypatch.setenv("PATH", str(tmp_path))
+    environment(PATH=tmp_path)
     assert found() == {}
     program(tmp_path, "nvidia-smi", 'echo "0, 37, 1024, 2048"\necho "1, [N/A], 0, 2048"')
     assert found() == {
@@ -304,16 +304,15 @@ def test_processes_that_fit_on_one_gpu_know_it():
     assert share("gpu", 2) == [False, False]
 
 
-def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch):
+def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch, environment: Environment):
     """What JAX finds in the environment of the two processes of two GPUs, of the fourth of four, and of the one for
     phones."""
     for name in ("_connected", "to_stderr", "signal.signal"):
         monkeypatch.setattr(f"pbl_workers.process.{name}", lambda *_: False)  # it ends where it would connect
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
-        for name in (VISIBLE, MEMORY, *CPU):
-            monkeypatch.setenv(name, "")
-            monkeypatch.delenv(name)
+        for value in ("", None):  # put back what the process sets
+            environment(**dict.fromkeys((VISIBLE, MEMORY, *CPU), value))
         process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
         seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, *CPU))))
     no = (None, None)

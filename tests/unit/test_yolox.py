@@ -115,8 +115,8 @@ def test_models_of_another_kind_or_shape_are_refused():
 
 
 @pytest.fixture
-def registry(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setenv("PBL_MODELS", str(tmp_path / "models"))
+def registry(tmp_path, environment) -> Path:
+    environment(PBL_MODELS=tmp_path / "models")
     return tmp_path / "models"
 
 

@@ -40,7 +40,9 @@ from pbl_schemas.operations.archive import (
     REFUSED,
     archive_dir,
     folder_of,
+    has_row,
     load_seen,
+    note_placed,
     plain_name,
     remove_copies,
     save_seen,
@@ -297,24 +299,29 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
     """Move copies of a recording, and of its sensor log if there is one (`check_log`), to their place in the archive
     and register them; return the outcome. `file`: the name that the recording came with.
 
-    Raises `PblError`, which says what is wrong with the recording.
+    Raises `PblError`, which says what is wrong with the recording: the copies are where they were, if it has no row.
     """
     visit.check(file)
     recording, *logs = copies
     folder = private_folder(folder_of(archive, "", visit.subject) / plain_name(visit.session_label))
     target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
+    came, note = [copy.path for copy in copies], note_placed(archive, target)
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)
     sync_folders(folder, archive)
     sensors = Sensors(attitude=logs[0].path if logs else None)
     (result,) = register([OneCamera(target, visit, sensors)])
     if result.error is not None:
+        if result.error.code not in _OURS and not has_row(target):
+            for copy, path in zip(copies, came, strict=True):
+                copy.path = copy.path.replace(path)
+            note.unlink()
         raise result.error
-    if result.status == "registered":
-        return result
-    registered = Path((video.Video & {"video_id": result.video_id}).fetch1("video_path"))
-    if registered != target and registered.is_file() and sha256_of(registered) == recording.sha256:
-        target.unlink()
+    if result.status != "registered":
+        registered = Path((video.Video & {"video_id": result.video_id}).fetch1("video_path"))
+        if registered != target and registered.is_file() and sha256_of(registered) == recording.sha256:
+            target.unlink()
+    note.unlink()
     return result
 
 

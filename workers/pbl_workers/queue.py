@@ -12,10 +12,12 @@ import datetime
 import functools
 import hashlib
 import json
+import math
 import os
 import platform
 import random
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from pbl_pipeline.errors import PblError
@@ -31,6 +33,10 @@ from .registry import LONG, LONG_FRAMES, NEW
 _SPREAD = 4
 #: Longest wait of a job that was put back (s).
 LONGEST_WAIT_S = 60.0
+#: Time for which candidates are tried without reading again (s): a more urgent job waits no longer.
+_KEPT_S = 0.1
+#: Candidates that were read and not tried, of each table and condition, with the time when (s).
+_read: dict[tuple[Any, str | None], tuple[float, list[dict[str, Any]]]] = {}
 #: Jobs that this process holds: table and hash of the key.
 _held: set[tuple[str, str]] = set()
 
@@ -127,32 +133,55 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 # --------------------------------------------------------------------------------------------------- reserving, ending
 def most_urgent(table: Any, where: str | None = None) -> int | None:
     """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
-    rows = _ready(jobs_of(table), "priority", 1, where)
+    rows = _ready(table, 1, where)
     return int(rows[0]["priority"]) if rows else None
 
 
-def _ready(jobs: Any, columns: str, n: int, where: str | None) -> list[dict[str, Any]]:
-    """Return columns of the first n jobs that can be taken now. Plain SQL: half of DataJoint's time for a query."""
+def _ready(table: Any, n: int, where: str | None) -> list[dict[str, Any]]:
+    """Return candidates for n jobs, the most urgent and oldest first, and keep them for `claim`. Plain SQL: half of
+    DataJoint's time for a query."""
+    jobs = jobs_of(table)
     rows = jobs.connection.query(
-        f"SELECT {columns} FROM {jobs.full_table_name} WHERE status='pending'{f' AND {where}' if where else ''}"  # noqa: S608
-        f" AND scheduled_time <= CURRENT_TIMESTAMP(3) ORDER BY priority, scheduled_time LIMIT {n}",
+        f"SELECT {', '.join(jobs.primary_key)}, priority, attempts FROM {jobs.full_table_name}"  # noqa: S608
+        f" WHERE status='pending'{f' AND {where}' if where else ''} AND scheduled_time <= CURRENT_TIMESTAMP(3)"
+        f" ORDER BY priority, scheduled_time LIMIT {_SPREAD * n}",
         as_dict=True,
     )
-    return list(rows.fetchall())
+    _read[table, where] = time.monotonic(), list(rows.fetchall())
+    return _read[table, where][1]
+
+
+def _candidates(table: Any, n: int, where: str | None) -> Iterator[dict[str, Any]]:
+    """Yield candidates for n jobs in the order in which they are tried: those that were just read, then the queue's."""
+    at, rows = _read.get((table, where), (-math.inf, []))
+    if time.monotonic() - at < _KEPT_S:
+        yield from _drawn(rows)
+    yield from _drawn(_ready(table, n, where))
+
+
+def _drawn(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Take candidates out of a list, the most urgent first. All workers see the same ones: a random order within a
+    priority makes two hands on one job rare."""
+    rows.sort(key=lambda r: (-r["priority"], random.random()))  # noqa: S311
+    while rows:
+        yield rows.pop()
 
 
 def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
     """Reserve up to n jobs, the most urgent and oldest first; where many workers draw, nearly so. `where`: as for
     `most_urgent`."""
     jobs = jobs_of(table)
-    rows = _ready(jobs, ", ".join((*jobs.primary_key, "priority", "attempts")), _SPREAD * n, where)
+    # DataJoint's `jobs.reserve` asks the server for the account's name in a statement before this one.
+    reserve = (
+        f"UPDATE {jobs.full_table_name} SET status='reserved', host=%s, pid=%s, connection_id=%s, user=USER(),"  # noqa: S608
+        f" reserved_time=CURRENT_TIMESTAMP(3) WHERE {' AND '.join(f'`{name}`=%s' for name in jobs.primary_key)}"
+        " AND status='pending' AND scheduled_time <= CURRENT_TIMESTAMP(3)"
+    )
     claims: list[Claim] = []
-    # All workers see the same candidates: a random order within a priority makes two hands on one job rare.
-    rows.sort(key=lambda r: (r["priority"], random.random()))  # noqa: S311
-    for row in rows:
+    for row in _candidates(table, n, where) if n else ():
         key = {k: row[k] for k in jobs.primary_key}
-        if jobs.reserve(key):
-            here = (platform.node(), os.getpid(), jobs.connection.connection_id)
+        here = (platform.node(), os.getpid(), jobs.connection.connection_id)
+        if jobs.connection.query(reserve, args=(*here, *key.values())).rowcount == 1:
             claims.append(Claim(table, key, int(row["priority"]), *here, attempts=int(row["attempts"])))
             _held.add((table.__name__, claims[-1].hash))
             if len(claims) == n:

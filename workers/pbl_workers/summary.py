@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import html
+from collections import Counter
 from pathlib import Path
 
 from pbl_pipeline.code_version import code_version
 from pbl_schemas import computed_tables, session, video
-from pbl_schemas.reading.status import Status, pipeline_status
+from pbl_schemas.reading.status import Status, error_counts, pipeline_status, queue_counts
 from pbl_schemas.rows import utc_now
 
 
@@ -22,6 +23,7 @@ class Summary:
     new_videos: int
     new_sessions: int
     done: dict[str, int]
+    codes: Counter[str]  # of the jobs in error
     status: Status
 
 
@@ -34,13 +36,17 @@ def make_summary(hours: float = 24.0) -> Summary:
     for table in computed_tables():
         column = next(n for n in table.heading.names if n.endswith("_computed"))
         done[table.__name__] = len(table & f"{column} >= {text}")
+    server, codes = video.Video.connection, Counter[str]()
+    for (_, code), n in error_counts(server, queue_counts(server)).items():
+        codes[code] += n
     return Summary(
         since,
         until,
         len(video.Video & f"video_created >= {text}"),
         len(session.Session & f"session_created >= {text}"),
         done,
-        pipeline_status(most=1000),
+        codes,
+        pipeline_status(most=0),
     )
 
 
@@ -58,10 +64,7 @@ def rows(found: Summary) -> list[tuple[str, str]]:
         waits = f", {table.waiting} wait for a choice" if table.waiting else ""
         left = f", {table.pending} pending" if table.pending else ""
         out.append((table.table, f"{found.done[table.table]} new of {table.done}{left}{failed}{waits}"))
-    codes: dict[str, int] = {}
-    for error in state.errors:
-        codes[error.code] = codes.get(error.code, 0) + 1
-    out += [(f"error {code}", str(n)) for code, n in sorted(codes.items(), key=lambda c: -c[1])]
+    out += [(f"error {code}", str(n)) for code, n in found.codes.most_common()]
     lost = f", {state.workers_lost} lost in the last hour" if state.workers_lost else ""
     out.append(("workers alive", f"{len(state.workers)}{lost}"))
     out += [(f"cron {one.name}", one.text()) for one in state.cron]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -82,47 +82,43 @@ class Progress:
     trace: Array
 
 
-def before_first(evaluate: Callable[[S], Quadratic], start: S) -> Progress:
-    """Initial `Progress` of `minimise`: nothing is evaluated yet."""
-    shapes = jax.eval_shape(evaluate, start)
-    return Progress(
-        state=start,
-        cost=jnp.asarray(jnp.inf, jnp.float32),
-        latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
-        candidate=start,
-        direction=(jnp.zeros(shapes.g.shape, shapes.g.dtype), jnp.zeros(shapes.h.shape, shapes.h.dtype)),
-        length=jnp.asarray(1.0, jnp.float32),
-        slope=jnp.asarray(jnp.inf, jnp.float32),
-        step=jnp.asarray(jnp.inf, jnp.float32),
-        damping=jnp.asarray(DAMPING_START, jnp.float32),
-        iteration=jnp.asarray(-1, jnp.int32),
-        idle=jnp.asarray(0, jnp.int32),
-        result=jnp.asarray(Result.BOUND, jnp.int32),
-        trace=jnp.full(MOST_ITERATIONS, jnp.nan, jnp.float32),
-    )
+@dataclasses.dataclass(frozen=True)
+class LevenbergMarquardt(Generic[S]):
+    """The iteration as its `init`, `step` and `terminate`, which `iterate` repeats."""
 
+    #: Cost and its quadratic model at a state.
+    evaluate: Callable[[S], Quadratic]
+    #: The state after a step (F, Q) of the frames' unknowns and (K,) of the shared ones.
+    move: Callable[[S, Array, Array], S]
+    #: (F,) 0 for frames whose step does not count for convergence.
+    counts: Float[Array, " F"]
 
-def minimise(
-    evaluate: Callable[[S], Quadratic],
-    move: Callable[[S, Array, Array], S],
-    begin: Progress,
-    counts: Float[Array, " F"],
-    limits: Limits,
-    steps: Any = None,
-) -> Progress:
-    """Minimise a cost, from `before_first` or from where a call with fewer iterations ended: both ways take the
-    same steps.
+    def init(self, start: S) -> Progress:
+        """`Progress` in which nothing is evaluated yet."""
+        shapes = jax.eval_shape(self.evaluate, start)
+        return Progress(
+            state=start,
+            cost=jnp.asarray(jnp.inf, jnp.float32),
+            latest=jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes),
+            candidate=start,
+            direction=(jnp.zeros(shapes.g.shape, shapes.g.dtype), jnp.zeros(shapes.h.shape, shapes.h.dtype)),
+            length=jnp.asarray(1.0, jnp.float32),
+            slope=jnp.asarray(jnp.inf, jnp.float32),
+            step=jnp.asarray(jnp.inf, jnp.float32),
+            damping=jnp.asarray(DAMPING_START, jnp.float32),
+            iteration=jnp.asarray(-1, jnp.int32),
+            idle=jnp.asarray(0, jnp.int32),
+            result=jnp.asarray(Result.BOUND, jnp.int32),
+            trace=jnp.full(MOST_ITERATIONS, jnp.nan, jnp.float32),
+        )
 
-    `evaluate`: cost and its quadratic model at a state; `move`: the state after a step (F, Q) of the frames' unknowns
-    and (K,) of the shared ones; `counts`: 0 for frames whose step does not count for convergence. `steps`: for many
-    problems side by side (`vmap`): so many passes, in which one that has ended stays as it is. A loop that ends for
-    each at another pass would copy all of `latest` once more in each.
-    Each pass of the loop evaluates one state: a second copy of that program, for the start or for the cost alone, would
-    double the time it takes to compile.
-    """
+    def step(self, p: Progress, limits: Limits) -> Progress:
+        """Evaluate the candidate, keep it if the cost has not grown, and choose the next; after the end nothing.
 
-    def step(p: Progress) -> Progress:
-        now, first, on = evaluate(p.candidate), p.iteration < 0, goes_on(p, limits)
+        Each evaluates one state: a second copy of that program, for the start or for the cost alone, would double the
+        time it takes to compile.
+        """
+        now, first, on = self.evaluate(p.candidate), p.iteration < 0, ~terminate(p, limits)
         # Single precision: a change below the rounding of the sum does not refuse a step.
         accepted = on & (now.cost <= p.cost * (1 + 1e-6))
         better = accepted & ~first
@@ -137,7 +133,7 @@ def minimise(
         result = jnp.where(better & (p.step < limits.step), Result.SMALL_STEP, result)
         dx, dy = solve(_damped(latest.system, damping), latest.g, latest.h)
         dx = jnp.clip(dx, -LONGEST_STEP, LONGEST_STEP)
-        longest = jnp.max(jnp.abs(dx) * counts[:, None])
+        longest = jnp.max(jnp.abs(dx) * self.counts[:, None])
         # The length at which the slope along the last direction would have been 0.
         secant = p.length / jnp.maximum(1 - _slope(latest, *p.direction) / p.slope, 1e-3)
         near = better & (jnp.maximum(p.step, longest) < NEAR)
@@ -146,7 +142,7 @@ def minimise(
             state=state,
             cost=cost,
             latest=None,
-            candidate=move(state, length * dx, length * dy),
+            candidate=self.move(state, length * dx, length * dy),
             direction=(dx, dy),
             length=length,
             slope=_slope(latest, dx, dy),
@@ -161,14 +157,21 @@ def minimise(
         after = jax.tree.map(lambda new, old: jnp.where(on, new, old), after, dataclasses.replace(p, latest=None))
         return dataclasses.replace(after, latest=latest)
 
-    if steps is not None:
-        return jax.lax.fori_loop(0, steps, lambda _, p: step(p), begin)
-    return jax.lax.while_loop(lambda p: goes_on(p, limits), step, begin)
+    def iterate(self, begin: Progress, limits: Limits, steps: Any = None) -> Progress:
+        """Minimise the cost, from `init` or from where a call with fewer iterations ended: both ways take the same
+        steps.
+
+        `steps`: for many problems side by side (`vmap`): so many steps, in which one that has ended stays as it is. A
+        loop that ends for each at another step would copy all of `latest` once more in each.
+        """
+        if steps is not None:
+            return jax.lax.fori_loop(0, steps, lambda _, p: self.step(p, limits), begin)
+        return jax.lax.while_loop(lambda p: ~terminate(p, limits), lambda p: self.step(p, limits), begin)
 
 
-def goes_on(p: Progress, limits: Limits) -> Array:
-    """False where the iteration has ended."""
-    return (p.result == Result.BOUND) & (p.iteration < jnp.minimum(limits.iterations, MOST_ITERATIONS))
+def terminate(p: Progress, limits: Limits) -> Array:
+    """True where the iteration has ended."""
+    return (p.result != Result.BOUND) | (p.iteration >= jnp.minimum(limits.iterations, MOST_ITERATIONS))
 
 
 def _slope(at: Quadratic, dx: Float[Array, "F Q"], dy: Float[Array, " K"]) -> Float[Array, ""]:

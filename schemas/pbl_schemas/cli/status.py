@@ -36,6 +36,7 @@ def status(exact: bool, as_json: bool) -> None:
 
 def lines(state: Status) -> list[str]:
     """The printed form."""
+    from pbl_schemas.operations.archive import UNFINISHED_DAYS
     from pbl_schemas.reading.status import span
 
     out = [f"{state.videos} videos", ""]
@@ -61,6 +62,12 @@ def lines(state: Status) -> list[str]:
         out.append(f"{state.workers_lost} workers lost in the last hour: their heartbeats ended, they did not")
     out += [f"cron {one.name}: {one.text()}" for one in state.cron]
     out += [f"disk {name}: {free:.1f} of {total:.1f} GB free" for name, free, total in state.disks]
+    if state.unfinished:
+        ages, sizes = zip(*state.unfinished, strict=True)
+        out.append(
+            f"{len(ages)} recordings begun and not registered: {sum(sizes) / 1e9:.1f} GB, the oldest without a part"
+            f" for {span(max(ages))} (`pbl cron release` removes them after {UNFINISHED_DAYS:g} days)"
+        )
     if state.errors:
         n = sum(t.error for t in state.tables)
         shown = "" if n == len(state.errors) else f", {len(state.errors)} of {n}"

@@ -3,6 +3,7 @@
     SUBJECT/SESSION/HASH-FILE    registered recordings, with their logs
     _refused/SUBJECT/HASH-FILE   refused uploads, with the reason in HASH-FILE.txt
     _phone/SUBJECT/NUMBER/       parts of a recording that a phone sends, until it is registered
+    _phone/SUBJECT/FILE.placed   note of a recording that lies in its place, SESSION/FILE, until it has a row
     .incoming/SUBJECT/           copies in progress; while no import runs, the remains of a killed one
     .incoming/seen.json          content of the drop folder when it was last listed
 
@@ -12,6 +13,7 @@ SUBJECT is `_` for uploads under a name that is not a code.
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import shutil
@@ -21,8 +23,9 @@ from typing import Any, NamedTuple
 
 from pbl_pipeline import settings
 
+from .. import video
 from ..subject_codes import SUBJECT_CODE
-from .folders import private_folder, remove_empty, write_json
+from .folders import private_folder, remove_empty, sync_folders, write_json, write_text
 
 #: Name of the installation-wide lock that every process holds while it changes the archive
 #: (`worker.installation_lock`).
@@ -30,7 +33,7 @@ LOCK = "incoming"
 REFUSED, COPIES, PHONE = "_refused", ".incoming", "_phone"
 #: Age at which the parts of a recording that did not go on are removed (days).
 UNFINISHED_DAYS = 7.0
-_SEEN = "seen.json"
+_SEEN, _PLACED = "seen.json", ".placed"
 
 
 def archive_dir() -> Path:
@@ -74,28 +77,63 @@ def files_of_person(archive: Path, subject: str, parts: tuple[str, ...] = ("", R
 
 
 class Unfinished(NamedTuple):
-    """Parts of a recording that is not whole: their folder or file, length (byte), and the time of the last part."""
+    """Parts of a recording that is not registered: their folder or file, length (byte), and the time of the last
+    one."""
 
     path: Path
     n_bytes: int
     last_s: float
 
 
+def note_placed(archive: Path, target: Path) -> Path:
+    """Write, before a recording is put into its place, where that is; return the note, to be removed once it has a row.
+    A killed process leaves it to `remove_unfinished`."""
+    subject = target.parent.parent.name
+    note = folder_of(archive, PHONE, subject) / f"{target.name}{_PLACED}"
+    write_text(note, os.fsencode(f"{target.parent.name}/{target.name}"))
+    sync_folders(note.parent, archive)
+    return note
+
+
+def has_row(target: Path) -> bool:
+    """Return whether a recording in its place of the archive is registered, under whatever name of the archive."""
+    rows = video.Video.connection.query(
+        f"SELECT video_path FROM {video.Video.full_table_name} WHERE SUBSTRING_INDEX(video_path, '/', -1) = %s",  # noqa: S608
+        args=(target.name,),
+    )
+    return any(Path(path).parts[-3:] == target.parts[-3:] for (path,) in rows.fetchall())
+
+
+def _placed(archive: Path, note: Path) -> tuple[Path, list[Path]]:
+    """Return the place of a note's recording; and it and its sensor log, as far as they are there."""
+    target = archive / note.parent.name / os.fsdecode(note.read_bytes())
+    return target, [path for path in target.parent.glob(f"{glob.escape(target.stem)}.*") if path.stem == target.stem]
+
+
 def unfinished(archive: Path) -> list[Unfinished]:
-    """Return what phones and browsers have begun to send, while other processes write and remove it."""
+    """Return what phones and browsers have begun to send, and recordings in their place of which a process was killed
+    before they had a row, while other processes write and remove it."""
     out = []
     for path in (archive / PHONE).glob("*/*"):
         with contextlib.suppress(FileNotFoundError):
-            own, files = path.stat(), [f.stat() for f in (path.iterdir() if path.is_dir() else (path,))]
-            last_s = max([own.st_mtime, *(f.st_mtime for f in files)])
+            own, placed = path.stat(), path.suffix == _PLACED
+            parts = _placed(archive, path)[1] if placed else path.iterdir() if path.is_dir() else (path,)
+            files = [f.stat() for f in parts]
+            last_s = max([own.st_mtime, *(f.st_mtime for f in files if not placed)])
             out.append(Unfinished(path, sum(f.st_size for f in files), last_s))
     return out
 
 
 def remove_unfinished(archive: Path, days: float = UNFINISHED_DAYS) -> list[Unfinished]:
-    """Remove and return what did not go on for so long; the phone keeps its recording, and sends it again."""
+    """Remove and return what did not go on for so long; the phone keeps its recording, and sends it again. For the
+    holder of the lock."""
     old = [one for one in unfinished(archive) if one.last_s < time.time() - 86_400 * days]
     for one in old:
+        if one.path.suffix == _PLACED:
+            target, files = _placed(archive, one.path)
+            for path in () if has_row(target) else files:
+                path.unlink(missing_ok=True)
+            remove_empty(target.parent, 2)
         shutil.rmtree(one.path, ignore_errors=True) if one.path.is_dir() else one.path.unlink(missing_ok=True)
         remove_empty(one.path.parent, 1)
     return old

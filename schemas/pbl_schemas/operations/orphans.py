@@ -54,12 +54,16 @@ def orphans(young_s: float = YOUNG_S) -> Report:
     return Report(len(files), sum(f.size for f in files.values()), old, lost)
 
 
-def remove(found: Report, older_than_s: float) -> int:
-    """Delete orphans of that age that are still without a row; return how many."""
+#: Ending of a file that DataJoint is writing; a killed process leaves it, and no row ever names it.
+WRITING = ".saving"
+
+
+def remove(found: Report, older_than_s: float, ending: str = "") -> int:
+    """Delete orphans of that age (with that ending) that are still without a row; return how many."""
     store, n = connection.store_backend(), 0
     named = set(_named())
     for file in found.orphans:
-        if file.age_s >= older_than_s and not _is_named(file.path, named):
+        if file.path.endswith(ending) and file.age_s >= older_than_s and not _is_named(file.path, named):
             store.remove(file.path)
             n += 1
     return n

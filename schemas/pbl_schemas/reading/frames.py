@@ -191,7 +191,7 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
             for r in (gdi.SessionGdi.Measure & key).to_dicts()
         }
         leg_m = lib.leg_length_m(row["fit_scale"])
-        bands = lib.normal_bands(lib.Spatiotemporal("PASS", "", measures, {}, 0, 0, 0), leg_m)
+        bands = lib.normal_bands(measures, leg_m)
         done, pace = video.conditions(fit.SessionFit.Trial & key), gdi.pace_of(key["gdi_method"])
         keys = (gait.GaitCycle & key).keys()
         cycles = [c for k in keys if done[k["video_id"]].pooled(pace) for c in gait.load_cycles(k)]

@@ -55,7 +55,7 @@ def _keys(key: Any) -> Any:
 
 def load_solution(key: Mapping[str, Any], rows: Rows = stored_rows) -> Solution:
     """The library's `Solution` of one row of SessionFit: how its body was fitted, without the fitted movements."""
-    row = row_of(fit.SessionFit, key, rows)
+    row = row_of(fit.SessionFit, _of(fit.SessionFit, key), rows)
     with stored_file(file_ref(row["session_file"])) as path, np.load(path, allow_pickle=False) as f:
         scale, trace = f["scale"], f["loss_trace"]
     found = from_row(
@@ -134,6 +134,17 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
         qc=tuple(checks),
         params_hash=row["session_params_hash"],
     )
+
+
+def pooled_cycles(key: Mapping[str, Any], rows: Rows) -> list[lib.GaitCycle]:
+    """The library's `GaitMetrics.cycles` of one row of SessionGdi, by its key."""
+    pace, out = gdi.pace_of(key["gdi_method"], rows), list[Any]()
+    for video_id in videos_of(key, rows):
+        of = {**key, "video_id": video_id}
+        if video.condition(video_id, rows).pooled(pace):
+            name = row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, of), rows)["trial_name"]
+            out += load_cycles(_of(gait.GaitEvents, of), name, rows)
+    return out
 
 
 def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:

@@ -14,7 +14,7 @@ from .. import fit, gait, gdi, keypoints, lab, review, session, video
 from ..datajoint_setup import dj
 from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES
-from ..rows import rows_inside
+from ..rows import PART, inside, rows_inside
 from .frames import frame_of, newest_sets
 from .visit_list import results_of
 
@@ -22,31 +22,54 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def subjects(restriction: Any = True) -> pd.DataFrame:
-    """One row per person: population, project, how many visits and videos, first and last day (null: no date)."""
-    rows = frame_of(lab.Subject.proj("population", "project") & restriction)
+#: People whose changes are computed at a time where not all are wanted.
+_PEOPLE = 10
+
+
+def total(name: str, restriction: Any = True) -> int | None:
+    """Return how many rows a list (a function of this module) has; None for one that is counted by making it."""
+    lists = {"subjects": _people, "visits": _visits, "videos": _videos}
+    return len(lists[name]() & restriction) if name in lists else None
+
+
+def subjects(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
+    """One row per person: population, project, how many visits and videos, first and last day (null: no date). `most`:
+    so many rows, the first ones; as of the other lists."""
+    rows = _first(_people() & restriction, most, "subject")
     visits = session.Session.proj("subject", "session_date")
-    counts = dj.U("subject").aggr(visits, visits="count(*)", first="min(session_date)", last="max(session_date)")
-    recorded = dj.U("subject").aggr(video.Video.proj("session_id") * visits, videos="count(*)")
-    return _counted(rows, "subject", counts, recorded)
+    counts = {"visits": "count(*)", "first": "min(session_date)", "last": "max(session_date)"}
+    recorded = video.Video.proj("session_id") * visits
+    return _counted(rows, "subject", (visits, counts), (recorded, {"videos": "count(*)"}))
 
 
-def visits(restriction: Any = True) -> pd.DataFrame:
+def visits(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
     """One row per visit: its label and day, how many videos (and marker recordings), and how many results (an index by
     one chain of methods) of its newest set."""
-    rows = frame_of(_visits() & restriction).sort_values(["subject", "session_label"], ignore_index=True)
-    recorded = dj.U("session_id").aggr(video.Video.proj("session_id"), videos="count(*)")
-    results = dj.U("session_id").aggr(gdi.SessionGdi.proj() * newest_sets(), results="count(*)")
-    return _counted(rows, "session_id", recorded, results)
+    rows = _first(_visits() & restriction, most, "subject", "session_label")
+    recorded = video.Video.proj("session_id"), {"videos": "count(*)"}
+    return _counted(rows, "session_id", recorded, (gdi.SessionGdi.proj() * newest_sets(), {"results": "count(*)"}))
 
 
-def changes(restriction: Any = True) -> pd.DataFrame:
+def changes(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
     """One row per visit with a result by the chain of methods of the visit before of the person, and measure ("gdi":
     the index): its change, the smallest that is more than chance, and the probabilities that it is real and important;
     or why the two cannot be compared (docs/measures.md)."""
     import pandas as pd
 
-    found = visits(restriction).sort_values(["subject", "session_date", "session_id"])
+    wanted = _visits() & restriction
+    people = sorted((dj.U("subject") & wanted).to_arrays("subject"))
+    each = len(people) if most is None else _PEOPLE
+    out: list[dict[str, Any]] = []
+    while people and (most is None or len(out) < most):
+        some = wanted if most is None else wanted & inside("subject", people[:each])
+        out += _changes(_first(some, None, "subject", "session_date", "session_id"))
+        del people[:each]
+    columns = ["subject", "visit", "before", *Change(0.0, None).row(""), "fit"]
+    return pd.DataFrame(out[:most], columns=columns)
+
+
+def _changes(found: Any) -> list[dict[str, Any]]:
+    """Rows of `changes`. `found`: visits in the order of their people and days."""
     results = results_of(found["session_id"])
     measures = _measures(found["session_id"])
     out: list[dict[str, Any]] = []
@@ -64,8 +87,7 @@ def changes(restriction: Any = True) -> pd.DataFrame:
                 out += [
                     {**about, **c.row(name), "fit": result.methods[0]} for name, c in changes.items() if c is not None
                 ]
-    columns = ["subject", "visit", "before", *Change(0.0, None).row(""), "fit"]
-    return pd.DataFrame(out, columns=columns)
+    return out
 
 
 def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
@@ -80,32 +102,30 @@ def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
     return out
 
 
-def videos(restriction: Any = True) -> pd.DataFrame:
+def videos(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
     """One row per video: whose, what is done at which pace, how many methods made keypoints and fits of it, and why it
     is not usable ("" for usable ones)."""
-    columns = ("session_id", "video_name", "activity", "camera_motion", "video_created")
-    query = video.Video.proj(*columns) * _visits() & restriction
-    rows = frame_of(query).sort_values("video_id", ignore_index=True)
-    found = video.conditions(query.proj())
+    query = _videos() & restriction
+    rows = _first(query, most, "video_id")
+    found = video.conditions(query.proj() if most is None else inside("video_id", rows["video_id"]))
     rows["pace"] = rows["video_id"].map({number: about.pace for number, about in found.items()})
-    points = dj.U("video_id").aggr(keypoints.Keypoints.proj(), keypoints="count(*)")
-    fits = dj.U("video_id").aggr(fit.SessionFit.Trial.proj() * newest_sets(), fits="count(*)")
-    rows = _counted(rows, "video_id", points, fits)
+    points = keypoints.Keypoints.proj(), {"keypoints": "count(*)"}
+    rows = _counted(rows, "video_id", points, (fit.SessionFit.Trial.proj() * newest_sets(), {"fits": "count(*)"}))
     marked = {number: mark.text for number, mark in unusable(rows["video_id"]).items()}
     rows["not_usable"] = [marked.get(int(number), "") for number in rows["video_id"]]
     first = ["video_id", "subject", "session_label", "video_name", "activity", "pace"]
     return rows[[*first, *(c for c in rows.columns if c not in first)]]
 
 
-def decisions(restriction: Any = True) -> pd.DataFrame:
+def decisions(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
     """One row per decision of a person about a visit or a video, the newest first; its subject, the state before and
     after as JSON."""
-    return _of_visits(review.Decision, "decision", restriction)
+    return _of_visits(review.Decision, "decision", restriction, most)
 
 
-def looks(restriction: Any = True) -> pd.DataFrame:
+def looks(restriction: Any = True, most: int | None = None) -> pd.DataFrame:
     """One row per look at a recording on the review page (written with PBL_AUDIT_LOOKS alone), the newest first."""
-    return _of_visits(review.Viewing, "viewing", restriction)
+    return _of_visits(review.Viewing, "viewing", restriction, most)
 
 
 def method_rows(stage: str | None = None) -> pd.DataFrame:
@@ -132,35 +152,49 @@ def method_rows(stage: str | None = None) -> pd.DataFrame:
     return pd.DataFrame(out, columns=["stage", "method", "name", "version", "default"])
 
 
-def _of_visits(table: Any, prefix: str, restriction: Any) -> pd.DataFrame:
+def _of_visits(table: Any, prefix: str, restriction: Any, most: int | None) -> pd.DataFrame:
     """Rows about a visit or one of its videos, with whose visit it is, and without a restriction those about none, such
     as an instrument; the columns without their prefix."""
     import pandas as pd
 
-    rows = frame_of(table.proj(..., of="session_id"))
+    everything = restriction is True or restriction == {}
+    rows = frame_of(table.proj(..., of="session_id") & dj.Top(most if everything else None, f"{prefix}_id DESC"))
     rows["video_id"] = rows["video_id"].astype("Int64")
     own = rows_inside(video.Video.proj("session_id"), "video_id", rows["video_id"].dropna())
     of_video = rows["video_id"].map({int(r["video_id"]): int(r["session_id"]) for r in own}).astype("Int64")
     rows["session_id"] = rows.pop("of").astype("Int64").fillna(of_video)
     found = rows_inside(_visits() & restriction, "session_id", rows["session_id"].dropna())
-    everything = restriction is True or restriction == {}
     named = pd.DataFrame(found, columns=["session_id", "subject", "session_label"]).astype({"session_id": "Int64"})
     rows = rows.merge(named, how="left" if everything else "inner", on="session_id")
-    rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True)
+    rows = rows.sort_values(f"{prefix}_id", ascending=False, ignore_index=True).head(most or len(rows))
     rows.columns = [name.removeprefix(f"{prefix}_") for name in rows.columns]
     first = ["id", "at", "by", "what", "subject", "session_label", "session_id", "video_id"]
     return rows[[*first, *(c for c in rows.columns if c not in first)]]
 
 
+def _people() -> Any:
+    return lab.Subject.proj("population", "project")
+
+
 def _visits() -> Any:
-    people = lab.Subject.proj("population", "project")
-    return session.Session.proj("subject", "session_label", "session_date") * people
+    return session.Session.proj("subject", "session_label", "session_date") * _people()
 
 
-def _counted(rows: Any, key: str, *counts: Any) -> Any:
-    """Rows with the columns of queries that count by `key`; 0 if a query has no row."""
-    for query in counts:
-        rows = rows.merge(frame_of(query), how="left", on=key)
-        for name in set(query.heading.names) - {key, "first", "last"}:
+def _videos() -> Any:
+    return video.Video.proj("session_id", "video_name", "activity", "camera_motion", "video_created") * _visits()
+
+
+def _first(query: Any, most: int | None, *order: str) -> Any:
+    """The first rows of a query by these columns, `most` of them (None: all)."""
+    return frame_of(query & dj.Top(most, order)).sort_values(list(order), ignore_index=True)
+
+
+def _counted(rows: Any, key: str, *counts: tuple[Any, dict[str, str]]) -> Any:
+    """Rows with columns that are calculated from all rows of another query with the same `key`; 0 where there is none.
+    Of few rows, the others are not read."""
+    for query, columns in counts:
+        own = query & inside(key, rows[key]) if len(rows) <= PART else query
+        rows = rows.merge(frame_of(dj.U(key).aggr(own, **columns)), how="left", on=key)
+        for name in columns.keys() - {"first", "last"}:
             rows[name] = rows[name].fillna(0).astype(int)
     return rows

@@ -15,13 +15,18 @@ from pbl_pipeline.words import NOT_COMPUTED
 from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from ..decisions.review_decisions import may_be_accepted
+from ..rows import ReadAhead, row_of
 from . import registered
+from .objects import load_kinetics, load_solution, pooled_cycles
 from .visit_list import VisitRow, earlier_result, results_of, visits_of
 from .visits import load_recording, load_visit
-from .why import whys
+from .why import Step, whys
 
 if TYPE_CHECKING:
-    from pbl_pipeline.gait import Measure
+    import numpy as np
+
+    from pbl_pipeline.gait import GaitCycle, Measure
+    from pbl_pipeline.kinetics import Kinetics
     from pbl_pipeline.qc import Check
     from pbl_pipeline.visit import Recording, Visit
 
@@ -41,12 +46,23 @@ class ShownCheck:
 
 
 @dataclasses.dataclass(frozen=True)
+class Pooled:
+    """What is drawn of a result: its cycles, the body's scale, forces, and the norm of its index."""
+
+    cycles: Sequence[GaitCycle]
+    scale: np.ndarray | None
+    kinetics: Kinetics | None
+    norm: str
+
+
+@dataclasses.dataclass(frozen=True)
 class ShownVisit:
     """A visit, the result that is shown of it and the others that there are."""
 
     row: VisitRow  # its line in the list of visits
     recordings: tuple[Recording, ...]  # all of the visit, without their arrays; of any kind and result
     load_visit: Callable[[], Visit] | None = None  # loads `visit`; None if nothing is computed yet
+    load_pooled: Callable[[], Pooled | None] = lambda: None  # what is drawn of it, in less time than `visit`
     results: tuple[Result, ...] = ()  # by every chain of methods
     shown: int | None = None  # number of the shown one among `results`
     key: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # in the tables that of the shown result
@@ -57,6 +73,7 @@ class ShownVisit:
     checks: tuple[ShownCheck, ...] = ()  # of the shown result, in the order of the chain
     lacks: tuple[str, ...] = ()  # what its files lack
     of_person: tuple[VisitRow, ...] = ()  # all visits of the person
+    stopped: Mapping[int, Step] = dataclasses.field(default_factory=dict)  # recordings that failed or wait for a choice
     marks: Mapping[int, Unusable] = dataclasses.field(default_factory=dict)  # recordings marked as not usable
     computed: str = ""  # when the checks were computed
     earlier: Result | None = None  # without a result: the last one of a part of the recordings
@@ -96,6 +113,7 @@ class ShownRecording:
     width_px: int | None = None
     height_px: int | None = None
     hidden_heads: str = ""  # how heads are hidden in what is shown; empty for the original
+    stopped: Step | None = None  # the step that failed or waits for a choice
     lead: int | None = None  # the recording with the fit, where several cameras filmed the trial and this is another
 
     def fitted(self) -> Recording:
@@ -120,9 +138,10 @@ def _mean_of(found: Sequence[tuple[Measure | None, str]]) -> tuple[Measure | Non
     return task_measure([m.mean for m, _ in known]), ""
 
 
-def _problems(videos: Iterable[int]) -> dict[int, str]:
-    """Return why recordings have no fit, without the state of the queues where one only waits to be computed."""
-    return {v: NOT_COMPUTED if found.waits else found.verdict for v, found in whys(videos).items()}
+def _problems(videos: Iterable[int]) -> dict[int, tuple[str, Step | None]]:
+    """Return why recordings have no fit, without the state of the queues where one only waits to be computed, and the
+    step that failed or waits for a choice."""
+    return {v: (NOT_COMPUTED if found.waits else found.verdict, found.stopped) for v, found in whys(videos).items()}
 
 
 def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
@@ -137,11 +156,12 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
             expected=f"one of its {len(results)} results",
             next_step="open the visit from the list",
         )
-    recordings = _recordings(session_id)
+    recordings, stopped = _recordings(session_id)
     about = ShownVisit(
         row=next(v for v in of_person if v.session_id == session_id),
         recordings=recordings,
         of_person=of_person,
+        stopped=stopped,
         marks=unusable([r.number for r in recordings if r.number is not None]),
     )
     if not results:
@@ -155,6 +175,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
     return dataclasses.replace(
         about,
         load_visit=functools.partial(load_visit, of_result),
+        load_pooled=functools.partial(_pooled, key, [int(r.number or 0) for r in recordings]),
         results=results,
         shown=shown,
         key=key,
@@ -163,6 +184,13 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
         checks=_checks_of(key),
         computed="".join(str(t) for t in (qc.SessionQc & key).to_arrays("qc_computed")),
     )
+
+
+def _pooled(key: Mapping[str, Any], videos: Sequence[int]) -> Pooled:
+    """What is drawn of a result of these recordings, by its key. Raises as `load_visit`."""
+    rows = ReadAhead([key], videos)
+    norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
+    return Pooled(pooled_cycles(key, rows), load_solution(key, rows).scale, load_kinetics(key, rows), norm)
 
 
 def computed_visit(session_id: int, shown: int) -> ShownVisit:
@@ -185,8 +213,10 @@ def shown_recording(video_id: int) -> ShownRecording:
     visits = video.Video.proj("session_id") * session.Session.proj("subject", "session_label")
     named = (visits & {"video_id": video_id}).fetch1()
     lead = fit.trial_of(video_id)
+    stopped = None
     if not recording.fitted:
-        recording = dataclasses.replace(recording, problem=_problems([video_id])[video_id])
+        problem, stopped = _problems([video_id])[video_id]
+        recording = dataclasses.replace(recording, problem=problem)
     return ShownRecording(
         recording=recording,
         number=video_id,
@@ -196,6 +226,7 @@ def shown_recording(video_id: int) -> ShownRecording:
         pictures=recording.path is not None,
         **video_facts(recording),
         hidden_heads=settings.deidentify_how() if recording.path is not None else "",
+        stopped=stopped,
         lead=lead if lead != video_id else None,
     )
 
@@ -261,8 +292,8 @@ def _checks_of(key: Mapping[str, Any]) -> tuple[ShownCheck, ...]:
     return tuple(out)
 
 
-def _recordings(session_id: int) -> tuple[Recording, ...]:
-    """Return the recordings of a visit, with why one has no fit."""
+def _recordings(session_id: int) -> tuple[tuple[Recording, ...], dict[int, Step]]:
+    """Return the recordings of a visit, with why one has no fit, and the step at which one stopped."""
     from pbl_pipeline.gait import Condition
     from pbl_pipeline.visit import Recording
 
@@ -273,6 +304,6 @@ def _recordings(session_id: int) -> tuple[Recording, ...]:
     for row in rows:
         number = int(row["video_id"])
         condition = Condition(row["activity"], row["pace"] or "")
-        problem = problems.get(number, "")
+        problem = problems.get(number, ("", None))[0]
         out.append(Recording(row["video_name"], condition=condition, problem=problem, number=number))
-    return tuple(out)
+    return tuple(out), {v: step for v, (_, step) in problems.items() if step is not None}

@@ -7,7 +7,8 @@ import dataclasses
 import datetime
 import functools
 import queue
-from collections.abc import Callable, Collection, Sequence
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,8 +16,9 @@ from .. import computed_tables, connection, keypoints, tracking, video, worker
 from ..decisions import not_usable
 from ..job_errors import error_code, stored_error
 from ..jobs import jobs_of
-from ..operations.archive import disks
+from ..operations.archive import archive_dir, disks, unfinished
 from ..operations.catalog import quote
+from ..rows import rows_inside
 
 #: With fewer videos than this, keys that are not queued yet are also counted.
 SMALL = 5000
@@ -148,6 +150,8 @@ class Status:
     cron: list[Cron] = dataclasses.field(default_factory=list)
     #: Name, free and total GB of each disk of this machine.
     disks: list[tuple[str, float, float]] = dataclasses.field(default_factory=list)
+    #: Ages (s) and lengths (byte) of what lies in the archive of this machine without being registered.
+    unfinished: list[tuple[float, int]] = dataclasses.field(default_factory=list)
 
 
 def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
@@ -170,9 +174,9 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
     errors = [e for t, s in zip(chain, tables, strict=True) if s.error for e in _errors(t, most)]
     empty = {t.table for t in tables if t.empty}
     waiting = _waiting(most) if any(t.waiting for t in tables) else []
-    marked = [
-        LeftOut(m.video_id, _file_of({"video_id": m.video_id}), m.text, m.by) for m in not_usable.all_unusable(most)
-    ]
+    marks = not_usable.all_unusable(most)
+    names = _names(m.video_id for m in marks)
+    marked = [LeftOut(m.video_id, names.get(m.video_id, ""), m.text, m.by) for m in marks]
     return Status(
         n_videos,
         tables,
@@ -186,6 +190,7 @@ def pipeline_status(exact: bool | None = None, most: int = 200) -> Status:
         worker_counts(server)[1],
         cron_passes(server),
         disks(),
+        [(time.time() - one.last_s, one.n_bytes) for one in unfinished(archive_dir())],
     )
 
 
@@ -324,10 +329,9 @@ def running(most: int = 200) -> list[Running]:
     for table, counts in zip(computed_tables(), queue_counts(video.Video.connection).values(), strict=True):
         if counts["reserved"]:
             jobs = jobs_of(table)
-            for row in jobs.reserved.to_dicts(order_by="reserved_time", limit=most):
-                key = {k: row[k] for k in jobs.primary_key}
+            for key, about, row in _keyed(jobs, jobs.reserved.to_dicts(order_by="reserved_time", limit=most)):
                 since = row["reserved_time"]
-                out.append(Running(table.__name__, key, _file_of(key), str(row["host"]), int(row["pid"]), since))
+                out.append(Running(table.__name__, key, about, str(row["host"]), int(row["pid"]), since))
     return sorted(out, key=lambda r: (r.since is None, r.since))
 
 
@@ -393,15 +397,14 @@ def _empty(names: Collection[str], most: int) -> list[EmptyRow]:
 
 
 def _errors(table: Any, most: int) -> list[ErrorRow]:
-    out = []
-    for row in jobs_of(table).errors.to_dicts(limit=most):
-        key = {k: row[k] for k in jobs_of(table).primary_key}
+    out, jobs = [], jobs_of(table)
+    for key, about, row in _keyed(jobs, jobs.errors.to_dicts(limit=most)):
         error = stored_error(row["error_message"])
         out.append(
             ErrorRow(
                 table=table.__name__,
                 key=key,
-                about=_file_of(key),
+                about=about,
                 code=error.code,
                 found=error.found,
                 next_step=error.next_step,
@@ -411,19 +414,28 @@ def _errors(table: Any, most: int) -> list[ErrorRow]:
     return out
 
 
-def _file_of(key: dict[str, Any]) -> str:
-    if "video_id" not in key:
-        return ""
-    names = (video.Video & {"video_id": key["video_id"]}).to_arrays("video_name")
-    return str(names[0]) if len(names) else ""
+def _keyed(jobs: Any, rows: Sequence[dict[str, Any]]) -> list[tuple[dict[str, Any], str, dict[str, Any]]]:
+    """Rows of a queue, each behind its key and the name of its video ("": a key without one)."""
+    names = _names(row["video_id"] for row in rows if "video_id" in jobs.primary_key)
+    return [({k: row[k] for k in jobs.primary_key}, names.get(row.get("video_id"), ""), row) for row in rows]
+
+
+def _names(videos: Iterable[int]) -> dict[Any, str]:
+    """Names of videos by their numbers."""
+    rows = rows_inside(video.Video.proj("video_name"), "video_id", map(int, videos))
+    return {int(row["video_id"]): str(row["video_name"]) for row in rows}
 
 
 def _waiting(most: int) -> list[Waiting]:
+    found = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
+    rows = (found - video.NotUsable).to_dicts(order_by="video_id", limit=most)
+    seen: dict[tuple[int, str], list[int]] = {}
+    for one in rows_inside(tracking.Tracking.Person.proj(), "video_id", (int(row["video_id"]) for row in rows)):
+        seen.setdefault((int(one["video_id"]), one["tracking_method"]), []).append(int(one["person_id"]))
     out = []
-    rows = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
-    for row in (rows - video.NotUsable).to_dicts(order_by="video_id", limit=most):
+    for row in rows:
         key = {k: row[k] for k in ("video_id", "tracking_method")}
-        persons = sorted(int(p) for p in (tracking.Tracking.Person & key).to_arrays("person_id"))
+        persons = sorted(seen.get((int(row["video_id"]), row["tracking_method"]), []))
         out.append(
             Waiting(
                 video_id=int(row["video_id"]),

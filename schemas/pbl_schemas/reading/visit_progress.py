@@ -39,12 +39,13 @@ def of_visit(session_id: int) -> Scope:
 
 @dataclasses.dataclass(frozen=True)
 class Failed:
-    """A failed computation: its table, the code of the error, what was found, and the remedy."""
+    """A failed computation: its table, the code of the error, what was found, the remedy, and its recording if any."""
 
     table: str
     code: str
     found: str
     next_step: str
+    recording: int | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,14 +74,15 @@ def visit_progress(session_id: int) -> Progress:
         where = scope.where(table)
         if where is None:
             continue
+        of = "video_id" if "video_id" in table.heading.primary_key else "NULL"
         rows = server.query(
-            f"SELECT status, host, error_message FROM {quote(*queue_name(table))} WHERE {where}"  # noqa: S608
+            f"SELECT status, host, error_message, {of} FROM {quote(*queue_name(table))} WHERE {where}"  # noqa: S608
         ).fetchall()
-        for status, host, message in rows:
+        for status, host, message, recording in rows:
             queued += status == "pending"
             if status == "reserved":
                 running.append((table.__name__, str(host)))
             elif status == "error":
                 error = stored_error(str(message))
-                failed.append(Failed(table.__name__, error.code, error.found, error.next_step))
+                failed.append(Failed(table.__name__, error.code, error.found, error.next_step, recording))
     return Progress(int(session_id), queued, tuple(running), tuple(failed))

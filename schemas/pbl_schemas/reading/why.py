@@ -23,7 +23,8 @@ DONE, EMPTY, PENDING, RUNNING, ERROR, NOT_YET = "done", "empty", "pending", "bei
 @dataclasses.dataclass(frozen=True)
 class Step:
     """One stage of one video. what: one of the words above. method: that names the row. note: origin, error or reason;
-    next_step: of an error. camera: the video it is about, where several cameras filmed the trial."""
+    next_step and code: of an error, or of a choice that is waited for. camera: the video it is about, where several
+    cameras filmed the trial."""
 
     table: str
     what: str
@@ -31,6 +32,7 @@ class Step:
     note: str = ""
     next_step: str = ""
     camera: int | None = None
+    code: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +54,12 @@ class Why:
         left = [s for s in self.steps if s.what != DONE]
         empty = any(s.what == EMPTY and s.table in ends for s in left)
         return self.marked or empty or any(s.next_step or s.what == ERROR for s in left)
+
+    @property
+    def stopped(self) -> Step | None:
+        """The step that failed or waits for a choice, if none before it still goes on."""
+        step = next((s for s in self.steps if s.code or s.what in (RUNNING, PENDING)), None)
+        return step if step and step.code and not self.marked else None
 
     @property
     def waits(self) -> bool:
@@ -132,9 +140,9 @@ def _steps(table: Any, where: Any) -> tuple[_Steps, _Steps]:
     waiting = [int(row["video_id"]) for row in stored if row.get("choice_status") == "NEEDS_CHOICE"]
     several = tracking.with_several_methods(waiting)
 
-    def add(to: _Steps, row: Mapping[str, Any], what: str, note: str, next_step: str = "") -> None:
+    def add(to: _Steps, row: Mapping[str, Any], what: str, note: str, next_step: str = "", code: str = "") -> None:
         about = row.get("fit_set"), int(row["video_id"]) if "video_id" in key else None
-        to.setdefault(about, []).append(Step(name, what, _method(row, table), note, next_step))
+        to.setdefault(about, []).append(Step(name, what, _method(row, table), note, next_step, code=code))
 
     for row in stored:
         empty = bool(status) and row[status] in values
@@ -143,12 +151,13 @@ def _steps(table: Any, where: Any) -> tuple[_Steps, _Steps]:
         if (empty or waits) and (text := row.get(reason or "")):
             note = str(text)
         what = EMPTY if empty else "waits for a choice" if waits else DONE
-        add(rows, row, what, note, tracking.choose_command(row, "PERSON", several) if waits else "")
+        asked = (tracking.choose_command(row, "PERSON", several), "SUBJECT_NEEDS_CHOICE") if waits else ()
+        add(rows, row, what, note, *asked)
     columns = ["status", "error_message", "host", "pid", "reserved_time", "priority", "scheduled_time"]
     for row in (jobs_of(table).proj(*columns) & where).to_dicts(order_by="KEY"):
         if row["status"] == "error":
             error = stored_error(row["error_message"])
-            add(jobs, row, ERROR, error.short(), error.next_step)
+            add(jobs, row, ERROR, error.short(), error.next_step, error.code)
         elif row["status"] == "reserved":
             add(jobs, row, RUNNING, f"by {row['host']}:{row['pid']} since {row['reserved_time']}")
         elif row["status"] == "pending":

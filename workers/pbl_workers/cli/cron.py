@@ -101,18 +101,24 @@ def refresh(everything: bool) -> None:
 
 @cron.command()
 def release() -> None:
-    """Put the jobs of dead workers back into the queue, and remove parts of recordings that did not go on for a week.
+    """Put the jobs of dead workers back into the queue, and remove recordings that were begun and never registered.
+
+    That is: parts that did not go on for a week, and recordings of the archive of which a process was killed before
+    they had a row. `pbl status` shows how many wait for it.
 
     Example: pbl cron release
     """
     import pbl_schemas
-    from pbl_schemas.operations.archive import archive_dir, remove_unfinished
+    from pbl_schemas import video, worker
+    from pbl_schemas.operations.archive import LOCK, archive_dir, remove_unfinished
     from pbl_workers.recover import free_dead
 
     pbl_schemas.activate(methods=False)
     freed = {t.__name__: n for t in pbl_schemas.computed_tables() if (n := free_dead(t))}
     click.echo(", ".join(f"{n} of {name}" for name, n in freed.items()) or "no dead reservations")
-    if removed := remove_unfinished(archive_dir()):
+    with worker.installation_lock(LOCK, video.Video.connection) as obtained:
+        removed = remove_unfinished(archive_dir()) if obtained else []  # else the next run
+    if removed:
         n_bytes = sum(one.n_bytes for one in removed)
         click.echo(f"removed {len(removed)} recordings that were begun and did not go on ({n_bytes / 1e6:.0f} MB)")
 
@@ -183,13 +189,14 @@ def summary(hours: float, out: Path | None) -> None:
 @click.option("--least-free", "least_gb", type=click.FloatRange(min=0), default=10.0, show_default=True,
               metavar="GB", help="Less free space is an error.")  # fmt: skip
 def disk(days: float | None, least_gb: float) -> None:
-    """Report free space, the store's size, files without a row and rows without their file.
+    """Report free space, the store's size, files without a row and rows without their file; remove files of the store
+    that a killed process was writing a week ago.
 
     Example: pbl cron disk --remove-older-than 30
     """
     import pbl_schemas
-    from pbl_schemas.operations.archive import disks
-    from pbl_schemas.operations.orphans import orphans, remove
+    from pbl_schemas.operations.archive import UNFINISHED_DAYS, disks
+    from pbl_schemas.operations.orphans import WRITING, orphans, remove
 
     pbl_schemas.activate(methods=False)
     found = orphans()
@@ -197,6 +204,8 @@ def disk(days: float | None, least_gb: float) -> None:
     click.echo(f"files without a row: {len(found.orphans)}, {sum(f.size for f in found.orphans) / 1e9:.2f} GB")
     for file in found.orphans[:20]:
         click.echo(f"  {file.path}  {file.age_s / 86400:.1f} days")
+    if n := remove(found, UNFINISHED_DAYS * 86400, WRITING):
+        click.echo(f"removed {n} that a killed process was writing")
     if days is not None:
         click.echo(f"removed: {remove(found, days * 86400)}")
     for name, free, total in disks():

@@ -16,7 +16,7 @@ from pbl_pipeline.change import result_of
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.visit import FIT, OVERLAY, REPORT, SESSION, Held, Recording, Visit, load_visit, name_of_fit
 from pbl_pipeline.words import MEASURES
-from pbl_schemas.reading.shown import ShownCheck, ShownRecording, ShownVisit, video_facts
+from pbl_schemas.reading.shown import Pooled, ShownCheck, ShownRecording, ShownVisit, video_facts
 from pbl_schemas.reading.visit_list import INCOMPLETE, Page, VisitRow
 from pbl_schemas.subject_codes import day_of
 
@@ -85,6 +85,7 @@ class ResultsFolder(Source):
             row=row,
             recordings=visit.recordings,
             load_visit=Held(visit),
+            load_pooled=functools.partial(_pooled, visit),
             measures=_measures(visit),
             tasks=_tasks(visit),
             lacks=visit.lacks,
@@ -233,6 +234,12 @@ ROUTES = [
     Address("/visits/{session_id:int}/report", report, "look", look="report"),
     Address("/recordings/{video_id:int}/overlay", overlay, "look", look="overlay"),
 ]
+
+
+def _pooled(visit: Visit) -> Pooled | None:
+    scale = None if visit.solution is None else visit.solution.scale
+    found = visit.measures
+    return None if found is None else Pooled(found.cycles, scale, visit.kinetics, found.gdi.norm)
 
 
 def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:

@@ -20,6 +20,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.gait import load_norm, norm_names
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
 from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
 from pbl_schemas.intake.sheets import with_point
@@ -29,6 +30,7 @@ from pbl_schemas.session import UNLABELLED
 from . import site
 from .access import HEADERS, HOURS, Session
 from .address import JSON
+from .remedies import remedies, remedies_of_path
 
 #: Fields of a form that no one has filled in, and their errors.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -71,7 +73,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, pd.DataFrame):
         return plain(value.to_dict("records"))
     if isinstance(value, ShownVisit):
-        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.name != "load_visit"}
+        own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if not f.name.startswith("load_")}
         return plain({**own, "visit": value.visit})
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -118,6 +120,8 @@ def _environment() -> jinja2.Environment:
     )
     found.globals.update(
         number=number,
+        remedies=remedies,
+        remedies_of_path=remedies_of_path,
         has_text=lambda name: name in texts.catalogue(),
         significant=significant,
         check_words=check_words,
@@ -127,7 +131,7 @@ def _environment() -> jinja2.Environment:
         moment=moment,
         angle_words=[title for title, _ in ANGLES.values()],
     )
-    found.filters["capital"] = capital
+    found.filters |= {"capital": capital, "norm_people": norm_people}
     return found
 
 
@@ -187,6 +191,13 @@ async def unforeseen(request: Request, error: Exception) -> Response:
     if as_json(request):
         return JSONResponse({"error": plain(_unforeseen())}, 500, HEADERS)
     return show(request, "unforeseen.html", 500, HEADERS)
+
+
+def norm_people(norm: str) -> int | None:
+    """Return how many typically developing children a set of the index that ships is of, by its name in tables or
+    files; None for other sets."""
+    name = re.sub(r"-v\d+$", "", norm)
+    return load_norm(name).n if name in norm_names() else None
 
 
 def visit_name(language: str, label: str) -> str:

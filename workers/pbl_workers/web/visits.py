@@ -22,11 +22,9 @@ from pbl_pipeline.gait import (
     adult_ranges,
     far_leg_of,
     leg_length_m,
-    load_norm,
-    norm_names,
     normal_bands,
 )
-from pbl_pipeline.kinetics import GRAVITY
+from pbl_pipeline.kinetics import GRAVITY, Kinetics
 from pbl_pipeline.names import normalised_label, whole_number
 from pbl_pipeline.render import overlay_frames, report_indices
 from pbl_pipeline.report import Picture, picture
@@ -35,7 +33,7 @@ from pbl_pipeline.report.forces import force_charts
 from pbl_pipeline.visit import Visit
 from pbl_pipeline.words import ANGLES, KINETICS
 from pbl_schemas.reading import visit_list
-from pbl_schemas.reading.shown import ShownVisit
+from pbl_schemas.reading.shown import Pooled, ShownVisit
 from pbl_schemas.subject_codes import day_of
 
 from . import pages, site
@@ -62,34 +60,30 @@ class Curves:
     adults: AdultRanges
 
 
-def curves_of(visit: Visit, language: str) -> Curves | None:
+def curves_of(about: ShownVisit, found: Pooled, language: str) -> Curves | None:
     """Return the curves of the cycles that count, None without any."""
-    if visit.measures is None:
-        return None
-    cycles = [c for c in visit.measures.cycles if c.used and c.curves]
+    cycles = [c for c in found.cycles if c.used and c.curves]
     if not cycles:
         return None
 
     def label(title: str, _: Ranges) -> str:
         return texts.text(language, "curves.chart", name=texts.library_words(language, title))
 
-    leg_m = None if visit.solution is None else leg_length_m(visit.solution.scale)
-    bands = normal_bands(visit.measures.spatiotemporal, leg_m)
+    leg_m = None if found.scale is None else leg_length_m(found.scale)
+    bands = normal_bands({name: measure for name, (measure, _) in about.measures.items()}, leg_m)
     drawn = cycle_curves(cycles, bands, {name: ANGLES[name] for name in SHOWN}, label)
     return Curves(tuple(drawn), bands, far_leg_of(cycles), adult_ranges())
 
 
-def forces_of(visit: Visit, language: str) -> dict[str, Any] | None:
-    """Return the forces of a visit (without its trials) with their charts and the body weight (N); None without any."""
-    if visit.kinetics is None:
-        return None
+def forces_of(kinetics: Kinetics, language: str) -> dict[str, Any]:
+    """Return forces (without their trials) with their charts and the body weight (N)."""
 
     def label(title: str, unit: str, n: int) -> str:
         return texts.text(language, "forces.chart", name=texts.library_words(language, title), unit=unit, n=n)
 
-    found = dataclasses.replace(visit.kinetics, trials=())
+    found = dataclasses.replace(kinetics, trials=())
     weight_n = None if found.mass_kg is None else GRAVITY * found.mass_kg
-    drawn = [{**c, "svg": texts.in_chart(language, c["svg"])} for c in force_charts(visit.kinetics, label)]
+    drawn = [{**c, "svg": texts.in_chart(language, c["svg"])} for c in force_charts(kinetics, label)]
     return {"found": found, "words": KINETICS, "weight_n": weight_n, "charts": drawn}
 
 
@@ -104,11 +98,6 @@ def overview(visit: Visit) -> list[dict[str, Any]]:
         frames = [Picture(i, float(fit.time_s[i]), image) for i, image in zip(indices, drawn, strict=True)]
         found.append({"name": r.name, "pictures": [picture(r.name, p) | {"time_s": p.time_s} for p in frames]})
     return found
-
-
-def norm_people(norm: str) -> int | None:
-    """Return how many typically developing children a set of the index that ships is of; None for other sets."""
-    return load_norm(norm).n if norm in norm_names() else None
 
 
 _FIELDS = ("cohort", "role", "quality", "state", "first_day", "last_day")
@@ -143,16 +132,14 @@ ROUTES = [
 
 
 def _drawn(about: ShownVisit, language: str) -> dict[str, Any]:
-    """Return the curves and forces of a visit, or why they cannot be shown, and of how many children the norm of its
-    index is."""
+    """Return the curves and forces of a visit, or why they cannot be shown."""
     try:
-        visit = about.visit
-        found = None if visit is None else curves_of(visit, language)
+        found = about.load_pooled()
+        curves = None if found is None else curves_of(about, found, language)
     except PblError as error:  # such as a file of the store that is gone: the rest of the page is in rows
-        return {"curves": None, "no_curves": error, "norm_people": None, "forces": None}
-    norm = "" if visit is None or visit.measures is None else visit.measures.gdi.norm
-    forces = None if visit is None else forces_of(visit, language)
-    return {"curves": found, "no_curves": None, "norm_people": norm_people(norm), "forces": forces}
+        return {"curves": None, "no_curves": error, "forces": None}
+    forces = None if found is None or found.kinetics is None else forces_of(found.kinetics, language)
+    return {"curves": curves, "no_curves": None, "forces": forces}
 
 
 async def visits(request: Request) -> Response:

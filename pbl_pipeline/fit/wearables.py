@@ -1,0 +1,205 @@
+"""Logs of wearable sensors on their way into a fit, and what it found of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+from scipy.spatial.transform import Rotation
+
+from pbl_pipeline.body import Body, body_frames, scale_multipliers
+from pbl_pipeline.errors import said
+from pbl_pipeline.sensors.orientation import Orientation
+from pbl_pipeline.sensors.pairing import better_pairing
+from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
+from pbl_pipeline.sensors.worn import SensorFit, input_error
+
+from .imu_term import MINUTE_S, segments_at, whitened
+from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
+from .session import LEVEL, Session
+from .term import At
+
+#: Standard deviation (deg, each axis) of a sensor's orientation on its segment: soft tissue, measured on recorded walks
+#: with markers and sensors; and its correlation over 1/30 s.
+WOBBLE_DEG = {"pelvis": 2.0, "thigh": 2.7, "shank": 2.0, "foot": 2.5}
+MEMORY = 0.8
+#: Standard deviations (deg) of the vertical of a sensor's world, and of a camera's that was taken as level.
+LEVEL_SD_DEG, TILT_SD_DEG = 1.5, 5.0
+#: Standard deviation (deg/s) of a gyroscope's bias, before and after a filter found it.
+BIAS_SD_DEG_S = 1.0, 0.4
+#: Change of velocity (m/s) by which the mean acceleration of a short log tilts the vertical.
+SPEED_M_PER_S = {"pelvis": 0.3, "thigh": 0.7, "shank": 1.5, "foot": 2.5}
+#: Time (s) around a frame in which a sensor must have been measured: the clock's start may be off by so much.
+AROUND_S = 0.05
+
+
+def with_wearables(
+    session: Session, p: Problem, start: State, dispersion: float
+) -> tuple[Problem, State, tuple[str, ...]]:
+    """Add sensors to a problem, with their start by a solution without them; and the segments they move with.
+
+    Raises `PblError` FIT_INPUT: a log does not reach a trial.
+    """
+    assert session.worn is not None
+    sensors, body = session.worn.sensors, session.body
+    seen = [_moved(body, session, i, start) for i in range(len(session.arrays))]
+    clocks = [_clock(session, i, s) for i, s in enumerate(seen)]
+    mounts = [wahba(_all_vectors(seen, clocks, sensor)) for sensor in sensors]
+    m, frames, n = len(sensors), len(p.weight), len(p.has_phone)
+    longest = max(a.time_s[-1] - a.time_s[0] for a in session.arrays)
+    needed = int(np.ceil((longest + 2 * CLOCK_RANGE_S) / SAMPLE_S)) + 2
+    quats = np.tile([1.0, 0, 0, 0], (n, m, pad_samples(needed), 1))
+    world = np.tile([1.0, 0, 0, 0], (n, m, 1))
+    turned, count = np.zeros((frames, m, 3, 3)), np.zeros((frames, m))
+    follows, level, middle = np.zeros((frames, m)), np.full((n, m), np.deg2rad(LEVEL_SD_DEG)), np.zeros(n)
+    for i, (arrays, clock) in enumerate(zip(session.arrays, clocks, strict=True)):
+        at, time = session.frames(i), arrays.time_s - arrays.time_s[0]
+        middle[i] = time[-1] / 2
+        grid = np.arange(needed) * SAMPLE_S - CLOCK_RANGE_S
+        for j, sensor in enumerate(sensors):
+            quat, known = sensor.at(grid + arrays.time_s[0] + clock)
+            quats[i, j, :needed], quats[i, j, needed:] = quat, quat[-1]
+            measured = all_around(grid, known, time)
+            count[at, j] = measured & arrays.used
+            R = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+            total = np.cumsum(R, axis=0) * SAMPLE_S
+            row = np.clip(((time + CLOCK_RANGE_S) / SAMPLE_S).round().astype(int), 0, needed - 1)
+            turned[at, j] = total[row] - total[int((middle[i] + CLOCK_RANGE_S) / SAMPLE_S)]
+            world[i, j] = _heading(seen[i], clock, sensor, mounts[j])
+            level[i, j] = np.hypot(level[i, j], _speed_error(sensor))
+        pair = np.append(np.diff(time), 1.0)[:, None]
+        both = count[at] * np.append(count[at][1:], np.zeros((1, m)), axis=0)
+        follows[at] = both * MEMORY ** (pair / FRAME_S)
+    kinds = [s.log.segment.split("_")[0] for s in sensors]
+    values: dict[str, Any] = {
+        "quat_wxyz": quats,
+        "turned": turned,
+        "count": count,
+        "follows": follows,
+        "mount": Rotation.from_matrix(mounts).as_quat(scalar_first=True),
+        "world": world,
+        "sd_rad": np.deg2rad([WOBBLE_DEG[k] for k in kinds]),
+        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[s.settled] for s in sensors]),
+        "level_sd_rad": level,
+        "tilt_sd_rad": np.pad(
+            [np.deg2rad(TILT_SD_DEG) * (o == LEVEL) for o in session.orientation], (0, n - len(clocks))
+        ),
+        "middle_s": middle,
+        "clock_s": np.pad(clocks, (0, n - len(clocks))),
+        "dispersion": dispersion,
+    }
+    index: Any = np.asarray([body.body_names.index(BODY_OF[s.log.segment]) for s in sensors], np.int32)
+    zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
+    wearables = Wearables(index, **{k: np.asarray(v, np.float32) for k, v in values.items()})
+    longest = max(range(len(seen)), key=lambda i: len(seen[i].time))
+    moves_with = better_pairing(seen[longest], clocks[longest], sensors)
+    return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
+
+
+def all_around(grid: np.ndarray, known: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Times at whose sides, `AROUND_S` away, a sensor is known."""
+    at = lambda t: known[np.clip(((t - grid[0]) / SAMPLE_S).round().astype(int), 0, len(grid) - 1)]  # noqa: E731
+    return at(time - AROUND_S) & at(time + AROUND_S)
+
+
+def _moved(body: Body, session: Session, i: int, state: State) -> Moved:
+    """The segments of a trial, from its first to its last frame that counts."""
+    arrays, at = session.arrays[i], session.frames(i)
+    first, last = np.flatnonzero(arrays.used)[[0, -1]]
+    qpos = np.asarray(state.qpos, float)[at][first : last + 1]
+    frames = body_frames(body, qpos, np.asarray(scale_multipliers(np.asarray(state.s, float))))
+    index = {k: body.body_names.index(name) for k, name in BODY_OF.items()}
+    return moved(
+        arrays.time_s[first : last + 1],
+        {k: frames.rotation[:, b] for k, b in index.items()},
+        {k: frames.position_m[:, b] for k, b in index.items()},
+    )
+
+
+def _clock(session: Session, i: int, seen: Moved) -> float:
+    assert session.worn is not None
+    try:
+        return clock_of(seen, session.worn.sensors, session.worn.clock_s[i])[0]
+    except ValueError as error:
+        spans = [s.span for s in session.worn.sensors]
+        raise input_error(
+            said(
+                "sensors measured together from {a:.1f} to {b:.1f} s",
+                a=max(s[0] for s in spans),
+                b=min(s[1] for s in spans),
+            ),
+            said("the time of trial {name}", name=session.names[i]),
+            "pass the log of this recording, or state when it started in the log's time",
+        ) from error
+
+
+def _all_vectors(
+    seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [pair for s, c in zip(seen, clocks, strict=True) for pair in vectors(s, c, sensor, sensor.log.segment)]
+
+
+def _heading(seen: Moved, clock: float, sensor: Orientation, mount: np.ndarray) -> np.ndarray:
+    """The rotation about the vertical (quaternion) from a sensor's world to the trial's."""
+    quat, known = sensor.at(seen.time + clock)
+    ours = Rotation.from_matrix(seen.rotation[sensor.log.segment]) * Rotation.from_matrix(mount)
+    mean = (ours * Rotation.from_quat(quat, scalar_first=True).inv()).as_matrix()[known].sum(axis=0)
+    yaw = np.arctan2(mean[1, 0] - mean[0, 1], mean[0, 0] + mean[1, 1])
+    return Rotation.from_rotvec([0.0, 0.0, yaw]).as_quat(scalar_first=True)
+
+
+def _speed_error(sensor: Orientation) -> float:
+    """Error (rad) of a sensor's vertical because its speed changes over the log."""
+    return SPEED_M_PER_S[sensor.log.segment.split("_")[0]] / (9.81 * (sensor.span[1] - sensor.span[0]))
+
+
+@functools.partial(jax.jit, static_argnames="body")
+def _whitened(body: Body, p: Problem, end: State) -> Array:
+    none: Any = None
+    return whitened(At(p, none, end, none, none, None, segments_at(body, p, end)))[0]
+
+
+def sensor_fits(
+    session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
+) -> tuple[SensorFit, ...]:
+    """What a solution says of its sensors."""
+    assert session.worn is not None
+    worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
+    assert worn is not None
+    z = np.linalg.norm(np.asarray(_whitened(session.body, p, end)), axis=-1)
+    turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
+    out = []
+    for j, sensor in enumerate(session.worn.sensors):
+        trials = range(len(session.arrays))
+        worlds = [turn(state.world[i, j], worn.world[i, j]) for i in trials]
+        R = np.stack([w.as_matrix() for w in worlds])
+        frames = [session.frames(i) for i in trials]
+        measured = [np.asarray(worn.count)[f, j] > 0 for f in frames]
+        used = [session.arrays[i].used for i in trials]
+        good = [m & (z[f, j] < width) for f, m in zip(frames, measured, strict=True)]
+        out.append(
+            SensorFit(
+                name=sensor.log.name,
+                segment=sensor.log.segment,
+                moves_with=moves_with[j],
+                mounting=turn(state.mount[j], worn.mount[j]).as_quat(scalar_first=True),
+                bias_rad_s=state.bias[j],
+                heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),
+                tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1, 1)),
+                clock_s=np.asarray([worn.clock_s[i] + state.clock[i, 0] for i in trials]),
+                gain=np.asarray([state.clock[i, 1] / MINUTE_S for i in trials]),
+                z=np.asarray(
+                    [
+                        np.sqrt(np.mean(z[f, j][k] ** 2) / 3) if k.any() else np.nan
+                        for f, k in zip(frames, measured, strict=True)
+                    ]
+                ),
+                dropped=np.asarray([1 - np.sum(g & u) / np.sum(u) for g, u in zip(good, used, strict=True)]),
+            )
+        )
+    return tuple(out)

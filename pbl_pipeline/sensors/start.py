@@ -1,0 +1,156 @@
+"""Where a fit with sensors starts: their clock and how they sit on the body, from a fit of the video alone.
+
+The clock is where the angular speeds of all sensors agree best with those of their segments. The rotation of a sensor
+on its segment takes angular velocity and the vertical from the sensor's axes to the segment's (Wahba, SIAM Review 7,
+1965). The pelvis hardly turns about a level axis; there the accelerations of walking tell how the sensor faces.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation, Slerp
+
+from .orientation import SAMPLE_S, Orientation, rate_of
+
+#: Segment -> body of the model. A foot's sensor sits on the shoe, over the midfoot.
+BODY_OF = {
+    "pelvis": "pelvis",
+    **{
+        f"{ours}_{side}": f"{body}_{side}"
+        for ours, body in (("thigh", "femur"), ("shank", "tibia"), ("foot", "calcn"))
+        for side in "rl"
+    },
+}
+#: Low pass of rates and accelerations (s, standard deviation of a Gaussian): a video's are noise above 5 Hz.
+SMOOTH_S, SMOOTH_SLOW_S = 0.03, 0.06
+#: Beside the ends of a recording, second differences of smoothed places are wrong (s).
+EDGE_S = 0.2
+#: Search around a stated clock (s), and finer steps around the best.
+RANGE_S, FINE_S = 0.5, 0.15
+#: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
+RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """A recording as its video shows it, at even times (s of the video, every `SAMPLE_S`): rotations of segments, to
+    the world, and of each the position of its origin (m)."""
+
+    time: Float[np.ndarray, " T"]
+    rotation: dict[str, Float[np.ndarray, "T 3 3"]]
+    rate: dict[str, Float[np.ndarray, "T 3"]]  # rad/s, in the segment's axes, smoothed
+    acceleration: dict[str, Float[np.ndarray, "T 3"]]  # m/s2, of the origin, in the world, smoothed
+
+
+def moved(
+    time: Float[np.ndarray, " F"],
+    rotation: dict[str, Float[np.ndarray, "F 3 3"]],
+    position: dict[str, Float[np.ndarray, "F 3"]],
+) -> Moved:
+    """Resample the segments of a recording to even times."""
+    even = np.arange(time[0], time[-1], SAMPLE_S)
+    turned = {k: Slerp(time, Rotation.from_matrix(R))(even) for k, R in rotation.items()}
+    rates = {k: smooth(rate_of(r.as_quat(scalar_first=True))) for k, r in turned.items()}
+    places = {k: np.stack([np.interp(even, time, v) for v in x.T], axis=1) for k, x in position.items()}
+    second = {
+        k: np.gradient(np.gradient(smooth(x, SMOOTH_SLOW_S), SAMPLE_S, axis=0), SAMPLE_S, axis=0)
+        for k, x in places.items()
+    }
+    return Moved(even, {k: r.as_matrix() for k, r in turned.items()}, rates, second)
+
+
+def smooth(x: np.ndarray, sd_s: float = SMOOTH_S) -> np.ndarray:
+    """Low pass of values at every `SAMPLE_S`."""
+    return gaussian_filter1d(x, sd_s / SAMPLE_S, axis=0, mode="nearest")
+
+
+def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) -> tuple[float, float]:
+    """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
+    there (their weighted correlation, -1 to 1).
+
+    Raises `ValueError` if the log does not reach the recording.
+    """
+    first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
+    low, high = first - seen.time[0] - 0.5, last - seen.time[-1] + 0.5
+    if stated is not None:
+        low, high = max(low, stated - RANGE_S), min(high, stated + RANGE_S)
+    if not low < high:
+        raise ValueError("the log does not reach the recording")
+    n = len(seen.time)
+    log_time = seen.time[0] + low + SAMPLE_S * np.arange(n + int((high - low) / SAMPLE_S))
+    rates = {s.log.segment: _known_rate(s, log_time) for s in sensors}
+    score, weight = np.zeros(len(log_time) - n + 1), 0.0
+    for segment, rate in rates.items():
+        ours = np.linalg.norm(seen.rate[segment], axis=1)
+        score += ours.var() * _correlation(np.linalg.norm(rate, axis=1), ours)
+        weight += ours.var()
+    best = int(np.argmax(score))
+    lags = np.arange(max(0, best - int(FINE_S / SAMPLE_S)), min(len(score), best + int(FINE_S / SAMPLE_S) + 1))
+    agreement = [sum(_turned_sum(seen.rate[k], r[i : i + n]) for k, r in rates.items()) for i in lags]
+    at = int(np.argmax(agreement))
+    if 0 < at < len(lags) - 1:  # the top of the parabola through three
+        a, b, c = agreement[at - 1 : at + 2]
+        shift = 0.5 * (a - c) / (a - 2 * b + c)
+    else:
+        shift = 0.0
+    return low + SAMPLE_S * (lags[at] + shift), float(score[best] / weight)
+
+
+def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
+    quat, known = sensor.at(time)
+    return np.where(known[:, None], smooth(rate_of(quat)), 0.0)
+
+
+def _correlation(long: np.ndarray, short: np.ndarray) -> np.ndarray:
+    """Correlation of a signal with each part of a longer one."""
+    n, ones = len(short), np.ones(len(short))
+    short = short - short.mean()
+    mean, square = (fftconvolve(x, ones, "valid") / n for x in (long, long**2))
+    spread = np.sqrt(np.maximum(square - mean**2, 1e-3)) * n * short.std()
+    return fftconvolve(long, short[::-1], "valid") / spread
+
+
+def _turned_sum(a: np.ndarray, b: np.ndarray) -> float:
+    """Largest sum of products of vectors (T, 3) with others under one rotation, of rates whose spread is the same."""
+    values, sign = np.linalg.svd(a.T @ b)[1], np.sign(np.linalg.det(a.T @ b))
+    return float(values[0] + values[1] + sign * values[2]) / (np.linalg.norm(b) + 1e-9) * np.linalg.norm(a)
+
+
+def wahba(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The rotation (3, 3) that takes the second vectors of pairs (T, 3) best to the first ones."""
+    U, _, Vt = np.linalg.svd(sum((a.T @ b for a, b in pairs), np.zeros((3, 3))))
+    return U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+
+
+def vectors(seen: Moved, clock: float, sensor: Orientation, segment: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Pairs of vectors (T, 3) over their errors, in the axes of the segment and of the sensor: rates and verticals."""
+    quat, known = sensor.at(seen.time + clock)
+    up = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]
+    pairs = [(seen.rate[segment], smooth(rate_of(quat)), RATE_SD), (seen.rotation[segment][:, 2], up, UP_SD)]
+    if segment == "pelvis" and sensor.log.acceleration is not None:
+        turn = Rotation.from_rotvec([0.0, 0.0, _heading(seen, sensor, seen.time + clock, known)])
+        ahead = (turn * Rotation.from_quat(quat, scalar_first=True)).as_matrix()[:, 0]
+        pairs.append((seen.rotation[segment][:, 0], ahead, HEADING_SD))
+    return [(a[known] / sd, b[known] / sd) for a, b, sd in pairs]
+
+
+def _heading(seen: Moved, sensor: Orientation, time: np.ndarray, known: np.ndarray) -> float:
+    """Angle (rad) about the vertical from a sensor's world to the video's: that which makes the level accelerations
+    most equal, each axis of the video's counted by its spread, which is the depth's noise in a view from the front."""
+    assert sensor.log.acceleration is not None
+    felt = np.stack([np.interp(time, sensor.log.time, v) for v in sensor.log.acceleration.T], axis=1)
+    felt = smooth(Rotation.from_quat(sensor.at(time)[0], scalar_first=True).apply(felt), SMOOTH_SLOW_S)
+    inner = known.copy()
+    inner[: int(EDGE_S / SAMPLE_S)] = inner[-int(EDGE_S / SAMPLE_S) :] = False
+    ours, felt = (a[inner, :2] - a[inner, :2].mean(axis=0) for a in (seen.acceleration[sensor.log.segment], felt))
+    angles = np.deg2rad(np.arange(360.0))
+    turned = (felt @ [1, 1j]) * np.exp(1j * angles)[:, None]
+    error = ours - np.stack([turned.real, turned.imag], axis=-1)
+    costs = np.einsum("ati,ij,atj->a", error, np.linalg.inv(np.cov(ours.T)), error)
+    return float(angles[np.argmin(costs)])
