@@ -60,7 +60,7 @@ def truth_of(name: str, keypoints: Keypoints, data: Path) -> tuple[PointTruth, s
 def detected(data: Path, folder: Path, method: Method[KeypointParams]) -> Iterator[tuple[str, Keypoints]]:
     """Name and keypoints by the method of each of the recordings; what is not yet in `folder` is kept there."""
     for name, video in recordings(data).items():
-        kept = folder / f"{name}.keypoints.npz"
+        kept = folder / f"{name}.{method.key}.keypoints.npz"
         if not kept.exists():
             folder.mkdir(parents=True, exist_ok=True)
             clip_keypoints(video, kept.with_suffix(".png"), keypoints=method).save(kept)

@@ -33,7 +33,8 @@ class TrialFit:
     residual_2d_px is the mean over them, and camera, phone_quat_wxyz and camera_position_m (3,) are the first one's;
     laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
     estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
-    the scale of a fit to one camera (`known_height.py`), NaN if it was not stated.
+    the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
+    keypoints, which tells their detector, "" if they have none or the file is from before it was kept.
     """
 
     name: str
@@ -61,6 +62,7 @@ class TrialFit:
     loss: float
     seconds: float
     height_m: float = float("nan")
+    confidence_curve: str = ""
 
     @functools.cached_property
     def not_observed(self) -> frozenset[str]:
@@ -88,8 +90,8 @@ class TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
         wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
         fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        # Older files, from before heights could be stated, lack it.
-        data = {"height_m": np.asarray(np.nan), **load_npz(path, fields)}
+        # Older files lack what could not be stated or was not kept then.
+        data = {"height_m": np.asarray(np.nan), "confidence_curve": np.asarray(""), **load_npz(path, fields)}
         missing = [k for k in fields if k not in data]
         if missing:
             raise PblError(
@@ -104,6 +106,7 @@ class TrialFit:
             values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
             values[k] = text_of(path, data, k)
+        values["confidence_curve"] = text_of(path, data, "confidence_curve")
         for k in ("loss", "seconds", "phone_clock_offset_s", "height_m"):
             values[k] = float(values[k])
         camera = Camera(data["camera_matrix"], data["distortion"], text_of(path, data, "camera_source"))

@@ -233,6 +233,7 @@ def _trial_fit(
         loss=float(solution.loss_trace[-1, 1]),
         seconds=seconds,
         height_m=float("nan") if height_m is None else height_m,
+        confidence_curve=view.confidence_curve if isinstance(view, Keypoints) else "",
     )
 
 

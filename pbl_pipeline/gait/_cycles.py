@@ -185,7 +185,7 @@ def find_cycles(
         series, feet = angle_series(fit, poses), feet_from_fit(fit, poses)
         no_lengths, metric, far = why_no_lengths(fit), is_metric(fit), far_leg(fit, poses)
         stated = bool(np.isfinite(fit.height_m))
-        errors = "" if metric else model_of_fit(fit.params_hash)
+        errors = "" if metric else model_of_fit(fit.params_hash, fit.confidence_curve)
     cycles, slides = [], []
     for bout in sorted({e.bout for e in found}):
         inside = sorted((e for e in found if e.bout == bout), key=lambda e: e.time_s)

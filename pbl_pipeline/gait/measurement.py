@@ -170,6 +170,7 @@ class MeasurementModel:
     pass_cycles: float  # cycles of both sides of one pass, of which the gait measures are means
     #: Errors of the gait measures, by view (far leg "left" or "", mirrored views alike) and measure.
     measures: Mapping[str, Mapping[str, MeasureError]]
+    curves: Sequence[str] = ()  # `Keypoints.confidence_curve` of the detectors that it is for; none: of all others
 
 
 class Posterior(NamedTuple):
@@ -209,9 +210,12 @@ def load_model(name: str) -> MeasurementModel:
 
 
 @functools.cache
-def model_of_fit(params_hash: str) -> str:
-    """Return the name of the model that was measured with a fit's parameters; empty if there is none."""
-    return next((name for name in model_names() if params_hash in load_model(name).fits), "")
+def model_of_fit(params_hash: str, confidence_curve: str) -> str:
+    """Return the name of the model that was measured with a fit's parameters and the detector of this curve; empty if
+    there is none."""
+    suited = {n: load_model(n).curves for n in model_names() if params_hash in load_model(n).fits}
+    others = (n for n, curves in suited.items() if not curves)
+    return next((n for n, curves in suited.items() if confidence_curve in curves), next(others, ""))
 
 
 class _Joint(NamedTuple):

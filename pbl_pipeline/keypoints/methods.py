@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from pbl_pipeline import models
 from pbl_pipeline.methods import Stage
 
@@ -24,21 +22,21 @@ class RegisteredModels:
 
 #: A family is a detector: a function from its parameters to a `KeypointDetector`.
 METHODS: Stage[KeypointParams] = Stage("keypoints", "detector", "blazepose-heavy", RegisteredModels())
-_FULL = METHODS.register("blazepose-33", 3, KeypointParams(crop_step_px=0.25), blazepose).params
+#: Both refine the points by the networks' heat maps.
+METHODS.register(
+    "blazepose-33", 4, KeypointParams(confidence_curve="blazepose-v2", crop_step_px=0.25, window_cells=1.5), blazepose
+)
 #: Shares inferences at 24 frames/s and more: each is slow, and those of two neighbouring frames differ little.
-_HEAVY = METHODS.register(
+METHODS.register(
     "blazepose-heavy",
-    4,
+    5,
     KeypointParams(
         model_sha256=HEAVY_SHA256,
         share_looks_s=0.042,
-        confidence_curve="blazepose-heavy-v3",
+        confidence_curve="blazepose-heavy-v4",
         lighter_first=True,
         crop_step_px=0.25,
+        window_cells=1.5,
     ),
-).params
-#: With points refined by the networks' heat maps. Not the default: error models and intervals are those of the others.
-for _name, _params, _curve in (("33", _FULL, "blazepose-v2"), ("heavy", _HEAVY, "blazepose-heavy-v4")):
-    _refined = dataclasses.replace(_params, window_cells=1.5, confidence_curve=_curve)
-    METHODS.register(f"blazepose-{_name}-heatmaps", 1, _refined)
+)
 METHODS.register_family("onnx", ModelKeypointParams, onnx)

@@ -653,7 +653,8 @@ def write_model(model: MeasurementModel, path: Path, made_by: str) -> None:
     type=click.Path(path_type=Path),
     help="Write the model there; with --model that one, its gait measures anew.",
 )
-def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | None) -> None:
+@click.option("--curve", "curves", multiple=True, help="Confidence curve of a detector that the written model is for.")
+def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | None, curves: tuple[str, ...]) -> None:
     """Estimate the model of the passes in FOLDER on the tuning persons, and print its errors on those held out."""
     basis, method = load_norm(norm), METHODS[fit]
     seen = read_passes(folder, basis)
@@ -698,7 +699,7 @@ def main(folder: Path, norm: str, fit: str, stored: str | None, write: Path | No
         _echo(f"{about}: probability of a change, by session", probability_errors(pairs), 3)
         click.echo(f"\n{about}: of a true change is found\n{change_table(frame).to_string(float_format='%.2f')}")
     if write is not None:
-        model = dataclasses.replace(models[ALONE], name=write.stem)
+        model = dataclasses.replace(models[ALONE], name=write.stem, curves=curves)
         index = f"; index of {load_model(stored).name}" if stored else ""
         write_model(model, write, f"python -m research.corpus.measurement, {method.key}, {people[0]} persons{index}")
         click.echo(f"\n{write}")

@@ -61,12 +61,12 @@ def test_readme_states_how_far_its_numbers_are_compared():
     [
         ("97.9 steps", "99.2 steps", "cadence"),
         ("1.226 s", "1.25 s", "stride time"),
-        ("62.3 %", "63.4 %", "stance"),
-        ("right 95.5", "right 97.8", "GDI of three angles"),
+        ("61.0 %", "62.1 %", "stance"),
+        ("right 97.7", "right 95.4", "GDI of three angles"),
         ("5 cycles", "6 cycles", "GDI of three angles"),
         ("90 % interval", "95 % interval", "GDI of three angles"),
-        ("84 to 107", "84 to 110", "GDI of three angles"),
-        ("1.9 px", "2.5 px", "residuals of the fit"),
+        ("89 to 107", "89 to 110", "GDI of three angles"),
+        ("1.8 px", "2.5 px", "residuals of the fit"),
         ("gdi_cycles, ", "", "QC"),
     ],
 )
@@ -79,7 +79,7 @@ def test_another_number_in_the_block_of_readme_is_seen(old: str, new: str, line:
 
 def test_small_differences_in_the_block_of_readme_are_allowed_missing_lines_are_not():
     ours = demo_block.in_readme()
-    close = [t.replace("97.9 steps", "97.0 steps").replace("1.226", "1.210").replace("95.8", "94.2") for t in ours]
+    close = [t.replace("97.9 steps", "97.0 steps").replace("1.226", "1.210").replace("97.9 (", "96.2 (") for t in ours]
     assert close != ours
     assert demo_block.differences(ours, close) == []
     for i in range(len(ours)):

@@ -1,5 +1,7 @@
 """Points refined by heat maps: synthetic peaks, the same rule in NumPy and JAX, and the real networks."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from pbl_pipeline.video import cut_image
 from tests.unit.test_blazepose import CAMERA, asset, frames, region
 
 __all__ = ["frames"]
-SD = METHODS["blazepose-heavy-heatmaps"].params.window_cells
+SD = METHODS["blazepose-heavy"].params.window_cells
 GRID = np.arange(SIDE)
 
 
@@ -83,7 +85,11 @@ def test_maps_of_the_networks_lie_where_their_points_do(name: str, frames: dict[
     of the crop apart."""
     for network in ("blazepose_landmarks", "blazepose_landmarks_heavy"):
         asset(network)
-    plain, refining = (m.function(m.params) for m in (METHODS[name], METHODS[f"{name}-heatmaps"]))
+    method = METHODS[name]
+    plain, refining = (
+        method.function(dataclasses.replace(method.params, window_cells=cells))
+        for cells in (0.0, method.params.window_cells)
+    )
     apart, moved = [], []
     for number, image in frames.items():
         roi = region(number)
@@ -99,7 +105,7 @@ def test_maps_of_the_networks_lie_where_their_points_do(name: str, frames: dict[
 @pytest.mark.parametrize("x", [0.0, 884.0, -2000.0])
 def test_black_pictures_and_people_at_the_border_have_finite_points(x: float, frames: dict[int, np.ndarray]):
     asset("blazepose_landmarks")
-    method = METHODS["blazepose-33-heatmaps"]
+    method = METHODS["blazepose-33"]
     refining = method.function(method.params)
     for image in (frames[100], np.zeros_like(frames[100])):
         for roi in ([x, 715.0, 440.0, 0.0], [x, 715.0, 60.0, 1.0]):

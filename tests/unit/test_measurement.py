@@ -43,6 +43,7 @@ from pbl_pipeline.gait.measurement import (
 )
 from pbl_pipeline.gait.metrics import with_errors
 from pbl_pipeline.gait.metrics_file import load_curves, save_curves
+from pbl_pipeline.keypoints import METHODS as KEYPOINTS
 from tests import not_none
 
 K = 2
@@ -163,8 +164,12 @@ def test_a_model_that_ships_is_one_of_covariances_and_mirrored(name):
 
 def test_the_default_fit_of_a_phone_has_a_measured_model():
     """Another version of the fit errs otherwise: measure it (`python -m research.corpus.passes`, `.measurement`)."""
-    assert model_of_fit(METHODS[default_fit(("blazepose_33", True))].hash) == "blazepose-33"
-    assert model_of_fit("another") == ""
+    fit = METHODS[default_fit(("blazepose_33", True))].hash
+    for name in ("blazepose-heavy", "blazepose-33"):
+        assert model_of_fit(fit, KEYPOINTS[name].params.confidence_curve) == "blazepose-heat-maps"
+    for curve in ("blazepose-heavy-v3", ""):  # of points as regressed; of files that do not say
+        assert model_of_fit(fit, curve) == "blazepose-33"
+    assert model_of_fit("another", "blazepose-heavy-v4") == ""
 
 
 def errors(index: Gdi) -> tuple[float, float]:

@@ -25,10 +25,8 @@ from pbl_pipeline.tracking import TrackingParams
 SHIPPED = {
     ("tracking", "blazepose-tiles", 5): "de3019dc7978cecf",
     ("subject", "walker", 2): "4a27a14ec961fed1",
-    ("keypoints", "blazepose-33", 3): "b3aa243c34a157df",
-    ("keypoints", "blazepose-heavy", 4): "266d0193cbc443f5",
-    ("keypoints", "blazepose-33-heatmaps", 1): "a4b4d0912819fcfb",
-    ("keypoints", "blazepose-heavy-heatmaps", 1): "b442964e7c841225",
+    ("keypoints", "blazepose-33", 4): "4f2e29a511b43439",
+    ("keypoints", "blazepose-heavy", 5): "d27f08d9dd31a380",
     ("fit", "paper-2025", 2): "177d1e2810a04248",
     ("fit", "paper-gauss-newton", 3): "bcd62f28a515f283",
     ("fit", "gauss-newton", 5): "45eee8dd5c125990",
