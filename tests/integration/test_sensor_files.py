@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.fit
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.sensors import SensorLog
@@ -42,14 +41,14 @@ def stored_keypoints() -> Keypoints:
         return Keypoints.load(path)
 
 
-def test_the_log_reaches_keypoints_and_fit(capture, monkeypatch: pytest.MonkeyPatch):
+def test_the_log_reaches_keypoints_and_fit(capture, stand_in: chain.StandIn):
     seen = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static"):
         seen.append((trials[0].phone_time_s, camera_motion))
         return chain.fit_session(trials, names, paramset)
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+    stand_in(fit_session=fit_session)
     path, log = capture
     (result,) = ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])
     assert result.status == "registered"
@@ -147,7 +146,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
 
 
-def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: chain.StandIn):
     given = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
@@ -160,7 +159,7 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, monkeypatch: pytest.Mo
         (one,) = given
         return one
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+    stand_in(fit_session=fit_session)
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
     shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
     thigh = worn_sensor.xsens(Swing(phase=1), tmp_path / "MT_1-000_00B42D4C.txt", rate=False)
