@@ -14,8 +14,8 @@ from pbl_pipeline import bounded
 from pbl_pipeline.errors import as_said, said
 from pbl_pipeline.sampling import interval_of
 
-from .formats.samples import Samples, log_error
 from .log import SensorLog
+from .samples import Samples, log_error
 
 #: Rates of sampling (Hz), median length (m/s2) of an acceleration with gravity, and the angular speed (rad/s) that one
 #: sample in a hundred exceeds: a foot reaches 15 in walking, 25 in a sprint.

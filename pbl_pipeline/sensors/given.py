@@ -18,8 +18,8 @@ from pbl_pipeline.errors import PblError, said, unread_file
 
 from .checked import checked
 from .formats.read import read_samples
-from .formats.samples import Samples, log_error
 from .log import SEGMENTS, SensorLog
+from .samples import Samples, log_error
 
 #: Words of a sensor's name by which its segment is known.
 _WORDS = {

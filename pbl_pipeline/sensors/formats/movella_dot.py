@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from .samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
+from ..samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
 
 _MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)[ _](\d\d:\d\d:\d\d)[._](\d{3}) (?:GMT|UTC)?(?:([+-]\d\d?):?(\d\d)?)?$")
 _LINE = re.compile(r"^(\w[\w ]*):\s*,?\s*([^,\n]*)", re.MULTILINE)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .samples import Format, LogFile, Samples, numbers, table
+from ..samples import Format, LogFile, Samples, numbers, table
 
 
 def _knows(file: LogFile) -> bool:

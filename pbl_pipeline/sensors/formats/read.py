@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 
+from ..samples import Samples, log_error, opened
 from . import apdm, movella_dot, opensense, own, sensor_logger, shimmer, xsens
-from .samples import Samples, log_error, opened
 
 FORMATS = (
     xsens.FORMAT,

@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from .samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
+from ..samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
 
 _MATRIX = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
 _RATE = re.compile(r"^//\s*Update Rate:\s*([\d.]+)\s*Hz", re.MULTILINE)
