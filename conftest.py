@@ -117,8 +117,8 @@ def phases_predicted_once() -> Iterator[None]:
     from pbl_pipeline.gait.events import phase
 
     with pytest.MonkeyPatch.context() as patch:
-        for function in (phase.predict, phase.smooth_phases):
-            patch.setattr(phase, function.__name__, remembered(function))
+        patch.setattr(phase, "predict", remembered(phase.predict))
+        patch.setattr(phase, "smooth_phases", remembered(phase.smooth_phases))
         yield
 
 

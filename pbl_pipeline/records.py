@@ -1,6 +1,6 @@
 """Results as rows: the fields of a frozen dataclass declare their columns, and rows follow from them.
 
-    @dataclasses.dataclass(frozen=True)
+    @record
     class GaitEvent:
         time_s: float = column("event_time", "(s) time of the trial")
 
@@ -63,6 +63,17 @@ def column(
     """Return a field of a dataclass with a `Column`; `how`: its other attributes."""
     own = {"column": Column(name, comment, type, **how)}
     return dataclasses.field(default=default, default_factory=default_factory, metadata=own)
+
+
+@typing.overload
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(column, dataclasses.field))
+def record(cls: type[T], /) -> type[T]: ...
+@typing.overload
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(column, dataclasses.field))
+def record(*, kw_only: bool) -> Callable[[type[T]], type[T]]: ...
+def record(cls: Any = None, /, **how: Any) -> Any:
+    """Decorate a frozen dataclass with columns, `how` as for `dataclasses.dataclass`; type checkers know `column`."""
+    return dataclasses.dataclass(cls, frozen=True, **how)
 
 
 def stored(name: str, comment: str = "", type: str = "float64", **how: Any) -> Callable[[F], F]:

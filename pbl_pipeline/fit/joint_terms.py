@@ -115,7 +115,7 @@ SMOOTHNESS = Term(
     unknowns=Unknowns.JOINT_IN_THREE_FRAMES,
     variables=lambda at: three_frames(at.state.qpos),
     residual=lambda at, z: bent(z, at.problem.bend)[..., None],
-    count=lambda at: jnp.where(at.weights.slides, at.weights["smooth_per_m2"], at.weights["smooth_per_rad2"]),
+    count=lambda at: at.weights.smooth,
     frames=lambda at: jnp.ones_like(at.problem.weight),
 )
 POSE_PRIOR = Term(

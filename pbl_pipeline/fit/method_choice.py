@@ -38,7 +38,7 @@ def unsuited(method: str, points: Points) -> str:
     Methods of the paper and of a laboratory are not for particular points.
     """
     suits = _suited(points)
-    if method == suits or method not in _MADE_FOR:
+    if _MADE_FOR.get(method) in (None, _MADE_FOR[suits]):
         return ""
     seen = "markers of a laboratory" if points is None else f"points of {points[0]}"
     return f"{method} was made for {_MADE_FOR[method]}, and is asked for {seen}: {suits} suits these"
@@ -53,6 +53,7 @@ def _suited(points: Points) -> str:
 #: Method -> the points that its priors and weights were made with.
 _MADE_FOR = {
     "blazepose": "BlazePose's points",
+    "blazepose-measured": "BlazePose's points",
     "gauss-newton": "MeTRAbs' 87 points with 3D",
     "markers": "markers of a laboratory",
 }

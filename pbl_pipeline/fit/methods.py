@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pbl_pipeline.methods import Stage
 
-from .params import BLAZEPOSE, GAUSS_NEWTON, MARKERS, PAPER_2025, PAPER_GAUSS_NEWTON, Params
+from .params import BLAZEPOSE, BLAZEPOSE_MEASURED, GAUSS_NEWTON, MARKERS, PAPER_2025, PAPER_GAUSS_NEWTON, Params
 from .per_frame import solve_per_frame
 
 #: A family is a solver: a function from sessions that are packed to the same sizes, its parameters and the sessions'
@@ -15,4 +15,5 @@ METHODS.register("paper-2025", 2, PAPER_2025, "pbl_pipeline.fit.implicit:solve_s
 METHODS.register("gauss-newton", 5, GAUSS_NEWTON, solve_per_frame)
 METHODS.register("paper-gauss-newton", 3, PAPER_GAUSS_NEWTON)
 METHODS.register("blazepose", 8, BLAZEPOSE)
+METHODS.register("blazepose-measured", 1, BLAZEPOSE_MEASURED)
 METHODS.register("markers", 3, MARKERS)

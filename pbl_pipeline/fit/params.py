@@ -123,6 +123,8 @@ class GaussNewtonParams:
     #: Weight of half the squared second difference of each joint over frames at 30 Hz, per rad^2 and m^2.
     smooth_per_rad2: float = 200.0
     smooth_per_m2: float = 20_000.0
+    #: Of the pelvis' height, which the picture shows better than its depth; 0: `smooth_per_m2`.
+    smooth_up_per_m2: float = later(0.0)
     #: Weight of half the squared angle beyond a joint's limit, per deg^2.
     weight_limit_per_deg2: float = 0.1
     #: The angle between fitted and measured camera counts linearly beyond this, as in the paper, and smoothly below.
@@ -144,6 +146,10 @@ class GaussNewtonParams:
     #: in standard deviations. 0: the augmenter is not used.
     weight_pelvis: float = later(0.0)
     pelvis_sd_deg: float = later(6.0)
+    #: Median residual of a point (px of the cost; cm) at which it counts as `weight_2d` and `weight_3d` say: others
+    #: more or less, by the residuals of a first solution (`measured_weights.py`). 0: all alike.
+    points_px: float = later(0.0)
+    points_cm: float = later(0.0)
     #: Wearable sensors (`imu_term.py`): half squares in standard deviations, as many keypoint residuals' as they are.
     weight_sensor: float = later(1.0)
     huber_sensor: float = later(3.0)
@@ -211,6 +217,16 @@ BLAZEPOSE = GaussNewtonParams(
         pose_prior="people-3",
         weight_scale=0.1,
     ),
+)
+#: `BLAZEPOSE` with weights that follow the errors of each point: points that fit well count more against priors, and
+#: what was steady only by smoothing may move. Chosen on the walk of the two phone clips (research/reports).
+BLAZEPOSE_MEASURED = dataclasses.replace(
+    BLAZEPOSE,
+    smooth_per_rad2=5.0,
+    smooth_up_per_m2=2_000.0,
+    points_px=1.0,
+    points_cm=1.5,
+    cost=dataclasses.replace(BLAZEPOSE.cost, weight_offset_per_m2=30.0),
 )
 #: For markers of a laboratory, known to millimetres but placed by hand; a marker that jumped counts little. Postures of
 #: people hold what few markers leave open, such as the tilt of a pelvis seen as two hip centres. The neutral angle of

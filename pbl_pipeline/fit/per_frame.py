@@ -29,6 +29,7 @@ from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
 from .initial_pose import placed_poses
 from .lanes import Found, Task, begin_one, fetch, fit_many, fit_one
+from .measured_weights import with_measured_weights
 from .params import GaussNewtonParams
 from .phone_error import phone_variance
 from .problem import Problem, State, pixels_alone
@@ -55,9 +56,9 @@ def solve_per_frame(
 
     The result does not depend on which sessions are fitted together. A session whose result is suspicious is solved
     again from a start that faces the other way, and the better one of the two is kept. If the paramset has feet on the
-    floor or the augmenter's pelvis, or sensors are worn, a first solution shows when each foot stands, what the
-    augmenter sees and how the sensors sit, and a second one uses it. Where the augmenter is needed and not available,
-    its error takes the place of the solution.
+    floor, the augmenter's pelvis or measured weights, or sensors are worn, a first solution shows when each foot
+    stands, what the augmenter sees, how far each point errs and how the sensors sit, and a second one uses it. Where
+    the augmenter is needed and not available, its error takes the place of the solution.
 
     Raises `PblError` FIT_INPUT: the paramset has a prior of no joint.
     """
@@ -119,7 +120,9 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
 
     Raises `PblError` where the augmenter is needed and not available.
     """
-    twice = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0 or session.worn is not None
+    measured = params.points_px > 0 or params.points_cm > 0
+    refined = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
+    twice = measured or refined or session.worn is not None
     p = session.problem
     found = yield Task(p, _with_detector(start, params), last=not twice)
     if suspicious(session, found.end.state.qpos):
@@ -128,6 +131,8 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
     trace, told, moves_with = found.trace, None, ()
     if twice:
         p, start = _on_floor(session, found)
+        if measured:
+            p = with_measured_weights(p, Weights.of(session.body, params), found)
         if params.weight_pelvis > 0:
             p = with_augmented_pelvis(session, p, np.asarray(start.qpos), np.asarray(scale_multipliers(start.s)))
             told = np.asarray(p.c_pelvis)

@@ -12,6 +12,7 @@ from pbl_pipeline.body import SCALE_NAMES, SLIDES
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
+from pbl_pipeline.records import record
 from pbl_pipeline.results import Solution
 from pbl_pipeline.sensors.worn import SensorFit
 from pbl_pipeline.video import Camera, check_lens
@@ -116,7 +117,7 @@ class TrialFit:
         return cls(**values, camera=camera)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@record(kw_only=True)
 class SessionFit(Solution):
     """All trials of a session with one body."""
 

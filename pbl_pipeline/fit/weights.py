@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from pbl_pipeline.body import PELVIS_TURNS, Body
 
@@ -34,7 +34,8 @@ class Weights:
     pose_log_weight: Float[Array, " C"]
     #: Tilt, list and rotation of the pelvis among the joints if a term needs its inclination, else none.
     pelvis: Int[Array, " P"]
-    slides: Bool[Array, " Q"]
+    #: Of smoothness, of each joint.
+    smooth: Float[Array, " Q"]
     #: Joint limits (rad).
     low: Float[Array, " Q"]
     high: Float[Array, " Q"]
@@ -62,16 +63,19 @@ class Weights:
         low, high = np.asarray(body.joint_range_rad).T
         inclined = cost.pose_prior or own.weight_pelvis
         pelvis = [body.joint_names.index(n) for n in PELVIS_TURNS if n in body.joint_names] if inclined else []
+        smooth = np.where(body.is_slide, own.smooth_per_m2, own.smooth_per_rad2)
+        if own.smooth_up_per_m2:
+            smooth[[n == "pelvis_ty" for n in body.joint_names]] = own.smooth_up_per_m2
         values: dict[str, Any] = {
             "numbers": numbers,
             "neutral": neutral,
             "whitener": whitener,
             "pose_log_weight": pose_log_weight,
+            "smooth": smooth,
             "low": low,
             "high": high,
             "scale_precision": scale_precision(body.scale_names, cost.scale_sd, cost.scale_sides_sd),
             "size_precision": PIXELS_WEIGHT_SIZE * size_unseen,
         }
         arrays = jax.tree.map(lambda v: np.asarray(v, np.float32), values)
-        arrays |= {"pelvis": np.asarray(pelvis, np.int32), "slides": np.asarray(body.is_slide)}
-        return cls(**jax.device_put(arrays))
+        return cls(**jax.device_put(arrays | {"pelvis": np.asarray(pelvis, np.int32)}))

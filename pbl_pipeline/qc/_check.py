@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL = "PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL"
 #: From best to worst. EMPTY: ran well, nothing to produce. NEEDS_CHOICE: waits for a person.
@@ -14,7 +13,7 @@ OUTCOMES = (PASS, WARN, EMPTY, NEEDS_CHOICE, FAIL)
 CADENCE = "cadence_plausible"
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Check:
     """A named check. `value` and `threshold` are in the unit that `check` names; None if none applies."""
 

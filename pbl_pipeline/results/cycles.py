@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 
 from pbl_pipeline.qc import CADENCE
-from pbl_pipeline.records import column, stored
+from pbl_pipeline.records import column, record, stored
 
 #: Angles of the fitted body: the pelvis' forward axis is level in neutral standing, because Delp's frame of the pelvis
 #: (OpenSim's) has its frontal plane through the anterior spines and the pubic symphysis.
 BODY_ANGLES = "pbl_body"
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Exclusion:
     """Reasons against a cycle; none if it is used.
 
@@ -69,7 +69,7 @@ class Exclusion:
 NO_POSITIONS = "no positions on the floor"
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Lengths:
     """Lengths (m) of one cycle, None if not known (`missing`: the reason).
 
@@ -93,7 +93,7 @@ class Lengths:
     )
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GaitCycle:
     """One stride: initial contact to the next initial contact of the same side.
 

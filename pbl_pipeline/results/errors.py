@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class JointError:
     """Error of one joint over the common frames, error = fit - reference, degrees.
 
@@ -36,7 +35,7 @@ class JointError:
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@record(kw_only=True)
 class TrialError:
     """Error of one trial over the common frames, NaN where it is not known."""
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 from pathlib import Path
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import column, stored
+from pbl_pipeline.records import column, record, stored
 
 LEFT, RIGHT = "left", "right"
 FOOT_DOWN, FOOT_UP = "foot_down", "foot_up"
@@ -17,7 +16,7 @@ EVENTS = (FOOT_DOWN, FOOT_UP)
 COLUMNS = ("time_s", "side", "event", "probability")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GaitEvent:
     """One event. `probability` in 0..1 that it is real: calibrated in the event model, only a measure of prominence in
     the coordinate-based methods; `bout` counts walking bouts from 0."""
@@ -35,7 +34,7 @@ class GaitEvent:
             raise ValueError(f"side {self.side!r} or event {self.event!r} is not one of {SIDES}, {EVENTS}")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GaitEvents:
     """The events of one trial in order of time.
 

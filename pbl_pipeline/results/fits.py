@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from pbl_pipeline.records import column, stored
+from pbl_pipeline.records import column, record, stored
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Solution:
     """Result of fitting the body of a visit, without the movements."""
 

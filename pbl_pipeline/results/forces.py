@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import column, plain
+from pbl_pipeline.records import column, plain, record
 
 #: Half of a 90 % interval in standard deviations.
 WIDTH_SD = 1.645
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class KineticMeasure:
     """Means over the used cycles of each side and over both sides, with their standard deviations (None: not known).
 
@@ -51,7 +51,7 @@ class KineticMeasure:
         return {**own, "interval": plain(dataclasses.replace(self, **own).interval, 4)}
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class CycleKinetics:
     """Kinetics of one gait cycle."""
 
@@ -65,7 +65,7 @@ class CycleKinetics:
     missing: str = ""  # reason of missing results
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Series:
     """Kinetics over N times of a trial, per kilogram; world frame (z up). NaN where contact is not known."""
 
@@ -81,7 +81,7 @@ class Series:
     knee_adduction_nm_per_kg: np.ndarray  # (N, 2) of `kinetics.joints.knee_adduction`
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class TrialKinetics:
     """Kinetics of one trial. `code` and `reason` explain missing results, otherwise both are empty."""
 
@@ -94,7 +94,7 @@ class TrialKinetics:
     samples: np.ndarray | None = dataclasses.field(default=None, compare=False, repr=False)
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Kinetics:
     """Kinetics of a visit: measures over all used cycles of its trials, and the trials."""
 

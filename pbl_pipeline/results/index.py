@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import column, plain
+from pbl_pipeline.records import column, plain, record
 from pbl_pipeline.words import number
 
 from .events import RIGHT
@@ -30,7 +29,7 @@ WITH_ERROR = ("mean", "sd", "minimal_change")
 NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class VariableScore:
     """Gait Variable Score (deg) of an angle, None for a side without cycles."""
 
@@ -39,7 +38,7 @@ class VariableScore:
     right: float | None = column("{}_score_right", "(deg)")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class MovementProfile:
     """Gait Variable Scores (deg) per side and angle: together the Movement Analysis Profile.
 
@@ -66,7 +65,7 @@ class MovementProfile:
         return tuple(VariableScore(k, self.left.get(k), self.right.get(k)) for k in {**self.left, **self.right})
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class GdiCycle:
     """The index of one cycle. `z` is the standardised log distance; `explained` the fraction (0..1) of the squared
     deviation from the normative mean that lies in the normative components; the rest does not count."""
@@ -79,7 +78,7 @@ class GdiCycle:
     explained: float = column("cycle_explained", "(0..1) share of the deviation that the index sees")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Gdi:
     """The index of one trial or session, of its `n` used cycles; None if these are too few (`reason`).
 

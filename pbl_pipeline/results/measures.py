@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
@@ -13,7 +12,7 @@ Z90 = 1.6449
 OF_VISIT = ("error_sd", "minimal_change")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Measure:
     """Mean and sd (n - 1; None for one value) over the n values of both sides; `left`, `right` are means of a side.
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class TrackFigures:
     """One person's track in figures."""
 
@@ -23,7 +21,7 @@ class TrackFigures:
     height_px: float = column("box_height", "(px) median height of the box")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class PersonTrack:
     """One person over the video. Rows of frames without the person are NaN (score 0)."""
 
@@ -39,10 +37,11 @@ class PersonTrack:
         height = np.median(self.box_px[frames, 3] - self.box_px[frames, 1])
         score = np.median(self.score[seen]) if seen.any() else 0.0
         first, last = frames[0], frames[-1]
-        return TrackFigures(self.person_id, first, last, time_s[first], time_s[last], seen.sum(), score, height)
+        times = float(time_s[first]), float(time_s[last])
+        return TrackFigures(self.person_id, first, last, *times, seen.sum(), score, height)
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class SubjectChoice:
     """Choice of the person to measure."""
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 #: Fields of `VideoInfo` that stand in the row of the file, not in that of its facts.
 OF_FILE = ("path", "sha256", "size_bytes")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class FirstPicture:
     """Facts of a video that are known from its first picture. Sizes are as it plays, after the rotation flag.
 
@@ -43,7 +41,7 @@ class FirstPicture:
     )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@record(kw_only=True)
 class VideoInfo(FirstPicture):
     """A probed video.
 

@@ -14,6 +14,7 @@ from pbl_pipeline.body import PELVIS_TURNS
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait import Z90, GaitCycle, trial_poses
+from pbl_pipeline.records import record
 from pbl_pipeline.results import JointError, TrialError
 
 from .align import (
@@ -78,7 +79,7 @@ def _finite(values: Sequence[float] | np.ndarray) -> np.ndarray:
     return v[np.isfinite(v)]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@record(kw_only=True)
 class KinematicErrors(TrialError):
     """Errors of one trial against its reference."""
 

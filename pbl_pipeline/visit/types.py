@@ -103,8 +103,8 @@ class Recording:
 
 def solution_of(fit: SessionFit) -> Solution:
     """Return the solution of a fit that this code made."""
-    own = {f.name: getattr(fit, f.name) for f in dataclasses.fields(Solution)}
-    return Solution(**own | {"software": code_version()})
+    own: dict[str, Any] = {f.name: getattr(fit, f.name) for f in dataclasses.fields(Solution)}
+    return Solution(**{**own, "software": code_version()})
 
 
 @dataclasses.dataclass(frozen=True)

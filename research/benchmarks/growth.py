@@ -1,4 +1,4 @@
-"""Time and statements of commands as the tables grow: figures of docs/operations.md.
+"""Time and statements of commands as the tables grow: figures of research/reports/2026-11-29_operations.md.
 
     python -m research.benchmarks.growth                                      # 10,000 and 100,000 videos
     python -m research.benchmarks.growth --videos 3000 --videos 30000

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-from pbl_pipeline.records import column
+from pbl_pipeline.records import column, record
 
 from . import session, video  # noqa: F401  the definitions refer to them
 from .datajoint_setup import dj
@@ -16,7 +14,7 @@ schema = dj.Schema()
 UPLOADING, RECEIVED, REFUSED = "uploading", "received", "refused"
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class ProtocolStep:
     """A step of a visit's protocol. done: recordings that are usable; waiting: those without a verdict yet."""
 

@@ -133,6 +133,13 @@ def utc_now() -> datetime.datetime:
     return dj.conn().query("SELECT UTC_TIMESTAMP()").fetchone()[0]
 
 
+def moment(at: datetime.datetime | str) -> str:
+    """Return a moment (UTC if it has no zone) as the clock of this machine shows it, to the minute."""
+    at = datetime.datetime.fromisoformat(at) if isinstance(at, str) else at
+    zoned = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
+    return f"{zoned.astimezone():%Y-%m-%d %H:%M}"
+
+
 def or_nan(value: float | None) -> float:
     """Return the number of a nullable column; NaN for NULL."""
     return float("nan") if value is None else float(value)

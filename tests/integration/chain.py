@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 import pbl_pipeline.fit
+import pbl_pipeline.gait
 import pbl_pipeline.keypoints
 import pbl_pipeline.pipeline  # binds the real functions now, not the stand-ins at its first import later
 import pbl_pipeline.tracking
+import pbl_pipeline.video
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit, session_fit
@@ -36,6 +38,17 @@ from tests.walker import observe
 from tests.walking_fit import walking_fit
 
 N_FRAMES = 240
+#: The stages that a test may replace, by name, and where the library looks for them.
+STAGES = {
+    "probe": pbl_pipeline.video,
+    "track_people": pbl_pipeline.tracking,
+    "detect_keypoints": pbl_pipeline.keypoints,
+    "fit_session": pbl_pipeline.fit,
+    "fit_sessions": pbl_pipeline.fit,
+    "detect_events": pbl_pipeline.gait,
+}
+#: The fixture `stand_in`: functions that stand in for stages, by their names.
+StandIn = Callable[..., None]
 
 
 def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walker and bystander") -> Path:
@@ -159,14 +172,18 @@ trial_kinetics = remembered(compute.trial_kinetics)
 def install(patch: pytest.MonkeyPatch) -> None:
     """Put the stand-ins in place of the library's functions."""
     patch.setattr(compute, "trial_kinetics", trial_kinetics)
-    patch.setattr(pbl_pipeline.tracking, "track_people", track_people)
-    patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
-    patch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+    replace(patch, track_people=track_people, detect_keypoints=detect_keypoints, fit_session=fit_session)
+
+
+def replace(patch: pytest.MonkeyPatch, **functions: Any) -> None:
+    """Put these functions in place of the stages of their names."""
+    for name, function in functions.items():
+        patch.setattr(STAGES[name], name, function)
 
 
 def change_fits(patch: pytest.MonkeyPatch, change: Callable[[SessionFit], SessionFit]) -> None:
     """Let the library fit what `change` makes of the fits of the stand-in."""
-    patch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **named: change(fit_session(*given, **named)))
+    replace(patch, fit_session=lambda *given, **named: change(fit_session(*given, **named)))
 
 
 def computed_once(build: Callable[[Path], Any]) -> Any:

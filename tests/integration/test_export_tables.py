@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import pbl_pipeline.gait
 from pbl_pipeline.errors import PblError
 from pbl_schemas import fit, gait, gdi, session
 from pbl_schemas.intake import Methods, Sensors, VisitRecord, ingest
@@ -21,9 +20,7 @@ from tests.rows import register
 from . import chain
 
 
-def test_a_visit_of_the_tables(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change_fits: Callable[..., None]
-):
+def test_a_visit_of_the_tables(tables: None, tmp_path: Path, stand_in: chain.StandIn, change_fits: Callable[..., None]):
     ezc3d = pytest.importorskip("ezc3d")
     change_fits(chain.with_all_markers)
     time = np.arange(-0.5, 9.0, 0.02)
@@ -35,7 +32,7 @@ def test_a_visit_of_the_tables(
     with pytest.raises(PblError, match="no finished fit"):
         fitted_visit({"subject": "P001"})
     populate()
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", None)  # nothing is computed anew
+    stand_in(detect_events=None)  # nothing is computed anew
     formats = [word for f in ("trc", "mot", "osim", "c3d", "dlc", "csv") for word in ("--to", f)]
     visit = ("export", "--subject", "P001", "--session", "2026-03-01", *formats, "--number-trials")
     done = pbl(*visit, "--out", tmp_path / "out")

@@ -8,7 +8,6 @@ from pathlib import Path
 import pymysql
 import pytest
 
-import pbl_pipeline.fit
 from pbl_schemas import fit
 from pbl_schemas.jobs import jobs_of
 from pbl_workers import loop, queue
@@ -23,7 +22,9 @@ N = 7
 
 
 @pytest.fixture
-def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], Worker]:
+def sessions(
+    tables: None, database: Path, monkeypatch: pytest.MonkeyPatch, stand_in: chain.StandIn
+) -> Callable[[Callable], Worker]:
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
     gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
     assert gpu_worker.queue_fits(0) == N
@@ -34,7 +35,7 @@ def sessions(tables: None, database: Path, monkeypatch: pytest.MonkeyPatch) -> C
             solve(len(given), **options)
             return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in given]
 
-        monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
+        stand_in(fit_sessions=fit_sessions)
         return Worker([fit.SessionFit], Silent(), batch=2)
 
     return worker

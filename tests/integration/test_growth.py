@@ -7,17 +7,22 @@ import time
 from contextlib import closing
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from pbl_schemas import computed_tables, connection, fit, rows
+from pbl_schemas import computed_tables, connection, fit, rows, video
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.datajoint_setup import LIMIT_S
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import catalog
 from pbl_schemas.plan import plan_fit_sets
-from pbl_workers import requeue
+from pbl_schemas.reading import registered
+from pbl_schemas.reading.status import pipeline_status
+from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
-from research.benchmarks import growth, worker_standins, workers
+from research.benchmarks import growth, many_recordings, worker_standins, workers
 from tests import Environment, mysql, not_none
+from tests.command import pbl
 from tests.database import embedded_only
 from tests.integration import chain
 
@@ -68,6 +73,38 @@ def test_statements_stay_as_short_as_they_are(
             found = [(row[1], row[2]) for row in cursor.fetchall()]
             assert not [table for kind, table in found if kind == "DEPENDENT SUBQUERY" and "fit_s" in str(table)], found
     assert planned
+
+
+def test_a_printed_list_ends_and_says_what_it_leaves_out(tables: None):
+    many_recordings.register_many(workers.recordings(0, 3 * workers.EACH))  # three people with a visit each
+    for name, most, n in (("subjects", 2, 3), ("visits", 2, 3), ("videos", 4, 18)):
+        done = pbl("list", name, "--limit", most)
+        assert len(done.out.splitlines()) == 1 + most
+        assert f"{n - most} further rows left out" in done.err
+        whole = pbl("list", name, "--limit", 0)
+        assert (len(whole.out.splitlines()), whole.err) == (1 + n, "")
+        assert len(pbl("list", name, "--csv", "--limit", most).out.splitlines()) == 1 + n
+        first = getattr(registered, name)(True, most)
+        pd.testing.assert_frame_equal(first, getattr(registered, name)().head(most))
+
+
+def test_status_asks_for_names_once(tables: None):
+    many_recordings.register_many(workers.recordings(0, workers.EACH))
+    numbers = [int(v) for v in video.Video.to_arrays("video_id")]
+    mark = {"unusable_reason": "other", "unusable_by": "A", "unusable_created": rows.utc_now()}
+    statements, jobs = [], jobs_of(video.VideoInfo)
+    assert queue.fill(video.VideoInfo) == workers.EACH
+    for some in (numbers[:1], numbers[1:]):
+        for v in some:
+            jobs.reserve({"video_id": v})
+            jobs.error({"video_id": v}, error_message="VIDEO_MISSING: gone")
+        video.NotUsable.insert({"video_id": v, **mark} for v in some)
+        state = pipeline_status()  # reads the columns of the tables
+        assert {m.about for m in state.not_usable} == {e.about for e in state.errors}
+        assert all(e.about.endswith(".mp4") for e in state.errors)
+        statements.append(growth.measured(pipeline_status).statements)
+    assert len(state.errors) == len(state.not_usable) == workers.EACH
+    assert statements[1] <= statements[0]
 
 
 @embedded_only

@@ -32,8 +32,8 @@ VISIT = {"subject": "P001", "session_label": "2026-01-10"}
 
 
 @pytest.fixture
-def upright(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", chain.fit_upright)
+def upright(tables: None, stand_in: chain.StandIn) -> None:
+    stand_in(fit_session=chain.fit_upright)
 
 
 @pytest.fixture

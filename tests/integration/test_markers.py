@@ -50,8 +50,8 @@ def ingest_markers(path: Path, visit: VisitRecord, table: Path | None = None) ->
 
 
 @pytest.fixture
-def fitted(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", chain.fit_either)
+def fitted(tables: None, stand_in: chain.StandIn) -> None:
+    stand_in(fit_session=chain.fit_either)
 
 
 @pytest.mark.long
@@ -113,7 +113,7 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
         assert slices.changes(name) == []
 
 
-def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, stand_in: chain.StandIn):
     seen: list[tuple] = []
 
     def fit_markers(trials, names, paramset=None, camera_motion="static", markers=None):
@@ -121,7 +121,7 @@ def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, monkeyp
         seen.append((names, {type(t) for t in trials}, markers.name, markers.names))
         return chain.fit_session(trials, names, paramset)
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_markers)
+    stand_in(fit_session=fit_markers)
     table = tmp_path / "our_lab.csv"
     table.write_text(SHIPPED.read_text())
     names = marker_set("mpi_inf_3dhp_17").names

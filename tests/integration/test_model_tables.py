@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.tracking
 import pbl_schemas
 from pbl_pipeline import methods, models
 from pbl_pipeline.body import marker_set
@@ -48,11 +47,11 @@ def track_people(video_path, params=None, info=None) -> Tracking:
 
 
 @pytest.fixture
-def tables(database: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path) -> Iterator[None]:
+def tables(database: Path, stand_in: chain.StandIn, environment: Environment, tmp_path: Path) -> Iterator[None]:
     """Empty tables, a registry of its own, the people where they are."""
     pbl_schemas.activate()
     environment(PBL_MODELS=tmp_path / "models")
-    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
+    stand_in(track_people=track_people)
     yield
     remove_all()
     # Other tests count the method rows of the project.

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-import pbl_pipeline.gait
 from pbl_pipeline.body import load_body
 from pbl_pipeline.synthetic import plain_walk
 from tests.command import Done, pbl
@@ -218,8 +217,8 @@ def failing(error: BaseException):
     return fails
 
 
-def test_an_unforeseen_error_asks_to_be_reported(monkeypatch, folder, tmp_path):
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(ZeroDivisionError("somewhere deep")))
+def test_an_unforeseen_error_asks_to_be_reported(stand_in, folder, tmp_path):
+    stand_in(detect_events=failing(ZeroDivisionError("somewhere deep")))
     words = ("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")
     done = pbl(*words)
     check(done, "INTERNAL")
@@ -239,23 +238,23 @@ def test_an_unforeseen_error_asks_to_be_reported(monkeypatch, folder, tmp_path):
         (ImportError("core bindings are missing"), "`pbl doctor`"),  # as raised by the package itself
     ],
 )
-def test_a_package_that_is_missing_or_broken_is_named(monkeypatch, folder, tmp_path, error, said):
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(error))
+def test_a_package_that_is_missing_or_broken_is_named(stand_in, folder, tmp_path, error, said):
+    stand_in(detect_events=failing(error))
     done = pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")
     check(done, "PACKAGE_MISSING")
     assert str(error) in done.err
     assert said in done.err
 
 
-def test_a_name_of_ours_that_is_missing_is_our_fault(monkeypatch, folder, tmp_path):
+def test_a_name_of_ours_that_is_missing_is_our_fault(stand_in, folder, tmp_path):
     error = ImportError("cannot import name 'x' from 'pbl_pipeline.gait'", name="pbl_pipeline.gait")
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(error))
+    stand_in(detect_events=failing(error))
     check(pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv"), "INTERNAL")
 
 
-def test_a_full_disk_is_named(monkeypatch, folder, tmp_path):
+def test_a_full_disk_is_named(stand_in, folder, tmp_path):
     full = OSError(errno.ENOSPC, "No space left on device", "walk.events.csv")
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(full))
+    stand_in(detect_events=failing(full))
     done = pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")
     check(done, "FILE_UNWRITABLE")
     assert "No space left" in done.err
@@ -266,8 +265,8 @@ def test_a_name_too_long_is_wrong_usage(words):
     check(pbl(*words, "a" * 5000), "USAGE")
 
 
-def test_an_interrupt_is_no_error(monkeypatch, folder, tmp_path):
-    monkeypatch.setattr(pbl_pipeline.gait, "detect_events", failing(KeyboardInterrupt()))
+def test_an_interrupt_is_no_error(stand_in, folder, tmp_path):
+    stand_in(detect_events=failing(KeyboardInterrupt()))
     done = pbl("events", folder / "walk.fit.npz", "--out", tmp_path / "e.csv")
     assert (done.code, done.error_code) == (130, "")
     assert "interrupted" in done.err

@@ -44,16 +44,16 @@ def test_a_file_whose_name_is_a_word_of_datajoint_is_one_error(tables: None, tmp
     assert work().failed == 0
 
 
-def test_a_video_that_was_deleted_while_its_job_was_queued_is_not_tried(tables: None, tmp_path: Path, monkeypatch):
+def test_a_video_that_was_deleted_while_its_job_was_queued_is_not_tried(tables: None, tmp_path: Path, stand_in):
     number = queued(tmp_path, video.VideoInfo)
     video.Video.delete(prompt=False)
-    monkeypatch.setattr(pbl_pipeline.video, "probe", lambda path: pytest.fail("tried"))
+    stand_in(probe=lambda path: pytest.fail("tried"))
     outcome = run_job.run(claimed(video.VideoInfo))
     assert (outcome.what, outcome.job.key) == (run_job.VANISHED, {"video_id": number})
     assert len(jobs_of(video.VideoInfo)) == 0
 
 
-def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: None, tmp_path: Path, monkeypatch):
+def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: None, tmp_path: Path, stand_in):
     queued(tmp_path, video.VideoInfo)
     real = pbl_pipeline.video.probe
 
@@ -61,7 +61,7 @@ def test_a_video_that_was_deleted_while_it_was_computed_leaves_no_job(tables: No
         video.Video.delete(prompt=False)
         return real(path)
 
-    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    stand_in(probe=probe)
     assert run_job.run(claimed(video.VideoInfo)).what == run_job.VANISHED
     assert (len(jobs_of(video.VideoInfo)), len(video.VideoInfo())) == (0, 0)
 
@@ -100,7 +100,7 @@ def test_a_row_that_a_result_needs_is_gone_for_good(tables: None, tmp_path: Path
     assert run_job.run(claimed(fit.SessionFit)).what == run_job.DONE
 
 
-def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Path, monkeypatch):
+def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Path, stand_in):
     number = queued(tmp_path, video.VideoInfo)
     real, names = pbl_pipeline.video.probe, iter("abc")
 
@@ -111,7 +111,7 @@ def test_inputs_that_change_each_time_end_as_an_error(tables: None, tmp_path: Pa
         video.Video.update1({"video_id": number, "video_path": str(elsewhere)})
         return real(elsewhere)
 
-    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    stand_in(probe=probe)
     ended = [run_job.run(claimed(video.VideoInfo)).what for _ in range(run_job.ATTEMPTS)]
     assert ended == [run_job.LATER, run_job.LATER, run_job.FAILED]
     assert error(video.VideoInfo)[0] == "INPUT_CHANGED"

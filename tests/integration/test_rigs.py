@@ -89,9 +89,8 @@ def fit_none(trials, names, paramset=None, camera_motion="static"):
 
 
 @pytest.fixture
-def rig(tables: None, monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    monkeypatch.setattr(pbl_pipeline.keypoints, "detect_keypoints", detect_keypoints)
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_none)
+def rig(tables: None, monkeypatch: pytest.MonkeyPatch, stand_in: chain.StandIn) -> pytest.MonkeyPatch:
+    stand_in(detect_keypoints=detect_keypoints, fit_session=fit_none)
     return monkeypatch
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.fit
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
@@ -39,14 +38,14 @@ def stored_keypoints() -> Keypoints:
         return Keypoints.load(path)
 
 
-def test_the_log_reaches_keypoints_and_fit(capture, monkeypatch: pytest.MonkeyPatch):
+def test_the_log_reaches_keypoints_and_fit(capture, stand_in: chain.StandIn):
     seen = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static"):
         seen.append((trials[0].phone_time_s, camera_motion))
         return chain.fit_session(trials, names, paramset)
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", fit_session)
+    stand_in(fit_session=fit_session)
     path, log = capture
     (result,) = ingest([path], VisitRecord("P001"), files=[Sensors(attitude=log)])
     assert result.status == "registered"

@@ -277,14 +277,14 @@ def test_labels_that_do_not_fit_are_refused(tables: None, tmp_path: Path, label:
         ingest([path], VisitRecord("P001", **label))
 
 
-def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, stand_in: chain.StandIn):
     original = pbl_pipeline.video.probe
 
     def odd(path):
         fields = ("container", "codec", "pixel_format", "recorded_utc", "make", "model")
         return dataclasses.replace(original(path), **dict.fromkeys(fields, "\U0001f4f1" * 300))
 
-    monkeypatch.setattr(pbl_pipeline.video, "probe", odd)
+    stand_in(probe=odd)
     register(chain.small_video(tmp_path, "walk"))
     run = populate(["VideoInfo"])
     assert not errors(run)
@@ -486,7 +486,7 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(select_tracking: Callab
 
 
 def test_a_decision_is_carried_to_a_tracking_that_comes_later(
-    select_tracking: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    select_tracking: Callable[..., None], tmp_path: Path, stand_in: chain.StandIn
 ):
     """The other method numbers the people the other way round; then it does not find the one who was chosen."""
     (number,) = register(chain.small_video(tmp_path, "walk"))
@@ -504,7 +504,7 @@ def test_a_decision_is_carried_to_a_tracking_that_comes_later(
     for hits, (name, persons) in enumerate(later.items(), 4):
         select_tracking(name, min_hits=hits)
         now = dataclasses.replace(found, persons=persons)
-        monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *a, _now=now, **k: _now)
+        stand_in(track_people=lambda *a, _now=now, **k: _now)
         assert not errors(populate(["Tracking", "SubjectChoice"]))
     rows = {r["tracking_method"]: r for r in tracking.SubjectChoice.to_dicts()}
     assert (rows["turned-v1"]["choice_status"], rows["turned-v1"]["chosen_person_id"]) == ("CHOSEN", 1)
@@ -543,7 +543,7 @@ def test_a_decision_given_with_the_video_is_checked_when_the_people_are_known(ta
 
 
 def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, stand_in: chain.StandIn
 ):
     def half_seen(video_path, tracking, person_id, camera, params=None):
         found = chain.detect_keypoints(video_path, tracking, person_id, camera)
@@ -551,7 +551,7 @@ def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(
             return found
         return dataclasses.replace(found, confidence=np.zeros_like(found.confidence))
 
-    monkeypatch.setattr(pbl_pipeline.keypoints, "detect_keypoints", half_seen)
+    stand_in(detect_keypoints=half_seen)
     _, good = register(chain.small_video(tmp_path, "cut"), chain.small_video(tmp_path, "whole"))
     run = populate()
     assert errors(run) == {"TrialInput": {"FIT_INPUT": 1}}
@@ -639,7 +639,7 @@ def test_a_missing_or_changed_file_is_an_error_until_it_is_back(tables: None, tm
 
 
 def test_an_error_row_keeps_code_and_next_step_however_long_the_text(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, stand_in: chain.StandIn
 ):
     def fails(path):
         raise PblError(
@@ -647,19 +647,19 @@ def test_an_error_row_keeps_code_and_next_step_however_long_the_text(
         )
 
     register(chain.small_video(tmp_path, "walk"))
-    monkeypatch.setattr(pbl_pipeline.video, "probe", fails)
+    stand_in(probe=fails)
     assert errors(populate()) == {"VideoInfo": {"VIDEO_DAMAGED": 1}}
     (row,) = pipeline_status().errors
     assert row.next_step.startswith("do nnn")
     assert "f" * 9000 in row.stack
 
 
-def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, stand_in: chain.StandIn):
     def fails(path):
         raise ZeroDivisionError("somewhere deep")
 
     register(chain.small_video(tmp_path, "walk"))
-    monkeypatch.setattr(pbl_pipeline.video, "probe", fails)
+    stand_in(probe=fails)
     assert errors(populate()) == {"VideoInfo": {"INTERNAL": 1}}
     (row,) = pipeline_status().errors
     assert "ZeroDivisionError: somewhere deep" in row.found

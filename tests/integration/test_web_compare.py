@@ -244,6 +244,7 @@ def test_measures_with_an_error_have_a_probability_in_page_json_and_list(visits:
         assert listed.loc["cadence_steps_per_min", "least"] == 0.5
         assert listed.loc["stance_percent", "not_comparable"] == "error"
         assert registered.changes({"subject": "P002"}).empty  # one visit
+        assert registered.changes(True, 2).equals(registered.changes().head(2))
     finally:
         for key in keys:
             gdi.SessionGdi.Measure.update1({**key, **dict.fromkeys(known)})

@@ -5,20 +5,19 @@ from typing import Any
 
 import pytest
 
-import pbl_pipeline.tracking
 from pbl_schemas import reading, tracking
 from pbl_schemas.review import Decision
 from pbl_workers.populate import populate
 from tests.integration import web
-from tests.integration.chain import small_video
+from tests.integration.chain import StandIn, small_video
 from tests.integration.test_visit_contract import track_people
 from tests.rows import register
 
 
 @pytest.fixture
-def seen(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def seen(tables: None, stand_in: StandIn) -> None:
     """The people of the stand-in within the picture: it sees them in one of 1920 x 1080 px."""
-    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", track_people)
+    stand_in(track_people=track_people)
 
 
 @pytest.fixture

@@ -1,6 +1,9 @@
 """Entering in the review page: the role of a visit and clinical scores, from the click to the row."""
 
+import datetime
 import re
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -93,6 +96,30 @@ def test_a_role_that_does_not_fit_the_days_is_refused(two_visits: None):
     answer = send(web.client(), 1, role="6_weeks")
     assert answer.status_code == 200
     assert "roles in the order of their dates" in answer.text
+
+
+@pytest.fixture
+def tokyo(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The clock of a machine in Tokyo; what it shows now, to the hour."""
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    yield f"{datetime.datetime.now():%Y-%m-%d %H:}"
+    monkeypatch.undo()
+    time.tzset()
+
+
+def test_times_are_those_of_the_clock_of_the_machine(two_visits: None, tokyo: str):
+    browser, seen = web.client(role="reviewer,operator", name="A. First"), scores_form(1).seen
+    assert send(browser, 1, seen, mJOA="14").status_code == 303
+    for language in ("en", "de"):
+        browser.headers["accept-language"] = language
+        for page in (
+            send(browser, 1, seen, mJOA="15").text,
+            browser.get("/operate").text,
+            browser.get("/visits/1").text,
+        ):
+            assert tokyo in page
+            assert "UTC" not in page
 
 
 def test_the_second_of_two_sees_what_the_first_entered(two_visits: None):

@@ -5,8 +5,6 @@ from typing import Any
 
 import pytest
 
-import pbl_pipeline.fit
-import pbl_pipeline.keypoints
 from pbl_pipeline.errors import PblError
 from pbl_schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
 from pbl_schemas.decisions import not_usable, review_decisions
@@ -21,7 +19,7 @@ from pbl_schemas.studies import slices
 from pbl_workers.populate import populate
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
-from tests.integration.chain import computed_once, small_video
+from tests.integration.chain import StandIn, computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 
 
@@ -212,9 +210,8 @@ def test_the_command(visit: tuple[int, int]):
         review_decisions.take_back(99)
 
 
-def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pbl_pipeline.keypoints, "detect_keypoints", test_rigs.detect_keypoints)
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", test_rigs.fit_none)
+def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path, stand_in: StandIn):
+    stand_in(detect_keypoints=test_rigs.detect_keypoints, fit_session=test_rigs.fit_none)
     toml = test_rigs.calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
         made = intake.register(
@@ -233,8 +230,8 @@ def test_all_cameras_of_a_trial_are_marked_together(tables: None, tmp_path: Path
     assert (state(), current()) == ("computed", [[1, 2, 3, 4, 5, 6]])
 
 
-def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_session", lambda *given, **_: test_rigs.fit_none(*given))
+def test_marker_recordings_are_marked_too(tables: None, tmp_path: Path, stand_in: StandIn):
+    stand_in(fit_session=lambda *given, **_: test_rigs.fit_none(*given))
     number = register(small_video(tmp_path, "walk"), session_label="2026-01-10")[0]
     paths = [test_markers.recording(tmp_path / f"{name}.npz", s) for name, s in (("m1", 7.0), ("m2", 8.0))]
     made = intake.register([LaboratoryMarkers(p, VisitRecord("P001", "2026-01-10")) for p in paths])

@@ -69,14 +69,14 @@ def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: N
     assert set(qc.SessionQc.Check.to_arrays("qc_stage")) >= {"keypoints", "fit", "gait", "gdi"}
 
 
-def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch):
+def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch, stand_in):
     batches = []
 
     def fit_sessions(sessions, paramset=None, **_):
         batches.append(len(sessions))
         return [chain.fit_session(s.trials, s.names, paramset, s.camera_motion) for s in sessions]
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fit_sessions)
+    stand_in(fit_sessions=fit_sessions)
     for i in range(5):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
     monkeypatch.setattr("pbl_workers.loop.REFRESH_EVERY_S", 1e9)
@@ -88,11 +88,11 @@ def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkey
     assert jobs_left() == {}
 
 
-def test_a_batch_that_fails_is_computed_one_by_one(tables: None, tmp_path: Path, monkeypatch):
+def test_a_batch_that_fails_is_computed_one_by_one(tables: None, tmp_path: Path, stand_in):
     def fails(*_, **__):
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr(pbl_pipeline.fit, "fit_sessions", fails)
+    stand_in(fit_sessions=fails)
     for i in range(2):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
     assert work(batch=2).failed == 0
@@ -170,6 +170,24 @@ def test_claims_are_by_priority_and_never_shared(tables: None, tmp_path: Path):
     for job in first + second:
         queue.put_back(job)
     assert jobs_left() == {"VideoInfo": {"pending": 6}}
+
+
+def test_a_more_urgent_job_waits_no_longer_than_candidates_are_kept(tables: None, tmp_path: Path):
+    ids = {*register(*videos(tmp_path, *(f"walk{i}" for i in range(6))))}
+    refresh.refresh()
+    for look in (lambda: queue.most_urgent(video.VideoInfo), lambda: time.sleep(queue.KEPT_S)):
+        ids -= {job.key["video_id"] for job in queue.claim(video.VideoInfo)}
+        urgent = ids.pop()
+        video.VideoInfo.jobs.update1({"video_id": urgent, "priority": registry.FIRST})
+        look()
+        assert [job.key["video_id"] for job in queue.claim(video.VideoInfo)] == [urgent]
+    # Others took what was read: the rest of the queue is still found.
+    queue.most_urgent(video.VideoInfo)
+    video.VideoInfo.jobs.delete_quick()
+    assert queue.fill(video.VideoInfo) == 6
+    for one in ids:
+        video.VideoInfo.jobs.reserve({"video_id": one})
+    assert len(queue.claim(video.VideoInfo, 6)) == 6 - len(ids)
 
 
 @pytest.mark.parametrize("priority", [registry.NEW, registry.FIRST])
@@ -293,7 +311,7 @@ def test_one_process_takes_recordings_of_phones_alone_and_the_others_leave_them_
 
 @pytest.mark.parametrize("when", ["while it is computed", "before its insert", "after its insert"])
 def test_the_result_survives_a_database_that_goes_away(
-    tables: None, tmp_path: Path, monkeypatch, database: Path, when: str
+    tables: None, tmp_path: Path, monkeypatch, stand_in, database: Path, when: str
 ):
     job = first_job(tmp_path)
     real, insert, computed, inserted, ends = pbl_pipeline.video.probe, video.VideoInfo.make_insert, [], [], [when]
@@ -316,7 +334,7 @@ def test_the_result_survives_a_database_that_goes_away(
         insert(self, *args)
         reached("after its insert")
 
-    monkeypatch.setattr(pbl_pipeline.video, "probe", probe)
+    stand_in(probe=probe)
     monkeypatch.setattr(video.VideoInfo, "make_insert", make_insert)
     monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.2)
     outcome = run_job.run(job)
@@ -351,15 +369,13 @@ def test_a_result_of_other_inputs_is_not_used(tables: None, tmp_path: Path):
 
 # ----------------------------------------------------------------------------------------------- processes that go away
 @pytest.mark.parametrize("table", [tracking.SubjectChoice, fit.SessionFit])
-def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(tables, tmp_path: Path, monkeypatch, table):
+def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(
+    tables, tmp_path: Path, monkeypatch, stand_in, table
+):
     """The job in hand and those that were taken with it, one after the other or in batches."""
     for i in range(3):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
-    monkeypatch.setattr(
-        pbl_pipeline.fit,
-        "fit_sessions",
-        lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions],
-    )
+    stand_in(fit_sessions=lambda sessions, *_, **__: [chain.fit_session(s.trials, s.names) for s in sessions])
     work(*(t for t in pbl_schemas.computed_tables() if t is not table))
     refresh.refresh()
 

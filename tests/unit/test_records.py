@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import column, declared, definition, from_row, stored, to_row
+from pbl_pipeline.records import column, declared, definition, from_row, record, stored, to_row
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvent, GaitEvents
 from pbl_pipeline.results.measures import Measure
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Part:
     size_m: float | None = column("{}_size", "(m) of {}", default=None)
     why: str = column("{}_why", "reason", "varchar(5)", empty=True, default="")
 
 
-@dataclasses.dataclass(frozen=True)
+@record
 class Whole:
     number: int = column("{}_no", type="int16", key=True)
     mean: float = column("{}_mean", null=True)

@@ -34,7 +34,7 @@ _SPREAD = 4
 #: Longest wait of a job that was put back (s).
 LONGEST_WAIT_S = 60.0
 #: Time for which candidates are tried without reading again (s): a more urgent job waits no longer.
-_KEPT_S = 0.1
+KEPT_S = 0.1
 #: Candidates that were read and not tried, of each table and condition, with the time when (s).
 _read: dict[tuple[Any, str | None], tuple[float, list[dict[str, Any]]]] = {}
 #: Jobs that this process holds: table and hash of the key.
@@ -154,7 +154,7 @@ def _ready(table: Any, n: int, where: str | None) -> list[dict[str, Any]]:
 def _candidates(table: Any, n: int, where: str | None) -> Iterator[dict[str, Any]]:
     """Yield candidates for n jobs in the order in which they are tried: those that were just read, then the queue's."""
     at, rows = _read.get((table, where), (-math.inf, []))
-    if time.monotonic() - at < _KEPT_S:
+    if time.monotonic() - at < KEPT_S:
         yield from _drawn(rows)
     yield from _drawn(_ready(table, n, where))
 

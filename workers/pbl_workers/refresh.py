@@ -111,7 +111,10 @@ def recent() -> Scope | None:
     """Recordings that something from outside may have happened to lately, and their sessions: registered, or decided
     about by a person, in the last `RECENT_DAYS`; None if they are many, as of an archive that was just registered."""
     since = f">= CURRENT_TIMESTAMP - INTERVAL {RECENT_DAYS} DAY"
-    ids = {int(v) for v in (video.Video & f"video_created {since}").to_arrays("video_id", limit=FEW + 1)}
+    new = video.Video & f"video_created {since}"
+    if len(new) > FEW:
+        return None
+    ids = {int(v) for v in new.to_arrays("video_id")}
     ids |= {int(v) for v in (tracking.SubjectOverride & f"override_created {since}").to_arrays("video_id")}
     decided = review.Decision & f"decision_at {since}" & "video_id is not null"
     ids |= {int(v) for v in decided.to_arrays("video_id")}

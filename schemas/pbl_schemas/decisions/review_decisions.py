@@ -15,7 +15,7 @@ from .. import fit, gait, qc, session, tracking, video
 from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
 from ..review import Decision, Viewing
-from ..rows import delete_below, utc_now
+from ..rows import delete_below, moment, utc_now
 from ..transactions import in_transaction, next_id, repeated
 from . import not_usable
 from .candidates import selection_of
@@ -320,7 +320,7 @@ def meanwhile(video_id: int, what: str) -> PblError:
     after = {} if last is None else last["decision_after"]
     said = ", ".join(f"{k} {v}" for k, v in after.items() if not isinstance(v, list))
     who = (
-        f"{last['decision_by']} decided for {said} at {last['decision_at']} UTC"
+        f"{last['decision_by']} decided for {said} at {moment(last['decision_at'])}"
         if last
         else "what is decided about was made or computed anew"
     )

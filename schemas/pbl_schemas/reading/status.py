@@ -429,8 +429,10 @@ def _names(videos: Iterable[int]) -> dict[Any, str]:
 def _waiting(most: int) -> list[Waiting]:
     found = (tracking.SubjectChoice & {"choice_status": "NEEDS_CHOICE"}) * video.Video.proj("video_name")
     rows = (found - video.NotUsable).to_dicts(order_by="video_id", limit=most)
+    numbers = [int(row["video_id"]) for row in rows]
+    several = tracking.with_several_methods(numbers)
     seen: dict[tuple[int, str], list[int]] = {}
-    for one in rows_inside(tracking.Tracking.Person.proj(), "video_id", (int(row["video_id"]) for row in rows)):
+    for one in rows_inside(tracking.Tracking.Person.proj(), "video_id", numbers):
         seen.setdefault((int(one["video_id"]), one["tracking_method"]), []).append(int(one["person_id"]))
     out = []
     for row in rows:
@@ -442,7 +444,7 @@ def _waiting(most: int) -> list[Waiting]:
                 about=row["video_name"],
                 reason=row["choice_reason"],
                 persons=persons,
-                next_step=tracking.choose_command(key, "|".join(map(str, persons))),
+                next_step=tracking.choose_command(key, "|".join(map(str, persons)), several),
                 look=f"pbl choose {row['video_id']} --sheet persons_{row['video_id']}.jpg",
             )
         )

@@ -20,6 +20,7 @@ from .. import lab, session, study, video
 from ..decisions.review_decisions import decisions, record
 from ..intake.records import set_condition, set_height, set_mass, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
+from ..rows import moment
 from ..subject_codes import check_subject, day_of, iso_label
 from ..transactions import in_transaction
 from .study_sheets import CLEAR, CODED, COLUMNS, SCORE_COLUMNS, check_role, import_rows
@@ -234,7 +235,7 @@ def _locked(read: Callable[[int], Form], session_id: int, given: Collection[str]
     who = "it was imported"
     if (last := next((d for d in decisions(session_id) if d.what in kinds), None)) is not None:
         did = f"entered {last.about.get('instrument', 'the role')}" if now.instruments else f"changed the {last.what}"
-        who = f"{last.by} {did} at {last.at} UTC"
+        who = f"{last.by} {did} at {moment(last.at)}"
     raise PblError(
         "DECIDED_MEANWHILE",
         found=f"since this form was loaded something else is stored: {who}",

@@ -46,7 +46,7 @@ async def show(request: Request) -> Response:
         **shown,
         n_errors=sum(t.error for t in state.tables),
         retried=whole_number(request.query_params.get("retried", "")),
-        now=f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S}",
+        now=datetime.datetime.now(datetime.UTC),
         span=span,
         key_text=lambda key: json.dumps(key, default=str),
     )

@@ -25,6 +25,7 @@ from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
 from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
 from pbl_schemas.intake.sheets import with_point
 from pbl_schemas.reading.shown import ShownVisit
+from pbl_schemas.rows import moment
 from pbl_schemas.session import UNLABELLED
 
 from . import site
@@ -203,13 +204,6 @@ def norm_people(norm: str) -> int | None:
 def visit_name(language: str, label: str) -> str:
     """Return the label of a visit; of one that got none, the words for that in a language."""
     return texts.text(language, "visits.unlabelled") if label == UNLABELLED else label
-
-
-def moment(at: datetime.datetime | str) -> str:
-    """Return a moment (UTC if it has no zone) as the clock of this machine shows it, to the minute."""
-    at = datetime.datetime.fromisoformat(at) if isinstance(at, str) else at
-    zoned = at if at.tzinfo else at.replace(tzinfo=datetime.UTC)
-    return f"{zoned.astimezone():%Y-%m-%d %H:%M}"
 
 
 def in_field(language: str, number: str) -> str:
