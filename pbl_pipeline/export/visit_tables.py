@@ -308,7 +308,8 @@ def _measures_wide(parts: Sequence[_Part]) -> Table:
     columns = _scope([(scope, trial) for scope, trial, *_ in parts])
     for measure, statistic in wanted:
         values = _floats(row.get((measure, statistic), np.nan) for row in rows)
-        text = (_STATISTICS | meanings(Gdi)).get(statistic, statistic.replace("_", " "))
+        own = meanings(Gdi) if measure == "gdi" else {}
+        text = (_STATISTICS | own).get(statistic, statistic.replace("_", " "))
         columns.append(Column(f"{measure}_{statistic}", values, _unit(measure, statistic), text))
     return Table("measures_wide", tuple(columns))
 

@@ -147,7 +147,7 @@ class GaussNewtonParams:
     weight_pelvis: float = later(0.0)
     pelvis_sd_deg: float = later(6.0)
     #: Median residual of a point (px of the cost; cm) at which it counts as `weight_2d` and `weight_3d` say: others
-    #: more or less, by the residuals of a first solution (`measured_weights.py`). 0: all alike.
+    #: more or less, by the residuals of a first solution to one camera (`measured_weights.py`). 0: all alike.
     points_px: float = later(0.0)
     points_cm: float = later(0.0)
     #: Wearable sensors (`imu_term.py`): half squares in standard deviations, as many keypoint residuals' as they are.

@@ -120,7 +120,8 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
 
     Raises `PblError` where the augmenter is needed and not available.
     """
-    measured = params.points_px > 0 or params.points_cm > 0
+    one_camera = session.problem.c_2d.shape[1] == 1  # of several, residuals are also of their calibration
+    measured = one_camera and (params.points_px > 0 or params.points_cm > 0)
     refined = params.weight_floor > 0 or params.weight_slide > 0 or params.weight_pelvis > 0
     twice = measured or refined or session.worn is not None
     p = session.problem

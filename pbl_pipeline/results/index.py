@@ -104,7 +104,12 @@ class Gdi:
     cycles: tuple[GdiCycle, ...]
     qc: tuple[Check, ...]
     profile: MovementProfile | None = None
-    sd: float | None = column("{}_sd", "(-) standard deviation of the error of {}", default=None)
+    sd: float | None = column(
+        "{}_sd",
+        "(-) standard deviation of the error of {}",
+        meaning="standard deviation of the error of mean",
+        default=None,
+    )
     minimal_change: float | None = column(
         "{}_minimal_change", "(-) minimal detectable change (90 percent) between two such visits", default=None
     )

@@ -642,6 +642,9 @@ def test_parquet_has_the_numbers_of_the_csv_with_units_and_origin(out):
 
 def test_the_dictionary_explains_every_column(out):
     rows = list(csv.DictReader((out / "data_dictionary.csv").open(newline="")))
+    texts = {r["column"]: r["meaning"] for r in rows if r["table"] == "measures_wide"}
+    assert "error" in texts["gdi_sd"]
+    assert "over both sides" in texts["stride_time_s_sd"]
     listed = {(r["table"], r["column"]) for r in rows}
     there = {
         (path.stem, name)
