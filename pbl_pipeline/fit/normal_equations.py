@@ -127,8 +127,8 @@ class _Columns(NamedTuple):
 def _columns_of(state: State, moving: bool) -> _Columns:
     sizes = [sum(a.size for a in jax.tree.leaves(part)) for part in _shared_parts(state, moving)]
     ends = np.cumsum(sizes).tolist()
-    slices = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    return _Columns(*slices, state.qpos.shape[1] + 3 * moving, ends[-1])
+    s, offset, clock, floor, detector, wearing = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return _Columns(s, offset, clock, floor, detector, wearing, state.qpos.shape[1] + 3 * moving, ends[-1])
 
 
 def _shared_parts(state: State, moving: bool) -> tuple[Any, ...]:

@@ -116,7 +116,8 @@ def with_wearables(
     }
     index: Any = np.asarray([body.body_names.index(BODY_OF[s.log.segment]) for s in sensors], np.int32)
     zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
-    wearables = Wearables(index, **{k: np.asarray(v, np.float32) for k, v in values.items()})
+    packed: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in values.items()}
+    wearables = Wearables(index, **packed)
     longest = max(range(len(seen)), key=lambda i: len(seen[i].time))
     moves_with = better_pairing(seen[longest], clocks[longest], sensors)
     return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
@@ -133,7 +134,7 @@ def _moved(body: Body, session: Session, i: int, state: State) -> Moved:
     arrays, at = session.arrays[i], session.frames(i)
     first, last = np.flatnonzero(arrays.used)[[0, -1]]
     qpos = np.asarray(state.qpos, float)[at][first : last + 1]
-    frames = body_frames(body, qpos, np.asarray(scale_multipliers(np.asarray(state.s, float))))
+    frames = body_frames(body, qpos, np.asarray(scale_multipliers(state.s), float))
     index = {k: body.body_names.index(name) for k, name in BODY_OF.items()}
     return moved(
         arrays.time_s[first : last + 1],

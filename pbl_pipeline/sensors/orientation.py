@@ -69,7 +69,8 @@ def oriented(log: SensorLog) -> Orientation:
     inertial = log.rate is not None and log.acceleration is not None
     if not inertial and log.orientation is None:
         raise _log_error(log, "neither rate and acceleration nor orientation", "one of these")
-    values: Any = np.hstack([log.rate, log.acceleration]) if inertial else log.orientation
+    columns: Any = [log.rate, log.acceleration] if inertial else [log.orientation]
+    values = np.hstack(columns)
     known = np.isfinite(values).all(axis=1)
     time, values = log.time[known], values[known]
     cuts = np.flatnonzero(np.diff(time) > BRIDGED_S + _interval(time)) + 1

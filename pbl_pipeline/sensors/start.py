@@ -105,7 +105,7 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
         shift = 0.5 * (a - c) / (a - 2 * b + c)
     else:
         shift = 0.0
-    return low + SAMPLE_S * (lags[at] + shift), float(score[best])
+    return float(low + SAMPLE_S * (lags[at] + shift)), float(score[best])
 
 
 def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def _correlation(long: np.ndarray, short: np.ndarray) -> np.ndarray:
 def _turned_sum(a: np.ndarray, b: np.ndarray) -> float:
     """Largest sum of products of vectors (T, 3) with others under one rotation, of rates whose spread is the same."""
     values, sign = np.linalg.svd(a.T @ b)[1], np.sign(np.linalg.det(a.T @ b))
-    return float(values[0] + values[1] + sign * values[2]) / (np.linalg.norm(b) + 1e-9) * np.linalg.norm(a)
+    return float((values[0] + values[1] + sign * values[2]) / (np.linalg.norm(b) + 1e-9) * np.linalg.norm(a))
 
 
 def wahba(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

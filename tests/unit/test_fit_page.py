@@ -17,7 +17,8 @@ pytestmark = pytest.mark.slow
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs/fit.md").read_text()
 #: Parameters that become arrays before a term sees them.
-OF_ARRAYS = {"pose_prior_deg", "pose_prior", "scale_sd", "scale_sides_sd"}
+OF_SMOOTHNESS = {"smooth_per_rad2", "smooth_per_m2", "smooth_up_per_m2"}
+OF_ARRAYS = {"pose_prior_deg", "pose_prior", "scale_sd", "scale_sides_sd", *OF_SMOOTHNESS}
 
 
 def rows() -> list[list[str]]:
