@@ -87,7 +87,7 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
 
     def each(values: Sequence[np.ndarray], most: float) -> tuple[float, str]:
         """The largest value, and the sensors whose value is above the most."""
-        worst = [float(np.max(np.where(np.isnan(v), np.inf, v))) for v in values]
+        worst = [float(np.nanmax(v)) if np.isfinite(v).any() else np.inf for v in values]
         return max(worst), ", ".join(s.segment for s, w in zip(sensors, worst, strict=True) if w > most)
 
     z, loose = each([s.z for s in sensors], SENSOR_Z_WARN)

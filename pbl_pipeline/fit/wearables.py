@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
-from pbl_pipeline.errors import said
+from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.sensors.orientation import Orientation, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
@@ -64,12 +64,12 @@ def with_wearables(
 ) -> tuple[Problem, State, tuple[str, ...]]:
     """Add sensors to a problem, with their start by a solution without them; and the segments they move with.
 
-    Raises `PblError` FIT_INPUT: a log does not reach a trial.
+    A trial that the logs do not reach is fitted without. Raises `PblError` FIT_INPUT: they reach none.
     """
     assert session.worn is not None
     sensors, body = session.worn.sensors, session.body
     seen = [_moved(body, session, i, start) for i in range(len(session.arrays))]
-    clocks = [_clock(session, i, s) for i, s in enumerate(seen)]
+    clocks = _clocks(session, seen)
     mounts = [wahba(_all_vectors(seen, clocks, sensor)) for sensor in sensors]
     m, frames, n = len(sensors), len(p.weight), len(p.has_phone)
     longest = max(a.time_s[-1] - a.time_s[0] for a in session.arrays)
@@ -118,7 +118,7 @@ def with_wearables(
     zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
     packed: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in values.items()}
     wearables = Wearables(index, **packed)
-    longest = max(range(len(seen)), key=lambda i: len(seen[i].time))
+    longest = max(range(len(seen)), key=lambda i: count[session.frames(i)].sum())
     moves_with = better_pairing(seen[longest], clocks[longest], sensors)
     return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
 
@@ -143,6 +143,20 @@ def _moved(body: Body, session: Session, i: int, state: State) -> Moved:
     )
 
 
+def _clocks(session: Session, seen: Sequence[Moved]) -> list[float]:
+    """Times of the logs at the trials' time 0; after their end for a trial that they do not reach."""
+    assert session.worn is not None
+    clocks, errors = [max(s.span[1] for s in session.worn.sensors) + 1e3] * len(seen), []
+    for i, s in enumerate(seen):
+        try:
+            clocks[i] = _clock(session, i, s)
+        except PblError as error:
+            errors.append(error)
+    if len(errors) == len(seen):
+        raise errors[0]
+    return clocks
+
+
 def _clock(session: Session, i: int, seen: Moved) -> float:
     assert session.worn is not None
     try:
@@ -163,7 +177,8 @@ def _clock(session: Session, i: int, seen: Moved) -> float:
 def _all_vectors(
     seen: Sequence[Moved], clocks: Sequence[float], sensor: Orientation
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    return [pair for s, c in zip(seen, clocks, strict=True) for pair in vectors(s, c, sensor, sensor.log.segment)]
+    reached = [(s, c) for s, c in zip(seen, clocks, strict=True) if sensor.at(s.time + c)[1].any()]
+    return [pair for s, c in reached for pair in vectors(s, c, sensor, sensor.log.segment)]
 
 
 def _heading(seen: Moved, clock: float, sensor: Orientation, mount: np.ndarray) -> np.ndarray:
@@ -228,7 +243,7 @@ def sensor_fits(
                 bias_rad_s=state.bias[j],
                 heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),
                 tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1, 1)),
-                clock_s=worn.clock_s[: len(trials)] + state.clock[: len(trials), 0],
+                clock_s=np.where(each[:, 1] < 1, worn.clock_s[: len(trials)] + state.clock[: len(trials), 0], np.nan),
                 gain=state.clock[: len(trials), 1] / MINUTE_S,
                 z=each[:, 0],
                 dropped=each[:, 1],

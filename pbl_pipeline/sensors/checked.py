@@ -276,21 +276,25 @@ def _unclipped(
     return np.where(clipped[:, None], np.nan, values)
 
 
-def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> None:
-    """Raise `PblError` SENSOR_LOG where a log that counts in UTC is of another day than a video.
+def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> list[str]:
+    """Compare logs that count in UTC with the days of videos; returns a note on each video of another day, whose clock
+    is wrong where another video agrees. Raises `PblError` SENSOR_LOG where none does.
 
     recorded: time of recording of each video as its file states it (`VideoInfo.recorded_utc`), by its name.
     """
+    in_utc = [(log.name, log.started_utc + log.time[[0, -1]]) for log in logs if log.started_utc is not None]
+    days = {}
     for name, utc in recorded.items():
-        moment = None if utc is None else datetime.datetime.fromisoformat(utc).timestamp()
-        for log in logs:
-            if log.started_utc is None or moment is None:
-                continue
-            first, last = log.started_utc + log.time[0], log.started_utc + log.time[-1]
-            if (days := max(first - moment, moment - last) / _DAY_S) > 1:
-                raise log_error(
-                    said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=log.name, days=days),
-                    "the log of the same visit",
-                    next_step="name the log of this visit, or correct the clock of the recording",
-                    key=name,
-                )
+        if utc is not None and in_utc:
+            moment = datetime.datetime.fromisoformat(utc).timestamp()
+            days[name] = max((max(t[0] - moment, moment - t[1]) / _DAY_S, sensor) for sensor, t in in_utc)
+    wrong = {name: off for name, off in days.items() if off[0] > 1}
+    for name, (off, sensor) in wrong.items():
+        if len(wrong) == len(days):
+            raise log_error(
+                said("sensor {sensor}: its log lies {days:.1f} days from the video", sensor=sensor, days=off),
+                "the log of the same visit",
+                next_step="name the log of this visit, or correct the clock of the recording",
+                key=name,
+            )
+    return [f"{name} states a day {off:.1f} days from the log of the sensors" for name, (off, _) in wrong.items()]

@@ -44,6 +44,11 @@ class Given:
     rate_hz: float | None = None
     called: str | None = None
 
+    @property
+    def shown(self) -> Path:
+        """What an error names: the file of the person."""
+        return Path(self.called or self.file)
+
 
 def segment_of(name: str) -> str | None:
     """The segment that the name of a sensor says (`Right Ankle`, `tibia_r_imu`), None if none or several."""
@@ -141,16 +146,16 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
         raise log_error(
             said("sensors on different clocks: {clocks}", clocks=", ".join(sorted(clocks))),
             "sensors that were synchronised in one recording",
-            key=found[0][2].file,
+            key=found[0][2].shown,
         )
     begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
-    logs = tuple(checked(x, segment, w.file, begin) for segment, x, w in found)
+    logs = tuple(checked(x, segment, w.shown, begin) for segment, x, w in found)
     first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
     if logs and last - first < _OVERLAP * min(x.time[-1] - x.time[0] for x in logs):
         raise log_error(
             said("logs that have {s:.3g} s in common", s=max(last - first, 0.0)),
             "sensors of one recording",
-            key=found[0][2].file,
+            key=found[0][2].shown,
         )
     return logs
 
@@ -189,9 +194,9 @@ def _chosen(given: Given, samples: Sequence[Samples]) -> list[tuple[str, Samples
         names = ", ".join(x.name for x in samples)
         raise PblError(
             "USAGE",
-            found=said("sensors {names} in {file}", names=names[:200], file=given.file.name),
+            found=said("sensors {names} in {file}", names=names[:200], file=given.shown.name),
             expected=said("which of them is on {segment}", segment=given.segment or "which segment"),
             next_step="name it: --imu shank_r=FILE#SENSOR, or --imu shank_r=FILE where the file has one sensor",
-            key=given.file,
+            key=given.shown,
         )
     return pairs

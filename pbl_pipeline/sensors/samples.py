@@ -61,7 +61,7 @@ class LogFile:
 
     def refuse(self, found: str, expected: str) -> PblError:
         """The error SENSOR_LOG about this file."""
-        return log_error(found, expected, key=self.path)
+        return log_error(found, expected, key=self.called or self.path)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ def opened(path: Path, rate_hz: float | None = None, called: str | None = None) 
         try:
             return LogFile(path, bounded.read_text(path, MAX_LOG), rate_hz, called)
         except ValueError as error:
-            raise log_error(f"no text to read ({error})", "a log as docs/imu.md says", key=path) from error
+            raise log_error(f"no text to read ({error})", "a log as docs/imu.md says", key=called or path) from error
 
 
 def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] = ()) -> pd.DataFrame:

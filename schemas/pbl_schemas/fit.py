@@ -49,11 +49,12 @@ from .method_rows import method_row
 from .origin import Origin, computes, origin_columns
 from .plan import plan_fit_sets
 from .record_parts import part_of
-from .rows import InputChanged, MadeOnce, inside, one
+from .rows import InputChanged, MadeOnce, delete_below, inside, one
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
     from pbl_pipeline import fit as lib
+    from pbl_pipeline.sensors import SensorLog
 
 
 @schema
@@ -123,7 +124,9 @@ class SessionFit(dj.Computed):
         table = None
         if of_markers and of_markers[0]["marker_table_file"] is not None:  # the laboratory's own set, one for a session
             table = (of_markers[0]["recording_marker_set"], file_ref(of_markers[0]["marker_table_file"]))
-        worn = _worn(key, {int(t[0]): t[1] for t in trials}) if rows else None
+        worn = None
+        if rows and (now := _sensors_now(key)):
+            worn = (*_worn(int(one(FitSet & key, "session_id")), {int(t[0]): t[1] for t in trials}), now)
         return trials, table, height_m, worn, method_row(FitMethod, key)
 
     @computes
@@ -135,7 +138,7 @@ class SessionFit(dj.Computed):
         height_m: float | None,
         worn: tuple | None,
         method: Mapping[str, Any],
-    ) -> tuple[lib.SessionFit, list[int], str]:
+    ) -> tuple[lib.SessionFit, list[int], str, tuple]:
         from pbl_pipeline.fit import fit_session
 
         session_input = self._loaded(trials, table, height_m, worn)
@@ -149,11 +152,11 @@ class SessionFit(dj.Computed):
             camera_motion=session_input.camera_motion,
             **{k: v for k, v in stated.items() if v is not None},
         )
-        return result, [t[0] for t in trials], method["sha"]
+        return result, [t[0] for t in trials], method["sha"], worn[2] if worn else ()
 
     def make_computes(
         self, keys: Sequence[dict], fetched: Sequence[tuple], threads: int | None = None
-    ) -> list[tuple[lib.SessionFit, list[int], str, Origin] | None]:
+    ) -> list[tuple[lib.SessionFit, list[int], str, tuple, Origin] | None]:
         """Several sets in one call of the library: for each what `make_compute` returns, None if it would raise.
 
         A worker with a GPU fits a batch so, and hands each result to the table's own make. threads: as for
@@ -161,7 +164,7 @@ class SessionFit(dj.Computed):
         """
         from pbl_pipeline.fit import fit_sessions
 
-        out: list[tuple[lib.SessionFit, list[int], str, Origin] | None] = [None] * len(keys)
+        out: list[tuple[lib.SessionFit, list[int], str, tuple, Origin] | None] = [None] * len(keys)
         for sha in dict.fromkeys(method["sha"] for *_, method in fetched):
             rows = [i for i, (*_, method) in enumerate(fetched) if method["sha"] == sha]
             start = time.monotonic()
@@ -176,7 +179,8 @@ class SessionFit(dj.Computed):
             origin = Origin.now((time.monotonic() - start) / max(len(results), 1))
             for i, result in zip(places, results, strict=True):
                 if not isinstance(result, PblError):
-                    out[i] = (result, [t[0] for t in fetched[i][0]], sha, origin)
+                    worn = fetched[i][3]
+                    out[i] = (result, [t[0] for t in fetched[i][0]], sha, worn[2] if worn else (), origin)
         return out
 
     def _loaded(
@@ -186,7 +190,6 @@ class SessionFit(dj.Computed):
         the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
-        from pbl_pipeline.sensors import Given, check_day, read_given
 
         _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
         own, more = None, {}
@@ -196,24 +199,19 @@ class SessionFit(dj.Computed):
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
             if worn is not None:
-                files, recorded = worn
-                paths = [stack.enter_context(stored_file(ref)) for ref, *_ in files]
-                sensors = read_given(
-                    [
-                        Given(path, segment, sensor or None, rate, called)
-                        for path, (_, called, segments, rate) in zip(paths, files, strict=True)
-                        for segment, sensor in sorted(segments.items())
-                    ]
-                )
-                check_day(sensors, recorded)
-                more = {"sensors": sensors, "sensor_clock_s": [None] * len(trials)}
+                more = {"sensors": _read_worn(*worn[:2])[0], "sensor_clock_s": [None] * len(trials)}
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m, **more)
 
-    def make_insert(self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, origin: Origin) -> None:
+    def make_insert(
+        self, key: dict, result: lib.SessionFit, ids: list[int], sha: str, worn: tuple, origin: Origin
+    ) -> None:
         from pbl_pipeline.qc import worst
 
+        session_id = session_of_set(key)  # locked: no sensors are attached from here on
+        if _sensors_now(key, "LOCK IN SHARE MODE") != worn:
+            raise InputChanged("other wearable sensors than were fitted", key)
         body_sha = result.trials[0].body_sha256
         residual_2d = np.concatenate([t.residual_2d_px.ravel() for t in result.trials])
         residual_3d = np.concatenate([t.residual_3d_m.ravel() for t in result.trials])
@@ -227,7 +225,7 @@ class SessionFit(dj.Computed):
             self.insert1(
                 {
                     **key,
-                    "session_id": session_of_set(key),
+                    "session_id": session_id,
                     "body_model": one(BodyModel & {"body_sha256": body_sha}, "body_model"),
                     **to_row(result),
                     "fit_residual_2d": median(residual_2d),
@@ -273,17 +271,66 @@ def _people(sets: Any) -> Any:
     return sets.proj("session_id") * session.Session.proj("subject") * lab.Subject.proj("subject_height")
 
 
-def _worn(key: Mapping[str, Any], names: Mapping[int, str]) -> tuple | None:
-    """Logs of wearable sensors of a set's visit, (file, its name, segments, rate) of each, and the time of recording of
-    its trials by their names; None without sensors."""
-    of_visit = video.Video & (FitSet & {"fit_set": key["fit_set"]}).proj("session_id")
+def _sensors_now(key: Mapping[str, Any], lock: str = "") -> tuple:
+    """Bytes, segments and rates of the logs of wearable sensors that a set is fitted with; empty for markers. lock:
+    clause by which a transaction sees what others have committed."""
+    visit, kind = one(FitSet & {"fit_set": key["fit_set"]}, "session_id", "fit_set_kind")
+    if kind == MARKERS:
+        return ()
+    logs, videos = video.WearableImu.full_table_name, video.Video.full_table_name
+    # Plain SQL: a lock does not reach into the subqueries of DataJoint's joins.
+    return tuple(
+        video.WearableImu.connection.query(
+            f"SELECT imu_sha256, imu_segments, imu_rate FROM {logs} JOIN {videos} USING (video_id)"  # noqa: S608
+            f" WHERE session_id = %s AND imu_segments IS NOT NULL ORDER BY imu_sha256 {lock}",
+            args=(int(visit),),
+        ).fetchall()
+    )
+
+
+def _worn(session_id: int, names: Mapping[int, str]) -> tuple[list[tuple], dict[str, str | None]]:
+    """Logs of wearable sensors of a visit, (file, its name, segments, rate) of each, and the time of recording of
+    some of its videos by their names."""
+    of_visit = video.Video & {"session_id": session_id}
     rows = (video.WearableImu & of_visit.proj()).to_dicts(order_by=("video_id", "imu"))
     worn = [r for r in rows if r["imu_segments"]]
-    if not worn:
-        return None
     files = [(file_ref(r["imu_file"]), r["imu_name"], dict(r["imu_segments"]), number(r["imu_rate"])) for r in worn]
     recorded = (video.VideoInfo & inside("video_id", names)).proj("recorded_utc").to_dicts()
     return files, {names[int(r["video_id"])]: r["recorded_utc"] for r in recorded}
+
+
+def _read_worn(files: Sequence[tuple], recorded: Mapping[str, str | None]) -> tuple[tuple[SensorLog, ...], list[str]]:
+    """Read the logs of `_worn`; returns them, and notes on the videos' days. Raises `PblError` SENSOR_LOG, USAGE."""
+    from pbl_pipeline.sensors import Given, check_day, read_given
+
+    with ExitStack() as stack:
+        paths = [stack.enter_context(stored_file(ref)) for ref, *_ in files]
+        sensors = read_given(
+            [
+                Given(path, segment, sensor or None, rate, called)
+                for path, (_, called, segments, rate) in zip(paths, files, strict=True)
+                for segment, sensor in sorted(segments.items())
+            ]
+        )
+    return sensors, check_day(sensors, recorded)
+
+
+def check_sensors(session_id: int) -> list[str]:
+    """Read the logs of a visit's wearable sensors as its fit does; returns notes on videos of another day. Raises
+    `PblError` SENSOR_LOG, USAGE: the fit would fail."""
+    videos = (video.Video & {"session_id": session_id}) - video.NotUsable
+    return _read_worn(*_worn(session_id, {int(v): f"video_id {v}" for v in videos.to_arrays("video_id")}))[1]
+
+
+def delete_sensor_fits(session_id: int) -> dict[str, int]:
+    """Delete the fits of a visit that its wearable sensors are part of; returns the rows as `delete_below`."""
+    return delete_below(SessionFit, sensor_fits(session_id).keys())
+
+
+def sensor_fits(session_id: int) -> Any:
+    """Fits of a visit of which its wearable sensors are, or would be, a part."""
+    sets = FitSet & {"session_id": session_id} & f"fit_set_kind <> '{MARKERS}'"
+    return SessionFit & sets.proj()
 
 
 def load_trial(ref: Mapping[str, Any]) -> lib.TrialFit:

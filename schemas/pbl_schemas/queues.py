@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
+from typing import Any
 
+from . import video
 from .chain import computed_tables
+from .fit_sets import FitSet
 from .job_errors import error_code
 from .jobs import jobs_of
+from .rows import inside, rows_inside
 
 
 def declare() -> None:
@@ -23,12 +27,17 @@ def declare() -> None:
 
 
 def forget_errors(video_id: int, codes: Collection[str] | None = None) -> None:
-    """Delete the error rows of a video (with these codes), so that the next populate tries again. Not in a transaction:
-    it may declare job tables."""
+    """Delete the error rows of a video and of the sets of its visit (with these codes), so that the next populate tries
+    again. Not in a transaction: it may declare job tables."""
+    visit = int((video.Video & {"video_id": video_id}).fetch1("session_id"))
     for table in computed_tables():
-        if "video_id" not in table.primary_key:
-            continue
         jobs = jobs_of(table)
-        for row in (jobs.errors & {"video_id": video_id}).to_dicts():
+        own: Any = {"video_id": video_id} if "video_id" in jobs.primary_key else False
+        if "fit_set" in jobs.primary_key:
+            # Also of sets that were deleted: they are planned again under the same name.
+            names = {str(name) for name in jobs.errors.to_arrays("fit_set")}
+            others = rows_inside(FitSet & f"session_id <> {visit}", "fit_set", names)
+            own = inside("fit_set", names - {row["fit_set"] for row in others})
+        for row in (jobs.errors & own).to_dicts():
             if codes is None or error_code(row["error_message"]) in codes:
                 (jobs & {k: row[k] for k in jobs.primary_key}).delete_quick()

@@ -42,11 +42,14 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
 
 @repeated
 def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
-    """Run `work` in a transaction; again where another process inserted the same at that moment, unless `until` holds
-    then."""
+    """Run `work` in a transaction in which every query sees what others have committed; again where another process
+    inserted the same at that moment, unless `until` holds then."""
     for attempt in range(_ATTEMPTS):
         try:
-            with lab.schema.connection.transaction:  # type: ignore[union-attr]
+            connection: Any = lab.schema.connection
+            # For this transaction only: a snapshot would be from before a lock that `work` waits for.
+            connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
+            with connection.transaction:
                 return work()
         except DuplicateError:
             if until() or attempt == _ATTEMPTS - 1:

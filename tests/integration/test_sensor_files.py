@@ -1,15 +1,18 @@
 """Files that come with a video, in the tables: the phone's log reaches keypoints and fit, the others are kept."""
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.sensors import SensorLog
-from pbl_schemas import fit, keypoints, lab, load_visit, qc, video
+from pbl_schemas import connection, fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
+from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
 from tests import worn_sensor
@@ -189,6 +192,82 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: chain.StandI
     assert "were removed" in pbl("ingest", videos[0], "--subject", "P001", "--imu", "none").out
     assert len(video.WearableImu()) == 0
     assert fitted()[1:] == ({}, None)
+
+
+def with_sensors(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
+    return chain.fit_session(trials, names, paramset)
+
+
+def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: chain.StandIn):
+    def fails(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
+        if sensors:
+            raise PblError("FIT_INPUT", found="a log of another walk", expected="this one", next_step="leave it out")
+        return chain.fit_session(trials, names, paramset)
+
+    stand_in(fit_session=fails)
+    path, shank = chain.small_video(tmp_path, "a"), worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    assert pbl("ingest", path, "--subject", "P001", "--imu", f"shank_r={shank}").code == 0
+    for how in (f"shank_l={shank}", "none"):
+        assert errors(populate()) == {"SessionFit": {"FIT_INPUT": 1}}
+        assert pbl("ingest", path, "--subject", "P001", "--imu", how).code == 0
+    assert not errors(populate())
+    assert len(fit.SessionFit()) == 1
+
+
+def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
+    path = chain.small_video(tmp_path, "a")
+    swings = {name: Swing(phase=i) for i, name in enumerate(("Right Ankle", "Right Thigh", "Lumbar"))}
+    several = worn_sensor.apdm(swings, tmp_path / "apdm.csv")
+    (tmp_path / "list.csv").write_text("segment,file,rate_hz\npelvis,apdm.csv,128\n")
+    for how in (f"shank_r={several}", f"thigh_r={several}", tmp_path / "list.csv"):
+        told = pbl("ingest", path, "--subject", "P001", "--imu", how)
+        assert told.code == 0, told.err
+    (row,) = video.WearableImu.to_dicts()
+    assert row["imu_segments"] == {"shank_r": "Right Ankle", "thigh_r": "Right Thigh", "pelvis": "Lumbar"}
+    assert row["imu_rate"] == 128
+    # A sensor with another clock is refused here, not by the fit.
+    foot = worn_sensor.xsens(Swing(phase=4), tmp_path / "MT_1-000_00B42D4B.txt")
+    told = pbl("ingest", path, "--subject", "P001", "--imu", f"foot_r={foot}")
+    assert (told.code, told.error_code, "different clocks" in told.err) == (1, "SENSOR_LOG", True)
+    assert len(video.WearableImu()) == 1
+
+
+def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: chain.StandIn):
+    stand_in(fit_session=with_sensors)
+    path, shank = chain.small_video(tmp_path, "a"), worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    assert pbl("ingest", path, "--subject", "P001", "--imu", f"shank_r={shank}").code == 0
+    assert not errors(populate())
+    table = fit.SessionFit()
+    key = table.fetch1("KEY")
+    result = table.make_compute(key, *table.make_fetch(key))
+    table.delete(prompt=False, part_integrity="cascade")
+    with table.connection.transaction:
+        with closing(connection.plain_connection()) as other:
+            other.cursor().execute(f"DELETE FROM {video.WearableImu.full_table_name}")
+        assert len(video.WearableImu()) == 1  # as this transaction sees it until its end
+        with pytest.raises(InputChanged, match="other wearable sensors"):
+            table.make_insert(key, *result)
+    assert len(table) == 0
+    assert not errors(populate())
+    assert len(table) == 1
+
+
+def test_sensors_stay_at_their_visit_when_their_video_moves(tmp_path: Path, stand_in: chain.StandIn):
+    stand_in(fit_session=with_sensors)
+    videos = [chain.small_video(tmp_path, name) for name in ("a", "b", "c")]
+    shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    register(videos[2], subject="P002", session_label="1")
+    assert pbl("ingest", *videos[:2], "--subject", "P001", "--imu", f"shank_r={shank}").code == 0
+    first, second = (int((video.Video & {"video_name": v.name}).fetch1("video_id")) for v in videos[:2])
+    assert not errors(populate())
+    assert pbl("move", first, "--to", "P002/1", "--yes").code == 0
+    assert video.WearableImu.fetch1("video_id") == second
+    assert not errors(populate())
+    # The last video of the visit takes them along; what was fitted there without them is deleted.
+    assert "would be deleted: 3 rows of `pbl_fit`.`__session_fit`" in pbl("move", second, "--to", "P002/1").out
+    assert pbl("move", second, "--to", "P002/1", "--yes").code == 0
+    assert video.WearableImu.fetch1("video_id") == second
+    assert len(fit.SessionFit()) == 0
 
 
 def test_a_sensor_log_that_cannot_be_read_registers_nothing(tmp_path: Path):

@@ -152,7 +152,15 @@ def test_own_csv(tmp_path: Path):
     assert log.started_utc == pytest.approx(1772356530.0)
     check_day([log], {"walk": "2026-03-02T08:15:30Z", "other": None})
     with pytest.raises(PblError, match=r"3\.0 days from the video"):
-        check_day([log], {"walk": "2026-03-04T09:15:36Z"})
+        check_day([log], {"walk": "2026-03-04T09:15:36Z", "other": None})
+    # A wrong clock of one video does not hold up the others.
+    days = {"walk": "2026-03-04T09:15:36Z", "other": "2026-03-01T09:15:36Z"}
+    assert check_day([log], days) == ["walk states a day 3.0 days from the log of the sensors"]
+    stored = tmp_path / "imu.csv"
+    stored.write_text("nothing\n")
+    with pytest.raises(PblError) as of_copy:
+        read_given([Given(stored, "shank_r", called="shank.csv")])
+    assert str(of_copy.value.key) == "shank.csv"
     table["start_utc"] = "2026-03-01T09:15:30"
     assert "start_utc" in refused(f"shank_r={swing.write(tmp_path / 'c.csv', table)}").found
 

@@ -176,6 +176,13 @@ def part(whole: Keypoints, at: slice) -> Keypoints:
     return dataclasses.replace(whole, **{**rows, "time_s": rows["time_s"] - rows["time_s"][0]})
 
 
+def later(log: SensorLog, start_s: float) -> SensorLog:
+    """A log without its samples before a time."""
+    at = log.time >= start_s
+    values = {k: v[at] for k in ("time", "rate", "acceleration", "orientation") if (v := getattr(log, k)) is not None}
+    return dataclasses.replace(log, **values)
+
+
 @pytest.mark.long
 def test_one_log_of_two_recordings_makes_knees_better():
     """Two parts of a walk seen from the front, whose places in the log are known to some tenths of a second."""
@@ -203,5 +210,13 @@ def test_one_log_of_two_recordings_makes_knees_better():
         assert np.rad2deg(found.magnitude()) < 25
     failed = [c for c in with_them.qc if c.check.startswith("sensor") and c.outcome != PASS]
     assert failed == []
+    # Sensors that were started after the first recording: it is fitted without them, and that is said.
+    late = [later(log, truth.time_s[55] + 0.08) for log in logs]
+    from_second = fit_session(trials, ["a", "b"], "blazepose", sensors=late, sensor_clock_s=[0.3, 1.9])
+    for sensor in from_second.sensors:
+        assert np.isnan(sensor.clock_s).tolist() == [True, False]
+        assert sensor.dropped[0] == 1
+        assert sensor.dropped[1] < 0.1
+    assert {c.check: c.outcome for c in from_second.qc}["sensor_share_dropped"] == WARN
     with pytest.raises(PblError, match="gauss-newton"):
         fit_session(trials, ["a", "b"], "paper-2025", sensors=logs)

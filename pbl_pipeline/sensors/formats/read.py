@@ -37,4 +37,4 @@ def read_samples(path: Path, rate_hz: float | None = None, called: str | None = 
     except PblError as error:
         if error.code != "PHONE_LOG":
             raise
-        raise log_error(error.found, error.expected, key=path) from error
+        raise log_error(error.found, error.expected, key=called or path) from error

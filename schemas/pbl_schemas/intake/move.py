@@ -24,6 +24,7 @@ from ..subject_codes import check_subject
 from ..transactions import in_transaction
 from ..video import unknown_video
 from .records import VisitRecord, session_ids
+from .sensors import carriers, hand_on
 from .videos import check_same_number
 
 #: Plans of a visit that follow a video into its new one.
@@ -69,9 +70,15 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
     of_these = [{"video_id": v} for v in numbers]
     sets = (fit.FitSet & (fit.FitSet.Video & of_these)).keys()
     counts = dj.Diagram.cascade(fit.FitSet & list(sets), part_integrity="cascade").counts() if sets else {}
+    left = len(video.Video & {"session_id": row["session_id"]}) - len(numbers)
     if fit.trials_of([video_id]):
         for found in (session.Session & there).to_dicts():
             check_same_number(int(found["session_id"]), len(numbers), Path(row["video_path"]))
+    if not left and carriers(numbers):  # the sensors go along
+        for found in (session.Session & there).to_dicts():
+            if fits := fit.sensor_fits(int(found["session_id"])).keys():
+                more = dj.Diagram.cascade(fit.SessionFit & list(fits), part_integrity="cascade").counts()
+                counts = {name: counts.get(name, 0) + more.get(name, 0) for name in counts | more}
     return Move(
         video_id,
         {int(v["video_id"]): Path(v["video_path"]) for v in (video.Video & of_these).to_dicts(order_by="video_id")},
@@ -81,7 +88,7 @@ def plan_move(video_id: int, subject: str, session_label: str) -> Move:
         not session.Session & there,
         tuple(sets),
         {name: n for name, n in counts.items() if n},
-        len(video.Video & {"session_id": row["session_id"]}) - len(numbers),
+        left,
     )
 
 
@@ -89,8 +96,9 @@ def carry_out(plan: Move) -> None:
     """Move the video into its new visit, with the plans of its methods.
 
     Detection and keypoints stay: they depend on the video alone. The sets of fits that hold it are deleted with all
-    dependent results; the rest of the old visit, and the new one, are fitted by the next populate. A recording in the
-    archive goes to the folder of its new person, so that `pbl forget` finds it there.
+    dependent results; the rest of the old visit, and the new one, are fitted by the next populate. Logs of wearable
+    sensors stay at the old visit while it has another video, else they go along. A recording in the archive goes to the
+    folder of its new person, so that `pbl forget` finds it there.
 
     Raises what `plan_move` raises, where rows changed since; FILE_UNWRITABLE: the recording in the archive
     cannot be moved, or another process is changing the archive. Nothing is changed then.
@@ -111,6 +119,7 @@ def carry_out(plan: Move) -> None:
                 here = set(points.to_arrays("keypoint_method"))
                 rows = [row for row in rows if row["keypoint_method"] in here]
             table.insert(({**row, "session_id": new} for row in rows), skip_duplicates=True)
+        hand_on(list(plan.files), old, new)
 
     with _moved_files(plan) as paths:
         in_transaction(lambda: work(paths))

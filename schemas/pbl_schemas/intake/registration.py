@@ -168,11 +168,14 @@ def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> lis
         return _update(one, known, chosen, named)
     one.complete(chosen)
     try:
-        return in_transaction(lambda: write([one], chosen), until=lambda: bool(registered(one.files)))
+        done = in_transaction(lambda: write([one], chosen), until=lambda: bool(registered(one.files)))
     except DuplicateError:
         if not (known := registered(one.files)):
             raise
         return _update(one, known, chosen, named)
+    if getattr(one, "sensors", None):
+        forget_errors(int(done[0].video_id or 0))  # fits of the visit may have failed by its older sensors
+    return done
 
 
 def registered(files: Iterable[File]) -> dict[str, dict[str, Any]]:

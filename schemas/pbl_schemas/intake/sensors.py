@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.temporary import new_folder
 
-from .. import fit, keypoints, video
+from .. import fit, keypoints, session, video
 from ..rows import counted, delete_below, utc_now
 
 if TYPE_CHECKING:
@@ -42,17 +42,20 @@ class Sensors:
         """True if a log comes with it."""
         return self.attitude is not None and str(self.attitude) != NONE
 
-    def read(self) -> PhoneLog | None:
-        """Read the logs, if there are any, and check that the other files exist. Raises `PblError` FILE_MISSING,
-        PHONE_LOG; FILE_FORMAT for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
+    def read(self) -> tuple[Sensors, PhoneLog | None]:
+        """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
+        the sensors in them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file
+        without bytes; SENSOR_LOG, USAGE as `read_given`."""
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
         for path in (self.depth, *(given.file for given in self.imu)):
             if path is not None and str(path) != NONE and not path.is_dir():
                 _check_there(path)
-        read_given([given for given in self.imu if given.segment is not None])
-        return read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
+        logs = iter(read_given([given for given in self.imu if given.segment is not None]))
+        imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
+        log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
+        return dataclasses.replace(self, imu=imu), log
 
 
 def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
@@ -96,22 +99,25 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
 
 def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
     """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them. A log
-    of a segment takes the place of the visit's older one."""
+    of a segment takes the place of the visit's older one. Raises what `fit.check_sensors` raises for all together."""
+    if not given:
+        return []
     files: dict[tuple[Path, float | None], dict[str, str]] = {}
     for one in given:
         own = files.setdefault((one.file, one.rate_hz), {})
         own |= {} if one.segment is None else {one.segment: one.sensor or ""}
-    visit = {"session_id": int((video.Video & key).fetch1("session_id"))}
-    of_visit = video.WearableImu & (video.Video & visit).proj()
+    visit = int((video.Video & key).fetch1("session_id"))
+    session.lock(visit)  # no fit is inserted from here on
+    of_visit = video.WearableImu & (video.Video & {"session_id": visit}).proj()
     done, worn = [], False
     for (file, rate), own in files.items():
         rows = of_visit.to_dicts()
         sha256 = None if str(file) == NONE else _sha256(file)
-        same = next((r for r in rows if r["imu_sha256"] == sha256 and r["imu_rate"] == rate), {"imu_segments": None})
-        # Further sensors of a file that is there already.
-        own = {s: name for s, name in (same["imu_segments"] or {}).items() if name not in own.values()} | own
-        if sha256 and "imu" in same and (same["imu_segments"] or {}) == own:
-            continue
+        if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
+            before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
+            own = {s: name for s, name in before.items() if name not in own.values()} | own
+            if (before, same["imu_rate"]) == (own, rate):
+                continue
         for row in rows:
             this = {k: row[k] for k in video.WearableImu.primary_key}
             segments = row["imu_segments"] or {}
@@ -131,10 +137,37 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
         done.append(f"wearable IMU file {file.name} was attached, {where}")
         worn |= bool(own)
     if worn:
-        sets = fit.FitSet & visit & f"fit_set_kind <> '{fit.MARKERS}'"
-        if rows := counted(delete_below(fit.SessionFit, (fit.SessionFit & sets.proj()).keys())):
+        done += fit.check_sensors(visit)
+        if rows := counted(fit.delete_sensor_fits(visit)):
             done.append(f"what was fitted without them was deleted: {rows}")
     return done
+
+
+def hand_on(numbers: Sequence[int], old: int, new: int) -> None:
+    """Give the logs of wearable sensors of videos that were moved to another video of their old visit; without one they
+    stay, and the fits of the new visit are deleted. Call it in a transaction. Raises what `fit.check_sensors` raises.
+    """
+    if not (carried := carriers(numbers)):
+        return
+    session.lock(new)
+    heirs = (video.Video & {"session_id": old}).to_arrays("video_id")
+    if not len(heirs):
+        fit.check_sensors(new)
+        fit.delete_sensor_fits(new)
+        return
+    heir, table = int(min(heirs)), video.WearableImu.full_table_name
+    last = max((int(n) for n in (video.WearableImu & {"video_id": heir}).to_arrays("imu")), default=0)
+    for i, row in enumerate(carried, last + 1):  # DataJoint does not change a key
+        video.WearableImu.connection.query(
+            f"UPDATE {table} SET video_id = %s, imu = %s WHERE video_id = %s AND imu = %s",  # noqa: S608
+            args=(heir, i, int(row["video_id"]), int(row["imu"])),
+        )
+
+
+def carriers(numbers: Sequence[int]) -> list[dict[str, Any]]:
+    """Keys of the logs of wearable sensors that are attached to these videos and belong to their visit."""
+    rows = (video.WearableImu & [{"video_id": v} for v in numbers]).proj("imu_segments").to_dicts()
+    return [row for row in rows if row["imu_segments"]]
 
 
 def _sha256(path: Path) -> str:

@@ -172,7 +172,7 @@ class OneCamera(Recording):
 
     def read(self) -> None:
         self.files = (File.of(*self.paths),)  # no picture is decoded
-        self.log = self.sensors.read()
+        self.sensors, self.log = self.sensors.read()
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
         number, path = int(rows[0]["video_id"]), self.files[0].path
