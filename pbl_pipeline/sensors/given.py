@@ -46,7 +46,7 @@ class Given:
 
     @property
     def shown(self) -> Path:
-        """What an error names: the file of the person."""
+        """The name of the file for an error: of the one that was given, not of its copy."""
         return Path(self.called or self.file)
 
 
