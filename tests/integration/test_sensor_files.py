@@ -245,7 +245,7 @@ def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, st
         with closing(connection.plain_connection()) as other:
             other.cursor().execute(f"DELETE FROM {video.WearableImu.full_table_name}")
         assert len(video.WearableImu()) == 1  # as this transaction sees it until its end
-        with pytest.raises(InputChanged, match="other wearable sensors"):
+        with connection.inserting(table), pytest.raises(InputChanged, match="other wearable sensors"):
             table.make_insert(key, *result)
     assert len(table) == 0
     assert not errors(populate())
