@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 
-from ..samples import Samples, log_error, opened
+from ..samples import Samples, log_error, opened, unknown_error
 from . import apdm, movella_dot, opensense, own, sensor_logger, shimmer, xsens
 
 FORMATS = (
@@ -26,15 +26,19 @@ def read_samples(path: Path, rate_hz: float | None = None, called: str | None = 
 
     `rate_hz`: for a file that does not state its own; `called`: name of the file of which this one is a copy.
 
-    Raises `PblError` FILE_MISSING, SENSOR_LOG.
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (no known format), SENSOR_LOG.
     """
+    file = opened(path, rate_hz, called)
     try:
-        file = opened(path, rate_hz, called)
         found = next((f for f in FORMATS if f.knows(file)), None)
         if found is None:
-            raise file.refuse("a file of no known format", ", ".join(f.name for f in FORMATS))
+            raise unknown_error("a file of no known format", ", ".join(f.name for f in FORMATS), key=path)
         return list(found.reads(file))
     except PblError as error:
         if error.code != "PHONE_LOG":
             raise
         raise log_error(error.found, error.expected, key=path) from error
+    except (ValueError, LookupError) as error:
+        raise log_error(
+            f"{found.name}: {type(error).__name__}: {error}"[:300], "the form that docs/imu.md names", key=path
+        ) from error
