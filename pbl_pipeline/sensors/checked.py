@@ -31,7 +31,7 @@ _TILT_DEG, _WANDER_DEG = 25.0, 15.0
 #: A comparison of two rates needs this much movement (rad/s) and so many samples.
 _MOVES, _ENOUGH, _MOST_COMPARED = 0.3, 50, 50_000
 #: Least share of quarters of a second in which accelerations keep the length of gravity; and the turn (deg) that wrong
-#: rates then leave of it. Right ones left up to 1 on recorded logs, 7 on a synthetic one; turned or dead axes 20 or more.
+#: rates then leave of it. Right ones left up to 1 on recorded logs, 7 on a synthetic one; turned or dead axes left 23.
 _QUIET, _AGAINST_DEG = 0.2, 15.0
 _DAY_S = 86400.0
 #: Raises the error for what was found, what is expected and the next step.

@@ -128,13 +128,16 @@ def test_a_log_that_ends_within_the_recording_or_rests_all_the_time(truth, seen)
 
 
 def cut(log: SensorLog, rows: np.ndarray) -> SensorLog:
+    assert log.rate is not None
+    assert log.acceleration is not None
     return dataclasses.replace(log, time=log.time[rows], rate=log.rate[rows], acceleration=log.acceleration[rows])
 
 
 def test_an_acceleration_that_is_missing_does_not_change_the_heading(truth, seen):
-    """Of a pelvis' sensor with an orientation of its own."""
+    """A pelvis' sensor that states its orientation."""
     (log,), _ = synthetic.worn(truth, 3, ("pelvis",), clock_s=0.0)
     own = dataclasses.replace(log, orientation=oriented(log).at(log.time)[0], rate=None)
+    assert own.acceleration is not None
     lacking = own.acceleration.copy()
     lacking[len(lacking) // 2] = np.nan
     a, b = (
@@ -158,9 +161,9 @@ def test_a_first_solution_has_no_variances(monkeypatch):
 
     monkeypatch.setattr(lanes, "_finish_one", lambda *_: pytest.fail("variances of a solution that is not the last"))
     monkeypatch.setattr(lanes, "_kept", lambda end: end)
-    latest = SimpleNamespace(x=np.zeros(1), dispersion=np.ones(1))
-    found = lanes.fetch(None, SimpleNamespace(latest=latest), last=False)
-    assert (found.variance, found.x.tolist()) == (None, [0.0])
+    end: Any = SimpleNamespace(latest=SimpleNamespace(x=np.zeros(1), dispersion=np.ones(1)))
+    found = lanes.fetch(end, end, last=False)
+    assert (found.variance, found.x) == (None, [0.0])
 
 
 @pytest.mark.parametrize("exchanged", [(), ("shank_r", "shank_l"), ("thigh_r", "thigh_l"), ("shank_l", "foot_l")])

@@ -28,17 +28,17 @@ def read_samples(path: Path, rate_hz: float | None = None, called: str | None = 
 
     Raises `PblError` FILE_MISSING, FILE_FORMAT (no known format), SENSOR_LOG.
     """
-    file = opened(path, rate_hz, called)
+    file, form = opened(path, rate_hz, called), ""
     try:
         found = next((f for f in FORMATS if f.knows(file)), None)
         if found is None:
             raise unknown_error("a file of no known format", ", ".join(f.name for f in FORMATS), key=path)
+        form = found.name
         return list(found.reads(file))
     except PblError as error:
         if error.code != "PHONE_LOG":
             raise
         raise log_error(error.found, error.expected, key=path) from error
     except (ValueError, LookupError) as error:
-        raise log_error(
-            f"{found.name}: {type(error).__name__}: {error}"[:300], "the form that docs/imu.md names", key=path
-        ) from error
+        found = f"{form}: {type(error).__name__}: {error}"[:300]
+        raise file.refuse(found, "a whole file as the program writes it") from error
