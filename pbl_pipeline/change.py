@@ -48,6 +48,7 @@ class Result:
     worst: tuple[str, ...]
     corrected: bool = False
     filming: Filming | None = None  # how it was filmed; None if it was not looked up
+    detection: tuple[str, str] = ("", "")  # methods of tracking and of the keypoints; "" if there are none
 
     @property
     def errors(self) -> tuple[float | None, float | None]:
@@ -57,7 +58,7 @@ class Result:
     @property
     def chain(self) -> tuple[str, ...]:
         """Kind of recordings and methods."""
-        return self.kind, *self.methods
+        return self.kind, *self.detection, *self.methods
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,6 +183,7 @@ def result_of(visit: Visit) -> Result | None:
         outcome=outcome,
         worst=tuple(c.check for c in measures.checks if c.outcome == outcome != PASS),
         corrected=any(c.check == "events_by_hand" for c in measures.checks),
+        detection=(visit.methods.get("Tracking", ""), visit.methods.get("Keypoints", "")),
     )
 
 

@@ -213,9 +213,12 @@ def load_model(name: str) -> MeasurementModel:
 def model_of_fit(params_hash: str, confidence_curve: str) -> str:
     """Return the name of the model that was measured with a fit's parameters and the detector of this curve; empty if
     there is none."""
-    suited = {n: load_model(n).curves for n in model_names() if params_hash in load_model(n).fits}
-    others = (n for n, curves in suited.items() if not curves)
-    return next((n for n, curves in suited.items() if confidence_curve in curves), next(others, ""))
+    models = [load_model(n) for n in model_names()]
+    known = any(confidence_curve in m.curves for m in models)
+    suited = (
+        m.name for m in models if params_hash in m.fits and (confidence_curve in m.curves or not (known or m.curves))
+    )
+    return next(suited, "")
 
 
 class _Joint(NamedTuple):

@@ -16,7 +16,7 @@ from pbl_schemas import connection, lab, session, tracking, video
 from pbl_schemas.datajoint_setup import full_path
 from pbl_schemas.intake import VisitRecord, uploads
 from pbl_schemas.intake import register as register_all
-from pbl_schemas.operations.archive import PHONE, folder_of
+from pbl_schemas.operations.archive import PHONE, folder_of, note_placed
 from pbl_schemas.operations.orphans import orphans, remove
 from pbl_workers import incoming
 from pbl_workers.heartbeat import Silent
@@ -296,6 +296,22 @@ def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(tables: No
     age()
     pbl("cron", "release")
     assert [name for name in there if not name.endswith(".placed")] == files(archive)
+
+
+def test_a_note_of_the_same_bytes_under_another_ending_removes_no_registered_film(
+    tables: None, tmp_path: Path, archive: Path
+):
+    came = folder_of(archive, PHONE, "P001") / "browser-1.mp4"
+    content = chain.small_video(tmp_path, "walk").read_bytes()
+    copies = [placed(came, content), placed(came.with_suffix(".csv"), LOG.encode())]
+    incoming.register_copies(VisitRecord("P001", "1"), "a.mp4", copies, archive)
+    before = files(archive)
+    (film,) = (archive / name for name in before if name.endswith(".mp4"))
+    note_placed(archive, film.with_suffix(".mov"))  # its process was killed before it could tell
+    for note in (archive / PHONE).rglob("*"):
+        os.utime(note, times=2 * (time.time() - 8 * 86_400,))
+    pbl("cron", "release")
+    assert files(archive) == before
 
 
 def test_a_recording_that_is_refused_leaves_nothing_in_the_archive(tables: None, tmp_path: Path, archive: Path):

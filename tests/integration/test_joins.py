@@ -87,7 +87,9 @@ def test_two_results_with_the_video_between_them_are_of_one_visit(visits: None):
 def test_the_section_of_joins_names_every_computed_table(visits: None):
     rows = [row for row in table_map.joins() if row.startswith("| know their")]
     named = {name: "session_id" in row for row in rows for name in re.findall(r"`([a-z]+\.\w+)`", row.split("|")[2])}
-    tables = {f"{t.__module__.removeprefix('pbl_schemas.')}.{t.__name__}": t for t in pbl_schemas.computed_tables()}
+    computed = pbl_schemas.computed_tables()
+    modules = {t: t.__module__.removeprefix("pbl_schemas.").removesuffix("_sets") for t in computed}
+    tables = {f"{module}.{t.__name__}": t for t, module in modules.items()}
     assert named == {name: "session_id" in table.heading.names for name, table in tables.items()}
 
 

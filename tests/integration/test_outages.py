@@ -184,7 +184,7 @@ def test_a_worker_starts_while_the_database_takes_nothing(
     assert worker.Worker.fetch1("worker") == beats.worker
 
 
-def test_tables_are_bound_after_a_database_that_went_away_while_they_were(monkeypatch: pytest.MonkeyPatch):
+def test_tables_are_bound_after_a_database_that_went_away_while_they_were(failing):
     schema, stage = connection.dj.Schema(), "outage"
 
     class Thing(connection.dj.Manual):
@@ -193,10 +193,9 @@ def test_tables_are_bound_after_a_database_that_went_away_while_they_were(monkey
     schema(Thing)
     server = connection.connect()
     try:
-        with monkeypatch.context() as patch:
-            failing(patch, server, "register", FULL)  # after the schema has its name, before its tables
-            with pytest.raises(pymysql.err.OperationalError):
-                connection.bind(stage, schema)
+        failing(server, "register", FULL)  # after the schema has its name, before its tables
+        with pytest.raises(pymysql.err.OperationalError):
+            connection.bind(stage, schema)
         connection.bind(stage, schema)
         Thing.insert1({"thing": 1})
         assert len(Thing()) == 1

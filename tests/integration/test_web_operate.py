@@ -1,5 +1,6 @@
 """Operating in the review page: queues, errors and another try; who may see what."""
 
+import datetime
 import html
 import json
 from pathlib import Path
@@ -111,7 +112,8 @@ def test_what_is_being_computed_by_whom_since_when(three_gone: list[int]):
     assert "gait&lt;b&gt;:42" in page
     assert "No worker is alive" not in page
     assert "No worker runs; what is being computed now was started on a page or by a command" in page
-    assert "2026-01-02 03:04:05" in page
+    since = datetime.datetime(2026, 1, 2, 3, 4, tzinfo=datetime.UTC).astimezone()
+    assert f"{since:%Y-%m-%d %H:%M}" in page
     assert f'href="/recordings/{three_gone[0]}"' not in page  # an operator does not look
     german = web.client("operator").get("/operate", headers={"accept-language": "de"}).text
     assert german.count("Lesen des Videos <code") >= 2  # among the stages and what is being computed

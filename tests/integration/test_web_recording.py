@@ -153,4 +153,4 @@ def test_a_lost_file_of_the_fit_says_so(looked_at, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(objects, "file_ref", lambda value: {"path": "gone.npz", "store": "arrays", "size": 1})
     answer = web.client().get(f"/recordings/{walk}/movement")
     assert answer.status_code == 409
-    assert "restore the object store" in answer.text
+    assert "Restore the object store" in answer.text

@@ -34,6 +34,13 @@ def test_a_mirrored_walk_is_not_called_changed():
     assert (alike.sure, alike.least, alike.differs) == (True, 5.0, ())
 
 
+def test_results_of_other_keypoints_are_not_alike():
+    """As of a visit from before the default changed, whose fit, events and index are by the same methods."""
+    earlier = dataclasses.replace(BEFORE, detection=("tiles-v5", "heavy-v4"))
+    found = not_none(change_since(after(98.8, FROM_LEFT, detection=("tiles-v5", "heavy-v5")), earlier))
+    assert (found.sure, found.real, found.differs) == (None, None, (Difference("methods"),))
+
+
 def test_a_large_change_is_one_from_any_side():
     assert not_none(change_since(after(104.0, MIRRORED), BEFORE)).sure is True
     unknown = not_none(change_since(after(104.0, MIRRORED, sd=None), BEFORE))

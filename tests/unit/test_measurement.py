@@ -170,6 +170,8 @@ def test_the_default_fit_of_a_phone_has_a_measured_model():
     for curve in ("blazepose-heavy-v3", ""):  # of points as regressed; of files that do not say
         assert model_of_fit(fit, curve) == "blazepose-33"
     assert model_of_fit("another", "blazepose-heavy-v4") == ""
+    earlier = next(h for h in load_model("blazepose-33").fits if h != fit)
+    assert model_of_fit(earlier, "blazepose-heavy-v4") == ""  # that fit was not measured with these points
 
 
 def errors(index: Gdi) -> tuple[float, float]:

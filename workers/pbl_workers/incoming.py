@@ -312,7 +312,9 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
     sensors = Sensors(attitude=logs[0].path if logs else None)
     (result,) = register([OneCamera(target, visit, sensors)])
     if result.error is not None:
-        if result.error.code not in _OURS and not has_row(target):
+        if has_row(target):
+            note.unlink()
+        elif result.error.code not in _OURS:
             for copy, path in zip(copies, came, strict=True):
                 copy.path = copy.path.replace(path)
             note.unlink()

@@ -37,6 +37,7 @@ LONGEST_WAIT_S = 60.0
 KEPT_S = 0.1
 #: Candidates that were read and not tried, of each table and condition, with the time when (s).
 _read: dict[tuple[Any, str | None], tuple[float, list[dict[str, Any]]]] = {}
+_MOST_READ = 100
 #: Jobs that this process holds: table and hash of the key.
 _held: set[tuple[str, str]] = set()
 
@@ -134,12 +135,15 @@ def sweep(table: Any, which: str = "status != 'reserved'") -> int:
 def most_urgent(table: Any, where: str | None = None) -> int | None:
     """Return the priority of the first job that can be taken now; None without one. `where`: a condition on its key."""
     rows = _ready(table, 1, where)
+    if len(_read) >= _MOST_READ:
+        _read.clear()
+    _read[table, where] = time.monotonic(), rows
     return int(rows[0]["priority"]) if rows else None
 
 
 def _ready(table: Any, n: int, where: str | None) -> list[dict[str, Any]]:
-    """Return candidates for n jobs, the most urgent and oldest first, and keep them for `claim`. Plain SQL: half of
-    DataJoint's time for a query."""
+    """Return candidates for n jobs, the most urgent and oldest first. Plain SQL: half of DataJoint's time for a
+    query."""
     jobs = jobs_of(table)
     rows = jobs.connection.query(
         f"SELECT {', '.join(jobs.primary_key)}, priority, attempts FROM {jobs.full_table_name}"  # noqa: S608
@@ -147,13 +151,12 @@ def _ready(table: Any, n: int, where: str | None) -> list[dict[str, Any]]:
         f" ORDER BY priority, scheduled_time LIMIT {_SPREAD * n}",
         as_dict=True,
     )
-    _read[table, where] = time.monotonic(), list(rows.fetchall())
-    return _read[table, where][1]
+    return list(rows.fetchall())
 
 
 def _candidates(table: Any, n: int, where: str | None) -> Iterator[dict[str, Any]]:
     """Yield candidates for n jobs in the order in which they are tried: those that were just read, then the queue's."""
-    at, rows = _read.get((table, where), (-math.inf, []))
+    at, rows = _read.pop((table, where), (-math.inf, []))
     if time.monotonic() - at < KEPT_S:
         yield from _drawn(rows)
     yield from _drawn(_ready(table, n, where))
@@ -175,13 +178,13 @@ def claim(table: Any, n: int = 1, where: str | None = None) -> list[Claim]:
     reserve = (
         f"UPDATE {jobs.full_table_name} SET status='reserved', host=%s, pid=%s, connection_id=%s, user=USER(),"  # noqa: S608
         f" reserved_time=CURRENT_TIMESTAMP(3) WHERE {' AND '.join(f'`{name}`=%s' for name in jobs.primary_key)}"
-        " AND status='pending' AND scheduled_time <= CURRENT_TIMESTAMP(3)"
+        " AND attempts=%s AND status='pending' AND scheduled_time <= CURRENT_TIMESTAMP(3)"
     )
     claims: list[Claim] = []
     for row in _candidates(table, n, where) if n else ():
         key = {k: row[k] for k in jobs.primary_key}
         here = (platform.node(), os.getpid(), jobs.connection.connection_id)
-        if jobs.connection.query(reserve, args=(*here, *key.values())).rowcount == 1:
+        if jobs.connection.query(reserve, args=(*here, *key.values(), row["attempts"])).rowcount == 1:
             claims.append(Claim(table, key, int(row["priority"]), *here, attempts=int(row["attempts"])))
             _held.add((table.__name__, claims[-1].hash))
             if len(claims) == n:

@@ -105,17 +105,26 @@ def has_row(target: Path) -> bool:
 
 
 def _placed(archive: Path, note: Path) -> tuple[Path, list[Path]]:
-    """Return the place of a note's recording; and it and its sensor log, as far as they are there."""
+    """Return the place of a note's recording; and it and its sensor log, as far as they are there and not another
+    recording's."""
     target = archive / note.parent.name / os.fsdecode(note.read_bytes())
-    return target, [path for path in target.parent.glob(f"{glob.escape(target.stem)}.*") if path.stem == target.stem]
+    beside = [p for p in target.parent.glob(f"{glob.escape(target.stem)}.*") if p.stem == target.stem and p != target]
+    own = [] if any(has_row(p) or (note.parent / f"{p.name}{_PLACED}").exists() for p in beside) else beside
+    return target, [path for path in (target, *own) if path.is_file()]
+
+
+def _begun(archive: Path) -> list[Path]:
+    with contextlib.suppress(PermissionError):
+        return list((archive / PHONE).glob("*/*"))
+    return []
 
 
 def unfinished(archive: Path) -> list[Unfinished]:
     """Return what phones and browsers have begun to send, and recordings in their place of which a process was killed
-    before they had a row, while other processes write and remove it."""
+    before they had a row, while other processes write and remove it. What this account may not see is left out."""
     out = []
-    for path in (archive / PHONE).glob("*/*"):
-        with contextlib.suppress(FileNotFoundError):
+    for path in _begun(archive):
+        with contextlib.suppress(FileNotFoundError, PermissionError):
             own, placed = path.stat(), path.suffix == _PLACED
             parts = _placed(archive, path)[1] if placed else path.iterdir() if path.is_dir() else (path,)
             files = [f.stat() for f in parts]

@@ -81,7 +81,7 @@ def _changes(found: Any) -> list[dict[str, Any]]:
                 if not same:
                     continue
                 changes = {INDEX: change_since(result, same[0])}
-                mine, old = (measures.get((v["session_id"], *result.chain), {}) for v in (now, before))
+                mine, old = (measures.get((v["session_id"], result.kind, *result.methods), {}) for v in (now, before))
                 changes |= measure_changes(mine, old, not_alike(result, same[0]))
                 about = {"subject": now["subject"], "visit": now["session_label"], "before": before["session_label"]}
                 out += [

@@ -15,7 +15,7 @@ from pbl_pipeline.words import NOT_COMPUTED
 from .. import fit, gait, gdi, qc, session, video
 from ..decisions.not_usable import Unusable, unusable
 from ..decisions.review_decisions import may_be_accepted
-from ..rows import ReadAhead, row_of
+from ..rows import ReadAhead
 from . import registered
 from .objects import load_kinetics, load_solution, pooled_cycles
 from .visit_list import VisitRow, earlier_result, results_of, visits_of
@@ -47,12 +47,11 @@ class ShownCheck:
 
 @dataclasses.dataclass(frozen=True)
 class Pooled:
-    """What is drawn of a result: its cycles, the body's scale, forces, and the norm of its index."""
+    """What is drawn of a result: its cycles, the body's scale and forces."""
 
     cycles: Sequence[GaitCycle]
     scale: np.ndarray | None
     kinetics: Kinetics | None
-    norm: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,8 +188,7 @@ def shown_visit(session_id: int, shown: int = 0) -> ShownVisit:
 def _pooled(key: Mapping[str, Any], videos: Sequence[int]) -> Pooled:
     """What is drawn of a result of these recordings, by its key. Raises as `load_visit`."""
     rows = ReadAhead([key], videos)
-    norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
-    return Pooled(pooled_cycles(key, rows), load_solution(key, rows).scale, load_kinetics(key, rows), norm)
+    return Pooled(pooled_cycles(key, rows), load_solution(key, rows).scale, load_kinetics(key, rows))
 
 
 def computed_visit(session_id: int, shown: int) -> ShownVisit:

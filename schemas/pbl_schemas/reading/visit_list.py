@@ -41,6 +41,8 @@ OUTCOMES = ("PASS", "WARN", "EMPTY", "NEEDS_CHOICE", "FAIL", "ACCEPTED")
 _WITH_ERROR = names(Gdi, "session_gdi", only=WITH_ERROR)
 _RESULT = ("fit_set", "fit_method", "gait_method", "gdi_method", "norm")
 _SAME_RESULT = " AND ".join(f"q.{k} = g.{k}" for k in _RESULT)
+#: Methods of a set's recordings.
+_DETECTION = ("tracking_method", "keypoint_method")
 #: Stands for the day of a visit without one: before all others.
 _NO_DAY = "0001-01-01"
 
@@ -164,11 +166,12 @@ def results_of(sessions: Iterable[int], sets: Sequence[str] = ()) -> dict[int, l
 
 def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
     found: dict[int, list[Result]] = {i: [] for i in ids}
-    open_checks = _open_checks(ids)
+    open_checks, videos = _open_checks(ids), _name(fit.FitSet.Video)
     rows = _ask(
         "SELECT f.session_id, f.fit_set, f.fit_set_kind, g.fit_method, g.gait_method, g.gdi_method, g.norm,"
         f" g.session_status, g.session_reason, g.session_gdi_reason, {', '.join(f'g.{c}' for c in _WITH_ERROR)},"
-        " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, '')"
+        " g.session_corrected, COALESCE(q.qc_outcome, ''), COALESCE(q.qc_worst, ''),"
+        f" {', '.join(f'(SELECT MIN(v.{k}) FROM {videos} v WHERE v.fit_set = f.fit_set)' for k in _DETECTION)}"
         f" FROM {_name(fit.FitSet)} f"
         f" JOIN {_name(fit.FitSelection)} c ON c.fit_set = f.fit_set"
         f" AND {f'c.fit_set IN ({_places(sets)})' if sets else 'c.fit_current = 1'}"
@@ -181,7 +184,7 @@ def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
     filmed = filming_of([dict(zip(of_set, row, strict=False)) for row in rows])
     for row, filming in zip(rows, filmed, strict=True):
         session_id, fit_set, kind, *four = row[:7]
-        status, why, no_index, index, sd, change, corrected, outcome, worst = row[7:]
+        status, why, no_index, index, sd, change, corrected, outcome, worst, people, points = row[7:]
         methods = (str(four[0]), str(four[1]), str(four[2]), str(four[3]))
         checks = tuple(n for n in str(worst).split(", ") if n)
         if outcome == "WARN" and (left := open_checks.get((str(fit_set), *methods))) is not None:
@@ -199,6 +202,7 @@ def _results_of(ids: list[int], sets: Sequence[str]) -> dict[int, list[Result]]:
                 checks,
                 bool(corrected),
                 filming,
+                (str(people or ""), str(points or "")),
             )
         )
     return {i: sorted(r, key=lambda one: fit.KINDS.index(one.kind)) for i, r in found.items()}

@@ -239,7 +239,7 @@ ROUTES = [
 def _pooled(visit: Visit) -> Pooled | None:
     scale = None if visit.solution is None else visit.solution.scale
     found = visit.measures
-    return None if found is None else Pooled(found.cycles, scale, visit.kinetics, found.gdi.norm)
+    return None if found is None else Pooled(found.cycles, scale, visit.kinetics)
 
 
 def _measures(visit: Visit) -> dict[str, tuple[Measure | None, str]]:
