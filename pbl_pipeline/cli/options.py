@@ -66,7 +66,7 @@ def sensor_logs(given: Sequence[str]) -> tuple[SensorLog, ...]:
     """Read the sensors of `--imu`, and print what was left out of them. Raises the `PblError`s of `read_given`."""
     from pbl_pipeline.sensors import given_sensors, read_given
 
-    logs = read_given([one for text in given for one in given_sensors(text)])
+    logs = read_given([one for text in given if text != "none" for one in given_sensors(text)])
     for log in logs:
         click.echo("; ".join((f"{log.segment}: sensor {log.name}, {log.time[-1] - log.time[0]:.0f} s", *log.notes)))
     return logs

@@ -102,9 +102,8 @@ _finish_one = jax.jit(finish)
 
 def fetch(p: Problem, end: Progress, last: bool) -> Found:
     """Fetch the end of an iteration to the host."""
-    rest = (None, end.latest.dispersion, *_finish_one(p, end.latest, end.state.R_nc))
-    rest = rest if last else (end.latest.x, end.latest.dispersion)
-    return Found(*jax.device_get((_kept(end), *rest)))
+    rest = _finish_one(p, end.latest, end.state.R_nc) if last else ()
+    return Found(*jax.device_get((_kept(end), None if last else end.latest.x, end.latest.dispersion, *rest)))
 
 
 def _kept(end: Progress) -> Progress:

@@ -37,7 +37,7 @@ from .session import Session
 from .solution import Solution
 from .solvers.gauss_newton import Limits, Progress
 from .solvers.result import Result
-from .wearables import floor_shares, sensor_fits, with_wearables
+from .wearables import sensor_fits, shares_of_floors, with_wearables
 from .weights import Weights
 
 #: A point that stands is slower than this fraction of its own fastest, or than this (m/s); speeds are means over some
@@ -142,7 +142,7 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
-    solution = _solution(session, params, found, trace, told)
+    solution = _solution(session, p, params, found, trace, told)
     if session.worn is None:
         return solution
     sensors = sensor_fits(session, p, found.end.state, params.huber_sensor, moves_with)
@@ -227,13 +227,18 @@ def standing(time_s: Float[np.ndarray, " T"], x: Float[np.ndarray, "T P 3"]) -> 
 
 
 def _solution(
-    session: Session, params: GaussNewtonParams, found: Found, trace: np.ndarray, pelvis_told: np.ndarray | None
+    session: Session,
+    p: Problem,
+    params: GaussNewtonParams,
+    found: Found,
+    trace: np.ndarray,
+    pelvis_told: np.ndarray | None,
 ) -> Solution:
     """The solution, without the time it took."""
     state, names = jax.tree.map(lambda a: np.asarray(a, np.float64), found.end.state), session.body.joint_names
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
     if session.worn is not None:
-        floor = floor * floor_shares(names, [s.log.segment for s in session.worn.sensors])
+        floor = floor * shares_of_floors(session, p)
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)

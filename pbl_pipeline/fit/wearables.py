@@ -59,6 +59,19 @@ def floor_shares(joint_names: Sequence[str], segments: Sequence[str]) -> Float[n
     return out
 
 
+def shares_of_floors(session: Session, p: Problem) -> Float[np.ndarray, "F Q"]:
+    """`floor_shares` in each frame, of the sensors that were measured in most of its trial."""
+    assert session.worn is not None
+    assert p.wearables is not None
+    count, names = np.asarray(p.wearables.count), session.body.joint_names
+    out = np.ones((len(count), len(names)))
+    for i, arrays in enumerate(session.arrays):
+        measured = 2 * count[session.frames(i)].sum(axis=0) > arrays.used.sum()
+        segments = [s.log.segment for s, most in zip(session.worn.sensors, measured, strict=True) if most]
+        out[session.frames(i)] = floor_shares(names, segments)
+    return out
+
+
 def with_wearables(
     session: Session, p: Problem, start: State, dispersion: float
 ) -> tuple[Problem, State, tuple[str, ...]]:
@@ -78,12 +91,15 @@ def with_wearables(
     world = np.tile([1.0, 0, 0, 0], (n, m, 1))
     turned, count = np.zeros((frames, m, 3, 3)), np.zeros((frames, m))
     follows, level, middle = np.zeros((frames, m)), np.full((n, m), np.deg2rad(LEVEL_SD_DEG)), np.zeros(n)
+    settled = np.ones(m, int)
     for i, (arrays, clock) in enumerate(zip(session.arrays, clocks, strict=True)):
         at, time = session.frames(i), arrays.time_s - arrays.time_s[0]
         middle[i] = time[-1] / 2
         grid = np.arange(needed) * SAMPLE_S - CLOCK_RANGE_S
         for j, sensor in enumerate(sensors):
-            quat, known = sensor.at(grid + arrays.time_s[0] + clock)
+            part = sensor.part(grid + arrays.time_s[0] + clock)
+            quat, known = part.at(grid + arrays.time_s[0] + clock)
+            settled[j] &= part.settled or not known.any()
             quats[i, j, :needed], quats[i, j, needed:] = quat, quat[-1]
             measured = all_around(grid, known, time)
             count[at, j] = measured & arrays.used
@@ -92,7 +108,7 @@ def with_wearables(
             row = np.clip(((time + CLOCK_RANGE_S) / SAMPLE_S).round().astype(int), 0, needed - 1)
             turned[at, j] = total[row] - total[int((middle[i] + CLOCK_RANGE_S) / SAMPLE_S)]
             world[i, j] = _heading(seen[i], clock, sensor, mounts[j])
-            level[i, j] = np.hypot(level[i, j], _speed_error(sensor))
+            level[i, j] = np.hypot(level[i, j], _speed_error(part))
         pair = np.append(np.diff(time), 1.0)[:, None]
         both = count[at] * np.append(count[at][1:], np.zeros((1, m)), axis=0)
         follows[at] = both * MEMORY ** (pair / FRAME_S)
@@ -105,7 +121,7 @@ def with_wearables(
         "mount": Rotation.from_matrix(mounts).as_quat(scalar_first=True),
         "world": world,
         "sd_rad": np.deg2rad([WOBBLE_DEG[k] for k in kinds]),
-        "bias_sd_rad_s": np.deg2rad([BIAS_SD_DEG_S[int(s.settled)] for s in sensors]),
+        "bias_sd_rad_s": np.deg2rad(BIAS_SD_DEG_S)[settled],
         "level_sd_rad": level,
         "tilt_sd_rad": np.pad(
             [np.deg2rad(TILT_SD_DEG) * (o == LEVEL) for o in session.orientation], (0, n - len(clocks))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import io
 import re
@@ -11,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from pbl_pipeline import bounded
 from pbl_pipeline.errors import PblError, said, unread_file
 
 from .checked import checked
 from .formats.read import read_samples
+from .formats.samples import Samples, log_error
 from .log import SEGMENTS, SensorLog
-from .samples import Samples, log_error
 
 #: Words of a sensor's name by which its segment is known.
 _WORDS = {
@@ -52,7 +52,7 @@ class Given:
 
 def segment_of(name: str) -> str | None:
     """The segment that the name of a sensor says (`Right Ankle`, `tibia_r_imu`), None if none or several."""
-    words = re.sub(r"[^a-z]+", " ", name.lower())
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])|[^a-zA-Z]+", " ", name).lower()
     found = [segment for segment, pattern in _WORDS.items() if re.search(pattern, words)]
     sides = [side for side, pattern in (("r", r"\b(right|r)\b"), ("l", r"\b(left|l)\b")) if re.search(pattern, words)]
     if len(found) != 1 or (found != ["pelvis"] and len(sides) != 1):
@@ -80,9 +80,13 @@ def given_sensors(text: str) -> list[Given]:
         if path.suffix.lower() == ".xml":
             return _opensense(path)
         if path.suffix.lower() == ".csv" and b"segment" in bounded.read_start(path, 16):
-            rows = pd.read_csv(io.StringIO(bounded.read_text(path)), dtype=str, keep_default_na=False)
-            return [_row(path, {str(k).strip(): v.strip() for k, v in row.items()}) for row in rows.to_dict("records")]
-    except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
+            text = bounded.read_text(path)
+            separator = ";" if ";" in text.split("\n", 1)[0] else ","
+            rows = list(csv.DictReader(io.StringIO(text), delimiter=separator, restkey="", restval=""))
+            if any(any(row.pop("", ())) for row in rows):
+                raise ValueError("a row with more cells than names")
+            return [_row(path, {k.strip(): v.strip() for k, v in row.items()}) for row in rows]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error, ElementTree.ParseError) as error:
         raise unread_file(error, "a list of sensors and their segments", "see docs/imu.md", path) from error
     return [Given(path)]
 
@@ -132,9 +136,10 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
     recording; USAGE: a segment or a sensor is named twice, or the one of a file is not known.
     """
     found = sensors_in(given)
-    measured = [b"".join(v.tobytes() for v in (x.acceleration, x.orientation) if v is not None) for _, x, _ in found]
+    values = [(x.rate, x.acceleration, x.orientation) for _, x, _ in found]
+    measured = [b"".join(v.tobytes() for v in each if v is not None) for each in values]
     for i, (segment, samples, _) in enumerate(found):
-        if segment in (s for s, _, _ in found[:i]) or measured[i] in measured[:i]:
+        if segment in (s for s, _, _ in found[:i]) or (measured[i] and measured[i] in measured[:i]):
             raise PblError(
                 "USAGE",
                 found=said("the sensor {name} on {segment}: one of them twice", name=samples.name, segment=segment),
@@ -148,6 +153,7 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
             "sensors that were synchronised in one recording",
             key=found[0][2].shown,
         )
+    found = [(segment, _unwrapped(x, found[0][1]), g) for segment, x, g in found]
     begin = min((float(np.nanmin(x.stamp)) for _, x, _ in found if np.isfinite(x.stamp).any()), default=0.0)
     logs = tuple(checked(x, segment, w.shown, begin) for segment, x, w in found)
     first, last = max((x.time[0] for x in logs), default=0.0), min((x.time[-1] for x in logs), default=0.0)
@@ -158,6 +164,16 @@ def read_given(given: Sequence[Given]) -> tuple[SensorLog, ...]:
             key=found[0][2].shown,
         )
     return logs
+
+
+def _unwrapped(samples: Samples, first: Samples) -> Samples:
+    """Samples whose clock begins at 0 again, in that turn of it in which they start nearest to the first sensor."""
+    start, to = (x.stamp[np.isfinite(x.stamp)][:1] for x in (samples, first))
+    if not samples.wraps_s or not len(start) or not len(to):
+        return samples
+    more = samples.wraps_s * round(float(to[0] - start[0]) / samples.wraps_s)
+    utc = None if samples.start_utc is None else samples.start_utc - more
+    return dataclasses.replace(samples, stamp=samples.stamp + more, start_utc=utc)
 
 
 def sensors_in(given: Sequence[Given]) -> list[tuple[str, Samples, Given]]:
@@ -171,12 +187,15 @@ def sensors_in(given: Sequence[Given]) -> list[tuple[str, Samples, Given]]:
 
 
 def named(one: Given) -> list[Given]:
-    """A file without a segment as its sensors whose names say one; itself where it cannot be read or none does."""
+    """A file without a segment as its sensors whose names say one; itself where none does or its format is
+    not known. Raises `PblError` SENSOR_LOG as `read_samples`."""
     if one.segment is not None:
         return [one]
     try:
         return [dataclasses.replace(one, segment=segment, sensor=x.name) for segment, x, _ in sensors_in([one])]
-    except PblError:
+    except PblError as error:
+        if error.code == "SENSOR_LOG":
+            raise
         return [one]
 
 

@@ -37,17 +37,20 @@ class Orientation:
     log: SensorLog
     runs: tuple[tuple[np.ndarray, np.ndarray], ...]
 
+    def part(self, time: Float[np.ndarray, " T"]) -> Orientation:
+        """The one run that holds most of some times (s of the log)."""
+        best = max(self.runs, key=lambda run: int(np.sum((time >= run[0][0]) & (time <= run[0][-1]))))
+        return dataclasses.replace(self, runs=(best,))
+
     def at(self, time: Float[np.ndarray, " T"]) -> tuple[Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
-        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in the run that
-        holds most of them."""
-        inside = [(time >= t[0]) & (time <= t[-1]) for t, _ in self.runs]
-        best = max(range(len(inside)), key=lambda i: int(inside[i].sum()))
-        t, quat = self.runs[best]
+        """Quaternions at times (s of the log), without jumps of sign, and which were measured: those in their
+        `part`."""
+        ((t, quat),) = self.part(time).runs
         turns = Slerp(t, Rotation.from_quat(quat, scalar_first=True))(np.clip(time, t[0], t[-1]))
         quat = turns.as_quat(scalar_first=True)
         jumps = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0, -1.0, 1.0)
         quat[1:] *= np.cumprod(jumps)[:, None]
-        return quat, inside[best]
+        return quat, (time >= t[0]) & (time <= t[-1])
 
     @property
     def settled(self) -> bool:
@@ -75,7 +78,7 @@ def oriented(log: SensorLog) -> Orientation:
     time, values = log.time[known], values[known]
     cuts = np.flatnonzero(np.diff(time) > BRIDGED_S + _interval(time)) + 1
     runs = [
-        (t, _filtered(t, v)) if inertial else (t, _without_jumps(v))
+        (t, _filtered(t, v)) if inertial else (t, v / np.linalg.norm(v, axis=1, keepdims=True))
         for t, v in zip(np.split(time, cuts), np.split(values, cuts), strict=True)
         if len(t) >= FEWEST
     ]
@@ -118,10 +121,6 @@ def _strapdown(rate: np.ndarray, acceleration: np.ndarray, step: float) -> Rotat
     turned = Rotation.concatenate(turns)
     up = turned.apply(acceleration).mean(axis=0)
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0] * turned
-
-
-def _without_jumps(quat: np.ndarray) -> np.ndarray:
-    return quat / np.linalg.norm(quat, axis=1, keepdims=True)
 
 
 def _log_error(log: SensorLog, found: str, expected: str) -> PblError:

@@ -35,6 +35,9 @@ EDGE_S = 0.2
 RANGE_S, FINE_S = 0.5, 0.15
 #: Correlations (of angular speeds) closer than this at times further apart than this (s) do not tell which is right.
 AMBIGUOUS, APART_S = 0.05, 0.3
+#: Share of a video that the log must cover, and the least correlation: synthetic walks have 0.8 and more, with sensors
+#: exchanged 0.37 and more (`better_pairing` names those), with standing still 0.2. Another walk can have 0.9.
+COVERED, LEAST = 0.5, 0.3
 #: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
 RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
 
@@ -76,27 +79,34 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
     there (their weighted correlation, -1 to 1).
 
-    Raises `ValueError` if the log does not reach the recording, or fits it as well at another stride.
+    Raises `ValueError` if the log does not cover `COVERED` of the recording, fits it nowhere, or as well at another
+    stride.
     """
+    n = len(seen.time)
     first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
-    low, high = first - seen.time[0] - 0.5, last - seen.time[-1] + 0.5
+    beyond = (1 - COVERED) * n * SAMPLE_S
+    low, high = first - seen.time[0] - beyond, last - seen.time[-1] + beyond
     if stated is not None:
         low, high = max(low, stated - RANGE_S), min(high, stated + RANGE_S)
     if not low < high:
         raise ValueError("the log does not reach the recording")
-    n = len(seen.time)
     log_time = seen.time[0] + low + SAMPLE_S * np.arange(n + int((high - low) / SAMPLE_S))
     rates = {s.log.segment: _known_rate(s, log_time) for s in sensors}
-    score, weight = np.zeros(len(log_time) - n + 1), 0.0
+    score, weight = np.zeros((2, len(log_time) - n + 1))
     for segment, rate in rates.items():
         ours = np.linalg.norm(seen.rate[segment], axis=1)
-        score += ours.var() * _correlation(np.linalg.norm(rate, axis=1), ours)
-        weight += ours.var()
-    score = score / weight
+        agreement, share = _correlation(np.linalg.norm(rate, axis=1), ours)
+        score += ours.var() * share * agreement
+        weight += ours.var() * share
+    score = np.clip(score / np.maximum(weight, 1e-9), 0.0, 0.9999)
+    share = weight / sum(np.linalg.norm(seen.rate[k], axis=1).var() for k in rates)
+    score = np.sqrt(1 - (1 - score**2) ** share)  # the correlation over all of it that tells as much
     best = int(np.argmax(score))
     away = np.abs(np.arange(len(score)) - best) * SAMPLE_S > APART_S
     if stated is None and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
         raise ValueError("the log fits the recording at several times")
+    if score[best] < LEAST:
+        raise ValueError("the log fits the recording nowhere")
     lags = np.arange(max(0, best - int(FINE_S / SAMPLE_S)), min(len(score), best + int(FINE_S / SAMPLE_S) + 1))
     agreement = [sum(_turned_sum(seen.rate[k], r[i : i + n]) for k, r in rates.items()) for i in lags]
     at = int(np.argmax(agreement))
@@ -109,27 +119,32 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
 
 
 def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
-    """Rates (T, 3) in all runs of a log, 0 elsewhere."""
-    rate = np.zeros((len(time), 3))
+    """Rates (T, 3) in all runs of a log, NaN elsewhere."""
+    rate = np.full((len(time), 3), np.nan)
     for run in sensor.runs:
         quat, known = Orientation(sensor.log, (run,)).at(time)
         rate[known] = smooth(rate_of(quat))[known]
     return rate
 
 
-def _correlation(long: np.ndarray, short: np.ndarray) -> np.ndarray:
-    """Correlation of a signal with each part of a longer one."""
-    n, ones = len(short), np.ones(len(short))
-    short = short - short.mean()
-    mean, square = (fftconvolve(x, ones, "valid") / n for x in (long, long**2))
-    spread = np.sqrt(np.maximum(square - mean**2, 1e-3)) * n * short.std()
-    return fftconvolve(long, short[::-1], "valid") / spread
+def _correlation(long: np.ndarray, short: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of a signal with each part of a longer one, where that is known, and the share that is."""
+    known, long, short = np.isfinite(long), np.nan_to_num(long), short - short.mean()
+    slide = lambda a, b: fftconvolve(a, b[::-1], "valid")  # noqa: E731
+    ones = np.ones(len(short))
+    n = np.maximum(slide(known, ones), 1.0)
+    (x, xx), (y, yy) = ([slide(a, ones) / n for a in (long, long**2)], [slide(known, b) / n for b in (short, short**2)])
+    spread = np.sqrt(np.maximum(xx - x**2, 1e-3) * np.maximum(yy - y**2, 1e-3 * short.var()))
+    return (slide(long, short) / n - x * y) / spread, n / len(short)
 
 
 def _turned_sum(a: np.ndarray, b: np.ndarray) -> float:
-    """Largest sum of products of vectors (T, 3) with others under one rotation, of rates whose spread is the same."""
+    """Largest sum of products of vectors (T, 3) with others, where those are known, under one rotation, of rates whose
+    spread is the same."""
+    power, known = np.sum(a**2), np.isfinite(b).all(axis=1)
+    a, b = a[known], b[known]
     values, sign = np.linalg.svd(a.T @ b)[1], np.sign(np.linalg.det(a.T @ b))
-    return float((values[0] + values[1] + sign * values[2]) / (np.linalg.norm(b) + 1e-9) * np.linalg.norm(a))
+    return float((values[0] + values[1] + sign * values[2]) * power / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9))
 
 
 def wahba(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -143,18 +158,24 @@ def vectors(seen: Moved, clock: float, sensor: Orientation, segment: str) -> lis
     quat, known = sensor.at(seen.time + clock)
     up = Rotation.from_quat(quat, scalar_first=True).as_matrix()[:, 2]
     pairs = [(seen.rate[segment], smooth(rate_of(quat)), RATE_SD), (seen.rotation[segment][:, 2], up, UP_SD)]
-    if segment == "pelvis" and sensor.log.acceleration is not None:
-        turn = Rotation.from_rotvec([0.0, 0.0, _heading(seen, sensor, seen.time + clock, known)])
-        ahead = (turn * Rotation.from_quat(quat, scalar_first=True)).as_matrix()[:, 0]
+    heading = _heading(seen, sensor, seen.time + clock, known) if segment == "pelvis" else np.nan
+    if np.isfinite(heading):
+        ahead = (Rotation.from_rotvec([0.0, 0.0, heading]) * Rotation.from_quat(quat, scalar_first=True)).as_matrix()[
+            :, 0
+        ]
         pairs.append((seen.rotation[segment][:, 0], ahead, HEADING_SD))
     return [(a[known] / sd, b[known] / sd) for a, b, sd in pairs]
 
 
 def _heading(seen: Moved, sensor: Orientation, time: np.ndarray, known: np.ndarray) -> float:
     """Angle (rad) about the vertical from a sensor's world to the video's: that which makes the level accelerations
-    most equal, each axis of the video's counted by its spread, which is the depth's noise in a view from the front."""
-    assert sensor.log.acceleration is not None
-    felt = np.stack([np.interp(time, sensor.log.time, v) for v in sensor.log.acceleration.T], axis=1)
+    most equal, each axis of the video's counted by its spread, which is the depth's noise in a view from the front.
+    NaN without accelerations."""
+    rows = () if sensor.log.acceleration is None else np.isfinite(sensor.log.acceleration).all(axis=1)
+    if sensor.log.acceleration is None or not np.any(rows):
+        return np.nan
+    felt = [np.interp(time, sensor.log.time[rows], v) for v in sensor.log.acceleration[rows].T]
+    felt = np.stack(felt, axis=1)
     felt = smooth(Rotation.from_quat(sensor.at(time)[0], scalar_first=True).apply(felt), SMOOTH_SLOW_S)
     inner = known.copy()
     inner[: int(EDGE_S / SAMPLE_S)] = inner[-int(EDGE_S / SAMPLE_S) :] = False
@@ -163,4 +184,4 @@ def _heading(seen: Moved, sensor: Orientation, time: np.ndarray, known: np.ndarr
     turned = (felt @ [1, 1j]) * np.exp(1j * angles)[:, None]
     error = ours - np.stack([turned.real, turned.imag], axis=-1)
     costs = np.einsum("ati,ij,atj->a", error, np.linalg.inv(np.cov(ours.T)), error)
-    return float(angles[np.argmin(costs)])
+    return float(angles[np.argmin(costs)]) if np.isfinite(costs).all() else np.nan

@@ -12,8 +12,9 @@ import pytest
 from scipy.signal import find_peaks
 from scipy.spatial.transform import Rotation
 
+from pbl_pipeline.cli.options import sensor_logs
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.sensors import Given, SensorLog, check_day, given_sensors, read_given
+from pbl_pipeline.sensors import Given, SensorLog, check_day, given_sensors, named, read_given
 from pbl_pipeline.sensors.given import segment_of
 from tests import worn_sensor
 from tests.worn_sensor import Swing
@@ -210,6 +211,11 @@ def changed(table: pd.DataFrame, what: str) -> pd.DataFrame:
         case "saturated":
             table[GYR] = np.clip(table[GYR] * 3, -4.4, 4.4)
             table = table.drop(columns=QUAT)
+        case "gyroscope off" | "an axis turned" | "gyroscope turned":
+            table[GYR] *= {"gyroscope off": [0, 0, 0], "an axis turned": [1, -1, 1]}.get(what, [-1, -1, -1])
+            table = table.drop(columns=QUAT)
+        case "orientation missing":
+            table.loc[n // 3 :, QUAT] = np.nan
         case "text":
             table = table.astype({"acc_x": object})
             table.loc[3, "acc_x"] = "n/a value"
@@ -234,6 +240,10 @@ def changed(table: pd.DataFrame, what: str) -> pd.DataFrame:
         ("milliseconds", "600 samples, 0.1 a second", ""),
         ("saturated", "the end of the sensor's range", "larger range"),
         ("text", "acc_x", ""),
+        ("gyroscope off", "turn gravity by ", "that it was on"),
+        ("an axis turned", "turn gravity by ", "signs"),
+        ("gyroscope turned", "turn gravity by ", "signs"),
+        ("orientation missing", "an orientation in 33% of the samples", ""),
     ],
 )
 def test_bad_input_is_named(tmp_path: Path, what: str, found: str, says: str):
@@ -306,12 +316,83 @@ def test_logs_of_other_recordings(tmp_path: Path):
         ("Lumbar", "pelvis"),
         ("femur_r", "thigh_r"),
         ("calcn_l_imu", "foot_l"),
+        ("RightLowerLeg", "shank_r"),
+        ("LeftUpperLeg", "thigh_l"),
+        ("RFoot", "foot_r"),
         ("torso_imu", None),
         ("Foot", None),
     ],
 )
 def test_segments_by_name(name: str, segment: str | None):
     assert segment_of(name) == segment
+
+
+DOT = "\n\nPacketCounter,SampleTimeFine,Quat_W,Quat_X,Quat_Y,Quat_Z\n1,1,1,0,0,0\n2,16667,1,0,0,0\n"
+QUATERNIONS = "\n".join(f"{i / 100},1,0,0,0,0" for i in range(99))
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("Format=7,x,y", "APDM"),
+        ("Test Name:,x\n\nTime,Right Ankle/Acceleration/X\n", "APDM"),
+        ("sep=,\nS_Timestamp_Unix_CAL,S_Gyro_X_CAL\n", "Shimmer"),
+        ("StartTime:,2021-02-30_20:21:13_804 GMT+8" + DOT, "day"),
+        ("OutputRate:,6.0.0Hz" + DOT, "6.0.0"),
+        ("// Update Rate: .Hz\nPacketCounter\tAcc_X\n1\t2\n", "Xsens"),
+        ("time_s,quat_w,quat_w,quat_x,quat_y,quat_z\n" + QUATERNIONS, "quat_w twice"),
+        ("time_s,quat_w,quat_x,quat_y,quat_z\n" + QUATERNIONS, "more cells than names"),
+        ("time_s" + ",c" * 20_000 + "\n", "16,384 columns"),
+        ("time_s" + "," * 9000 + "\n" + "1\n" * 9000, "fewer cells"),
+    ],
+)
+def test_a_broken_log_of_a_known_format_is_an_error(tmp_path: Path, text: str, found: str):
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    error = refused(f"shank_r={path}")
+    assert (error.code, found in error.found) == ("SENSOR_LOG", True)
+    with pytest.raises(PblError, match="SENSOR_LOG"):  # nor is it kept unread
+        named(Given(path))
+
+
+def test_only_logs_of_no_known_format_or_segment_are_kept_unread(tmp_path: Path):
+    for name, text in (("a.csv", ""), ("b.csv", "frame,x\n"), ("c.csv", Swing().own().to_csv(index=False))):
+        (tmp_path / name).write_text(text)
+        assert named(Given(tmp_path / name)) == [Given(tmp_path / name)]
+    assert "an empty file" in refused(f"shank_r={tmp_path / 'a.csv'}").found
+
+
+def test_counters_that_begin_again(tmp_path: Path):
+    """Movella DOT's packets after 65,535; Xsens sensors that start on two sides of it."""
+    swing = Swing()
+    path = worn_sensor.dot(swing, tmp_path / "dot.csv")
+    table = path.read_text().split("\n\n", 1)
+    rows = [row.split(",", 1) for row in table[1].splitlines()]
+    again = [f"{(65_400 + i) % 65_536},{row[1]}" for i, row in enumerate(rows[1:])]
+    path.write_text("\n".join([table[0], "", ",".join(rows[0]), *again]))
+    assert_is(read(f"shank_r={path}")[0], swing)
+    early, late = (tmp_path / f"MT_1-000_00B42D4{d}.txt" for d in "BC")
+    worn_sensor.xsens(swing, early, first=65_500)
+    worn_sensor.xsens(Swing(phase=1), late, first=4)
+    shank, thigh = read(f"shank_r={early}", f"thigh_r={late}")
+    assert (shank.time[0], thigh.time[0]) == pytest.approx((0.0, 0.4))
+
+
+def test_lists_with_semicolons_and_with_an_empty_last_cell(tmp_path: Path):
+    path = tmp_path / "list.csv"
+    for text in ("segment;file\nshank_r;a.csv\n", "segment,file,sensor\nshank_r,a.csv,,\n"):
+        path.write_text(text)
+        assert given_sensors(str(path)) == [Given(tmp_path / "a.csv", "shank_r")]
+
+
+def test_no_sensors_on_the_command_line():
+    assert sensor_logs(["none"]) == ()
+
+
+def test_two_logs_of_rates_alone_are_not_one_twice(tmp_path: Path):
+    a, b = (Swing(phase=p).own().drop(columns=ACC + QUAT) for p in (0, 1))
+    paths = [Swing().write(tmp_path / n, t) for n, t in (("a.csv", a), ("b.csv", b))]
+    assert "not both" in refused(f"shank_r={paths[0]}", f"thigh_r={paths[1]}").found
 
 
 # ---------------------------------------------------------------------------------------------------------- real files

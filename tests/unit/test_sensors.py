@@ -1,6 +1,8 @@
 """Wearable sensors: their orientation, where a fit with them starts, and what is said of them."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from pbl_pipeline.body import body_frames, load_body
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import fit_session
 from pbl_pipeline.fit.checks import _sensors
-from pbl_pipeline.fit.wearables import floor_shares
+from pbl_pipeline.fit.wearables import floor_shares, shares_of_floors
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.qc import FAIL, PASS, WARN
 from pbl_pipeline.sensors.log import SEGMENTS, SensorLog
@@ -116,6 +118,54 @@ def test_another_log_is_refused(truth, seen):
         clock_of(seen, [oriented(log)], 0.0)
 
 
+def test_a_log_that_ends_within_the_recording_or_rests_all_the_time(truth, seen):
+    """The video goes on 0.9 s after the log, which a stride would hide."""
+    (log,) = synthetic.worn(truth, 3, ("shank_r",), clock_s=0.0)[0]
+    sensor = oriented(cut(log, log.time < truth.time_s[-1] - 0.9))
+    assert clock_of(seen, [sensor], None)[0] == pytest.approx(0.0, abs=0.02)
+    with pytest.raises(ValueError, match="nowhere"):
+        clock_of(seen, [oriented(cut(log, log.time < -0.6))], -3.5)
+
+
+def cut(log: SensorLog, rows: np.ndarray) -> SensorLog:
+    assert log.rate is not None
+    assert log.acceleration is not None
+    return dataclasses.replace(log, time=log.time[rows], rate=log.rate[rows], acceleration=log.acceleration[rows])
+
+
+def test_an_acceleration_that_is_missing_does_not_change_the_heading(truth, seen):
+    """A pelvis' sensor that states its orientation."""
+    (log,), _ = synthetic.worn(truth, 3, ("pelvis",), clock_s=0.0)
+    own = dataclasses.replace(log, orientation=oriented(log).at(log.time)[0], rate=None)
+    assert own.acceleration is not None
+    lacking = own.acceleration.copy()
+    lacking[len(lacking) // 2] = np.nan
+    a, b = (
+        wahba(vectors(seen, 0.0, oriented(dataclasses.replace(own, acceleration=acc)), "pelvis"))
+        for acc in (own.acceleration, lacking)
+    )
+    assert np.rad2deg(Rotation.from_matrix(a @ b.T).magnitude()) < 2
+    none = dataclasses.replace(own, acceleration=np.full_like(lacking, np.nan))
+    assert len(vectors(seen, 0.0, oriented(none), "pelvis")) == 2
+
+
+def test_the_length_of_a_run_counts_not_that_of_the_log():
+    sensor = oriented(turning(20.0, slice(500, 550))[0])
+    late, early = sensor.part(np.arange(6, 9, 0.1)), sensor.part(np.arange(1, 3, 0.1))
+    assert (late.settled, early.settled) == (True, False)
+    assert early.span == pytest.approx((0.0, 4.99))
+
+
+def test_a_first_solution_has_no_variances(monkeypatch):
+    from pbl_pipeline.fit import lanes
+
+    monkeypatch.setattr(lanes, "_finish_one", lambda *_: pytest.fail("variances of a solution that is not the last"))
+    monkeypatch.setattr(lanes, "_kept", lambda end: end)
+    end: Any = SimpleNamespace(latest=SimpleNamespace(x=np.zeros(1), dispersion=np.ones(1)))
+    found = lanes.fetch(end, end, last=False)
+    assert (found.variance, found.x) == (None, [0.0])
+
+
 @pytest.mark.parametrize("exchanged", [(), ("shank_r", "shank_l"), ("thigh_r", "thigh_l"), ("shank_l", "foot_l")])
 def test_exchanged_sensors_are_named(truth, seen, exchanged):
     to = dict(zip(exchanged, reversed(exchanged), strict=True))
@@ -166,6 +216,21 @@ def test_least_standard_deviations_fall_where_both_segments_have_sensors():
     names = ("hip_flexion_r", "hip_flexion_l", "knee_angle_r", "ankle_angle_r", "lumbar_bending")
     shares = floor_shares(names, ["pelvis", "thigh_r", "shank_r"])
     assert shares.tolist() == [0.65, 0.85, 0.65, 0.85, 1.0]
+
+
+def test_a_sensor_that_measured_nothing_in_a_trial_leaves_its_floors():
+    names, n = ("knee_angle_r",), 4
+    sensors = [SimpleNamespace(log=SimpleNamespace(segment=s)) for s in ("thigh_r", "shank_r")]
+    count = np.ones((2 * n, 2))
+    count[n:, 1] = 0
+    session: Any = SimpleNamespace(
+        worn=SimpleNamespace(sensors=sensors),
+        body=SimpleNamespace(joint_names=names),
+        arrays=[SimpleNamespace(used=np.ones(n, bool))] * 2,
+        frames=lambda i: slice(i * n, (i + 1) * n),
+    )
+    problem: Any = SimpleNamespace(wearables=SimpleNamespace(count=count))
+    assert shares_of_floors(session, problem)[:, 0].tolist() == [0.65] * n + [0.85] * n
 
 
 def part(whole: Keypoints, at: slice) -> Keypoints:

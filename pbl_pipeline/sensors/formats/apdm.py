@@ -8,7 +8,7 @@ z up (seen in the real files; the documents call the world North, West, Up).
 
 from __future__ import annotations
 
-from ..samples import Format, LogFile, Samples, numbers, table
+from .samples import Format, LogFile, Samples, numbers, table
 
 _UNITS = {"Acceleration": "m/s^2", "Angular Velocity": "rad/s"}
 

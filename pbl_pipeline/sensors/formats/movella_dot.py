@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from ..samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
+from .samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
 
 _MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)[ _](\d\d:\d\d:\d\d)[._](\d{3}) (?:GMT|UTC)?(?:([+-]\d\d?):?(\d\d)?)?$")
 _LINE = re.compile(r"^(\w[\w ]*):\s*,?\s*([^,\n]*)", re.MULTILINE)
@@ -40,7 +40,8 @@ def _reads(file: LogFile) -> list[Samples]:
     turns = numbers(file, found, [f"Quat_{k}" for k in "WXYZ"])
     if turns is None:
         turns = quaternions(euler_deg=numbers(file, found, ["Euler_X", "Euler_Y", "Euler_Z"]))
-    counter, hz = numbers(file, found, "PacketCounter"), re.match(r"[\d.]+", about.get("OutputRate", ""))
+    counter = numbers(file, found, "PacketCounter")
+    hz = re.match(r"[\d.]+", about.get("OutputRate", ""))
     name = about.get("DeviceTag") or file.stem
     start = _start(about.get("StartTime", ""))
     return [
@@ -52,8 +53,9 @@ def _reads(file: LogFile) -> list[Samples]:
             numbers(file, found, ["Acc_X", "Acc_Y", "Acc_Z"]),
             turns,
             None if start is None else start - float(stamp[0]),
-            counter,
+            None if counter is None else counted_on(counter, 2**16),
             float(hz[0]) if hz else None,
+            2**32 / 1e6,
         )
     ]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..samples import Format, LogFile, Samples, numbers, table
+from .samples import Format, LogFile, Samples, numbers, table
 
 
 def _knows(file: LogFile) -> bool:
@@ -23,7 +23,7 @@ def _reads(file: LogFile) -> list[Samples]:
     if stamp is None:
         raise file.refuse("no column time", "times in s and a column of quaternions for each sensor")
     out = []
-    for name in [str(c) for c in found.columns if c != "time" and not str(c).startswith("Unnamed")]:
+    for name in [str(c) for c in found.columns if c not in ("", "time")]:
         cells = found[name].str.split(",", expand=True)
         if cells.shape[1] != 4:
             raise file.refuse(f"column {name} with {cells.shape[1]} numbers in a cell", "quaternions w,x,y,z")

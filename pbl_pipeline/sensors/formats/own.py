@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 
-from ..samples import Format, LogFile, Samples, numbers, table
+from .samples import Format, LogFile, Samples, numbers, table
 
 
 def _knows(file: LogFile) -> bool:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pbl_pipeline.errors import PblError
 
-from ..samples import Samples, log_error, opened
 from . import apdm, movella_dot, opensense, own, sensor_logger, shimmer, xsens
+from .samples import Samples, log_error, opened, unknown_error
 
 FORMATS = (
     xsens.FORMAT,
@@ -26,15 +26,19 @@ def read_samples(path: Path, rate_hz: float | None = None, called: str | None = 
 
     `rate_hz`: for a file that does not state its own; `called`: name of the file of which this one is a copy.
 
-    Raises `PblError` FILE_MISSING, SENSOR_LOG.
+    Raises `PblError` FILE_MISSING, FILE_FORMAT (no known format), SENSOR_LOG.
     """
+    file, form = opened(path, rate_hz, called), ""
     try:
-        file = opened(path, rate_hz, called)
         found = next((f for f in FORMATS if f.knows(file)), None)
         if found is None:
-            raise file.refuse("a file of no known format", ", ".join(f.name for f in FORMATS))
+            raise unknown_error("a file of no known format", ", ".join(f.name for f in FORMATS), key=path)
+        form = found.name
         return list(found.reads(file))
     except PblError as error:
         if error.code != "PHONE_LOG":
             raise
         raise log_error(error.found, error.expected, key=called or path) from error
+    except (ValueError, LookupError) as error:
+        found = f"{form}: {type(error).__name__}: {error}"[:300]
+        raise file.refuse(found, "a whole file as the program writes it") from error

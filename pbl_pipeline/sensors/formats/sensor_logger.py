@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.video.sensor_logger import member_text
 
-from ..samples import Format, LogFile, Samples, numbers, table
+from .samples import Format, LogFile, Samples, numbers, table
 
 _NAME, _G = "WristMotion", 9.80665
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..samples import Format, LogFile, Samples, numbers, table
+from .samples import Format, LogFile, Samples, numbers, table
 
 _STAMP = "_Timestamp_Unix_CAL"
 _FACTORS = {"deg/s": np.pi / 180, "rad/s": 1.0, "m/(s^2)": 1.0, "m/(sec^2)": 1.0}

@@ -12,7 +12,7 @@ import re
 
 import numpy as np
 
-from ..samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
+from .samples import Format, LogFile, Samples, counted_on, numbers, quaternions, table
 
 _MATRIX = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
 _RATE = re.compile(r"^//\s*Update Rate:\s*([\d.]+)\s*Hz", re.MULTILINE)
@@ -38,9 +38,9 @@ def _reads(file: LogFile) -> list[Samples]:
     counter, fine = (numbers(file, found, name) for name in ("PacketCounter", "SampleTimeFine"))
     counter = np.arange(len(found)) if counter is None else counted_on(counter, 2**16)
     if fine is not None:
-        stamp = counted_on(fine, 2**32) / 1e4
+        stamp, wraps_s = counted_on(fine, 2**32) / 1e4, 2**32 / 1e4
     elif hz:
-        stamp = counter / hz
+        stamp, wraps_s = counter / hz, 2**16 / hz
     else:
         raise file.refuse(
             "neither Update Rate in its header nor SampleTimeFine", "the rate: rate_hz in a file of sensors"
@@ -53,7 +53,7 @@ def _reads(file: LogFile) -> list[Samples]:
     recording, device = m.groups() if (m := _DEVICE.fullmatch(file.stem)) else ("", file.stem)
     rate, acceleration = (numbers(file, found, [f"{what}_{axis}" for axis in "XYZ"]) for what in ("Gyr", "Acc"))
     return [
-        Samples(device, f"Xsens {recording}", stamp, rate, acceleration, turns, counter=counter, stated_hz=hz),
+        Samples(device, f"Xsens {recording}", stamp, rate, acceleration, turns, None, counter, hz, wraps_s),
     ]
 
 

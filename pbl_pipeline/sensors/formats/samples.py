@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import collections
+import csv
 import dataclasses
 import functools
 import io
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,8 +21,9 @@ from pbl_pipeline.errors import PblError, os_errors_as
 #: Bytes of a log, unpacked: six sensors in one file at 128 Hz for 20 minutes.
 MAX_LOG = 4 * bounded.MAX_TEXT
 
-log_error = functools.partial(
-    PblError, "SENSOR_LOG", next_step="export it again as docs/imu.md says, or leave this sensor out"
+_NEXT = "export it again as docs/imu.md says, or leave this sensor out"
+log_error, unknown_error = (
+    functools.partial(PblError, code, next_step=_NEXT) for code in ("SENSOR_LOG", "FILE_FORMAT")
 )
 
 
@@ -27,7 +31,8 @@ log_error = functools.partial(
 class Samples:
     """Samples of one sensor in a file: N rows in SI units and in the axes of the sensor, NaN where a cell is empty.
 
-    Sensors with the same `clock` are synchronous; the stamps of "UTC" are seconds since 1970. A `counter` counts
+    Sensors with the same `clock` are synchronous; the stamps of "UTC" are seconds since 1970, others begin at 0 again
+    after `wraps_s`, where that is known. A `counter` counts
     samples, of which the file states `stated_hz` a second. `orientation` (quaternions, scalar first) is from the sensor
     to a world whose z points up, as the program's documents say; `checked` compares it with the accelerations.
     """
@@ -41,6 +46,7 @@ class Samples:
     start_utc: float | None = None  # s since 1970 at stamp 0
     counter: np.ndarray | None = None  # (N,)
     stated_hz: float | None = None
+    wraps_s: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,14 +80,20 @@ class Format:
 
 
 def opened(path: Path, rate_hz: float | None = None, called: str | None = None) -> LogFile:
-    """Read the text of a log. Raises `PblError` FILE_MISSING, SENSOR_LOG (no text, or too long)."""
+    """Read the text of a log. Raises `PblError` FILE_MISSING, FILE_FORMAT (no text, or too long)."""
     if path.is_dir() or path.suffix.lower() == ".zip":
         return LogFile(path, "", rate_hz, called)
+    name = called or path
     with os_errors_as("FILE_MISSING", "the log of a wearable sensor", "check the path", path):
         try:
-            return LogFile(path, bounded.read_text(path, MAX_LOG), rate_hz, called)
+            text = bounded.read_text(path, MAX_LOG)
         except ValueError as error:
-            raise log_error(f"no text to read ({error})", "a log as docs/imu.md says", key=called or path) from error
+            raise unknown_error(
+                f"no text to read ({error})", "a log as docs/imu.md says", key=called or path
+            ) from error
+    if not text.strip():
+        raise unknown_error("an empty file", "a log as docs/imu.md says", key=name)
+    return LogFile(path, text, rate_hz, called)
 
 
 def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] = ()) -> pd.DataFrame:
@@ -89,17 +101,31 @@ def table(file: LogFile, header: int, separator: str = ",", skip: Sequence[int] 
 
     Raises `PblError` SENSOR_LOG.
     """
+    expected = "rows with a cell for each name in the header"
     try:
-        bounded.count_rows(file.text.count("\n"))
-        lines = [*range(header), *skip]
+        line = next(itertools.islice(io.StringIO(file.text), header, None), "")
+        names = [name.strip() for name in next(csv.reader([line], delimiter=separator), [])]
+        rows = file.text.count("\n")
+        bounded.count_rows(rows)
+        bounded.count_cells(len(names), len(names))
+        if rows * len(names) > len(file.text):
+            raise ValueError("most rows have fewer cells")
         found = pd.read_csv(
-            io.StringIO(file.text), sep=separator, skiprows=lines, index_col=False, dtype=str, comment="#"
+            io.StringIO(file.text),
+            sep=separator,
+            header=None,
+            names=[*range(len(names) + 1)],  # one more: cells beyond the last name
+            skiprows=[*range(header + 1), *skip],
+            index_col=False,
+            dtype=str,
+            comment="#",
         )
-    except (ValueError, pd.errors.ParserError) as error:
-        raise file.refuse(f"no table ({error})", "rows with a cell for each name in the header") from error
-    names = [str(name).strip() for name in found.columns]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
+    except (ValueError, csv.Error) as error:
+        raise file.refuse(f"no table ({error})", expected) from error
+    if twice := [name for name, n in collections.Counter(names).items() if name and n > 1]:
         raise file.refuse(f"the column {twice[0]} twice", "each column once")
+    if found.pop(len(names)).notna().any():
+        raise file.refuse("rows with more cells than names", expected)
     found.columns = names
     return found
 
