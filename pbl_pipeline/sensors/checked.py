@@ -137,9 +137,9 @@ def _check_gravity(acceleration: np.ndarray, refuse: Refuse) -> None:
     least, typical = np.quantile(length[np.isfinite(length)], (0.1, 0.5)) if np.isfinite(length).any() else (0.0, 0.0)
     if _GRAVITY[0] <= typical <= _GRAVITY[1]:
         return
-    units = (unit for unit, g in (("g", 1.0), ("mg", 1000.0)) if 0.75 * g <= typical <= 1.3 * g)
+    units = (words for words, g in ((", as in g", 1.0), (", as in mg", 1000.0)) if 0.75 * g <= typical <= 1.3 * g)
     in_g = next(units, None) if least > 0.5 * typical else None  # without gravity it comes to nearly 0
-    cause = f", as in {in_g}" if in_g else ", as without gravity" if typical < _GRAVITY[0] else ""
+    cause = in_g or (", as without gravity" if typical < _GRAVITY[0] else "")
     refuse(
         said("accelerations of typically {a:.3g}{cause}", a=typical, cause=said(cause)),
         "m/s2 with gravity, 9.81 at rest",

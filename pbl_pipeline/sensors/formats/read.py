@@ -32,7 +32,7 @@ def read_samples(path: Path, rate_hz: float | None = None, called: str | None = 
     try:
         found = next((f for f in FORMATS if f.knows(file)), None)
         if found is None:
-            raise unknown_error("a file of no known format", ", ".join(f.name for f in FORMATS), key=path)
+            raise unknown_error("a file of no known format", ", ".join(f.name for f in FORMATS), key=called or path)
         form = found.name
         return list(found.reads(file))
     except PblError as error:
