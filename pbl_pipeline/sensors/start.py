@@ -35,8 +35,9 @@ EDGE_S = 0.2
 RANGE_S, FINE_S = 0.5, 0.15
 #: Correlations (of angular speeds) closer than this at times further apart than this (s) do not tell which is right.
 AMBIGUOUS, APART_S = 0.05, 0.3
-#: Share of a video that the log must cover, and the least correlation: synthetic walks have 0.8 and more, with sensors
-#: exchanged 0.37 and more (`better_pairing` names those), with standing still 0.2. Another walk can have 0.9.
+#: Share of a video that the log must cover, and the least correlation where the clock is not stated: synthetic walks
+#: have 0.8 and more, with a pair of sensors exchanged 0.37 and more (`better_pairing` names those), with standing still 0.2.
+#: Another walk can have 0.9.
 COVERED, LEAST = 0.5, 0.3
 #: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
 RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
@@ -79,8 +80,8 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
     there (their weighted correlation, -1 to 1).
 
-    Raises `ValueError` if the log does not cover `COVERED` of the recording, fits it nowhere, or as well at another
-    stride.
+    Raises `ValueError` if the log does not cover `COVERED` of the recording; without `stated` also if it fits it
+    nowhere, or as well at another stride.
     """
     n = len(seen.time)
     first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
@@ -105,7 +106,7 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     away = np.abs(np.arange(len(score)) - best) * SAMPLE_S > APART_S
     if stated is None and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
         raise ValueError("the log fits the recording at several times")
-    if score[best] < LEAST:
+    if stated is None and score[best] < LEAST:
         raise ValueError("the log fits the recording nowhere")
     lags = np.arange(max(0, best - int(FINE_S / SAMPLE_S)), min(len(score), best + int(FINE_S / SAMPLE_S) + 1))
     agreement = [sum(_turned_sum(seen.rate[k], r[i : i + n]) for k, r in rates.items()) for i in lags]
