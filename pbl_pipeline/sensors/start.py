@@ -35,10 +35,10 @@ EDGE_S = 0.2
 RANGE_S, FINE_S = 0.5, 0.15
 #: Correlations (of angular speeds) closer than this at times further apart than this (s) do not tell which is right.
 AMBIGUOUS, APART_S = 0.05, 0.3
-#: Share of a video that the log must cover, and the least correlation where the clock is not stated: synthetic walks
-#: have 0.8 and more, with a pair of sensors exchanged 0.37 and more (`better_pairing` names those), with standing still 0.2.
-#: Another walk can have 0.9.
-COVERED, LEAST = 0.5, 0.3
+#: Share of a video that the log must cover; of the turning (rad/s, mean of an axis) of a person who moves, which the
+#: sensors must show: those that lie still are of another time. The correlation does not tell: that of another walk can
+#: be 0.9, with sensors exchanged 0.2, which `better_pairing` names.
+COVERED, MOVES, TURNING = 0.5, 0.5, 0.3
 #: Errors of a video's angular velocity (rad/s) and of its verticals (rad), which weigh them against each other.
 RATE_SD, UP_SD, HEADING_SD = 0.8, np.deg2rad(6.0), np.deg2rad(15.0)
 
@@ -80,8 +80,8 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
     there (their weighted correlation, -1 to 1).
 
-    Raises `ValueError` if the log does not cover `COVERED` of the recording; without `stated` also if it fits it
-    nowhere, or as well at another stride.
+    Raises `ValueError` if the log does not cover `COVERED` of the recording, fits it nowhere, or, where no time is
+    stated, as well at another stride.
     """
     n = len(seen.time)
     first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
@@ -106,7 +106,8 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     away = np.abs(np.arange(len(score)) - best) * SAMPLE_S > APART_S
     if stated is None and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
         raise ValueError("the log fits the recording at several times")
-    if stated is None and score[best] < LEAST:
+    ours = float(np.mean([np.abs(seen.rate[k]) for k in rates]))
+    if ours > MOVES and np.nanmean([np.abs(r[best : best + n]) for r in rates.values()]) < TURNING * ours:
         raise ValueError("the log fits the recording nowhere")
     lags = np.arange(max(0, best - int(FINE_S / SAMPLE_S)), min(len(score), best + int(FINE_S / SAMPLE_S) + 1))
     agreement = [sum(_turned_sum(seen.rate[k], r[i : i + n]) for k, r in rates.items()) for i in lags]

@@ -124,7 +124,7 @@ def test_a_log_that_ends_within_the_recording_or_rests_all_the_time(truth, seen)
     sensor = oriented(cut(log, log.time < truth.time_s[-1] - 0.9))
     assert clock_of(seen, [sensor], None)[0] == pytest.approx(0.0, abs=0.02)
     with pytest.raises(ValueError, match="nowhere"):
-        clock_of(seen, [oriented(cut(log, log.time < -0.6))], None)
+        clock_of(seen, [oriented(cut(log, log.time < -0.6))], -3.5)
 
 
 def cut(log: SensorLog, rows: np.ndarray) -> SensorLog:
