@@ -41,14 +41,15 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
 
 
 @repeated
-def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False) -> T:
-    """Run `work` in a transaction in which every query sees what others have committed; again where another process
-    inserted the same at that moment, unless `until` holds then."""
+def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False, *, fresh: bool = False) -> T:
+    """Run `work` in a transaction; again where another process inserted the same at that moment, unless `until` holds
+    then. `fresh`: every query sees what others have committed, and not the state before a lock that `work` waits
+    for."""
     for attempt in range(_ATTEMPTS):
         try:
             connection: Any = lab.schema.connection
-            # For this transaction only: a snapshot would be from before a lock that `work` waits for.
-            connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
+            if fresh:
+                connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
             with connection.transaction:
                 return work()
         except DuplicateError:

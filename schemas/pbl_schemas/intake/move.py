@@ -122,7 +122,7 @@ def carry_out(plan: Move) -> None:
         hand_on(list(plan.files), old, new)
 
     with _moved_files(plan) as paths:
-        in_transaction(lambda: work(paths))
+        in_transaction(lambda: work(paths), fresh=True)
     for number in plan.files:
         forget_errors(number)
 

@@ -168,7 +168,7 @@ def _register(one: Recording, chosen: Mapping[str, str], named: set[str]) -> lis
         return _update(one, known, chosen, named)
     one.complete(chosen)
     try:
-        done = in_transaction(lambda: write([one], chosen), until=lambda: bool(registered(one.files)))
+        done = in_transaction(lambda: write([one], chosen), lambda: bool(registered(one.files)), fresh=True)
     except DuplicateError:
         if not (known := registered(one.files)):
             raise

@@ -194,7 +194,7 @@ class OneCamera(Recording):
     def update(self, row: Mapping[str, Any]) -> list[str]:
         done = self._new_camera(row) if self.visit.camera_file else []
         if self.sensors:
-            done += in_transaction(lambda: self._new_sensors(row))
+            done += in_transaction(lambda: self._new_sensors(row), fresh=True)
         if done:
             forget_errors(int(row["video_id"]))  # a failure with the other camera or log may not recur
         return done
