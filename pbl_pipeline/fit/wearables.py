@@ -134,8 +134,8 @@ def with_wearables(
     zeros: Any = [np.zeros(shape, np.float32) for shape in ((m, 3), (n, m, 3), (m, 3), (n, 2))]
     packed: dict[str, Any] = {k: np.asarray(v, np.float32) for k, v in values.items()}
     wearables = Wearables(index, **packed)
-    longest = max(range(len(seen)), key=lambda i: count[session.frames(i)].sum())
-    moves_with = better_pairing(seen[longest], clocks[longest], sensors)
+    fullest = max(range(len(seen)), key=lambda i: count[session.frames(i)].sum())
+    moves_with = better_pairing(seen[fullest], clocks[fullest], sensors)
     return dataclasses.replace(p, wearables=wearables), dataclasses.replace(start, wearing=Wearing(*zeros)), moves_with
 
 

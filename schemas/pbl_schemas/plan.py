@@ -17,7 +17,7 @@ from .datajoint_setup import dj
 from .jobs import jobs_of
 from .method_rows import method_row, resolve_method
 from .rows import inside, utc_now
-from .transactions import repeated
+from .transactions import read_committed, repeated
 
 #: Columns of one fit: recordings of one kind of a session, seen through one chain of methods.
 GROUP = ("session_id", "tracking_method", "keypoint_method", "fit_method", "fit_set_kind")
@@ -134,11 +134,7 @@ def locked(session_id: int) -> Iterator[None]:
 
     Two workers that see different trials ready would otherwise both make their set the current one.
     """
-    connection = fit.schema.connection
-    assert connection is not None
-    # For this transaction only: the snapshot of the default level would be from before the lock.
-    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
-    with connection.transaction:
+    with read_committed(fit.schema.connection):
         session.lock(session_id)
         yield
 

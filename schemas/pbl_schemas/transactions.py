@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
 import pymysql
@@ -40,17 +41,23 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
     return wrapper
 
 
+@contextmanager
+def read_committed(connection: Any) -> Iterator[None]:
+    """A transaction in which every query sees what others have committed, and not the state before a lock that it waits
+    for; without locks on what it reads."""
+    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")  # of the next transaction only
+    with connection.transaction:
+        yield
+
+
 @repeated
 def in_transaction(work: Callable[[], T], until: Callable[[], bool] = lambda: False, *, fresh: bool = False) -> T:
     """Run `work` in a transaction; again where another process inserted the same at that moment, unless `until` holds
-    then. `fresh`: every query sees what others have committed, and not the state before a lock that `work` waits
-    for."""
+    then. `fresh`: one that is `read_committed`."""
     for attempt in range(_ATTEMPTS):
         try:
             connection: Any = lab.schema.connection
-            if fresh:
-                connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
-            with connection.transaction:
+            with read_committed(connection) if fresh else connection.transaction:
                 return work()
         except DuplicateError:
             if until() or attempt == _ATTEMPTS - 1:

@@ -11,7 +11,7 @@ from datajoint import DataJointError
 import pbl_schemas
 from docs_site import table_map
 from pbl_schemas import fit, gdi, lab, session, video
-from pbl_schemas.chain import ON_REQUEST
+from pbl_schemas.chain import ON_REQUEST, tables
 from pbl_schemas.datajoint_setup import dj
 from pbl_workers.populate import populate
 from tests.rows import register
@@ -87,10 +87,8 @@ def test_two_results_with_the_video_between_them_are_of_one_visit(visits: None):
 def test_the_section_of_joins_names_every_computed_table(visits: None):
     rows = [row for row in table_map.joins() if row.startswith("| know their")]
     named = {name: "session_id" in row for row in rows for name in re.findall(r"`([a-z]+\.\w+)`", row.split("|")[2])}
-    computed = pbl_schemas.computed_tables()
-    modules = {t: t.__module__.removeprefix("pbl_schemas.").removesuffix("_sets") for t in computed}
-    tables = {f"{module}.{t.__name__}": t for t, module in modules.items()}
-    assert named == {name: "session_id" in table.heading.names for name, table in tables.items()}
+    computed = {name: table for name, table in tables().items() if table in pbl_schemas.computed_tables()}
+    assert named == {name: "session_id" in table.heading.names for name, table in computed.items()}
 
 
 def test_a_delete_behind_a_restricted_restriction_is_datajoints_own_error(visits: None):

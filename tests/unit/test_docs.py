@@ -24,6 +24,7 @@ from pbl_pipeline.cli import TASKS
 from pbl_pipeline.errors import CODES
 from pbl_pipeline.report.words import VERDICT_WORDS
 from pbl_schemas import STAGES, computed_tables
+from pbl_schemas.chain import tables
 from tests import demo_block, pages
 from tests.command import pbl
 from tests.source import PACKAGES, files
@@ -142,8 +143,8 @@ def test_the_page_of_reports_names_every_verdict():
 
 def test_the_chain_of_the_contributors_page_is_the_tables_and_their_functions():
     rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|", pages.text("docs/house.md"), re.MULTILINE)
-    modules = {t: t.__module__.removeprefix("pbl_schemas.").removesuffix("_sets") for t in computed_tables()}
-    computed = [f"{module}.{table.__name__}" for table, module in modules.items()]
+    names = {table: name for name, table in tables().items()}
+    computed = [names[table] for table in computed_tables()]
     beside = {"validation.KinematicError", "privacy.Deidentified"}  # on request
     assert [name for name, _ in rows if name != "fit.FitSet"] == [name for name in computed if name not in beside]
     public = api.public(ROOT)

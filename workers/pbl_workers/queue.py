@@ -25,7 +25,7 @@ from pbl_schemas import chain, computed_tables, fit, video
 from pbl_schemas.connection import dj
 from pbl_schemas.jobs import COUNTS, jobs_of, keys_of
 from pbl_schemas.rows import parts
-from pbl_schemas.transactions import repeated
+from pbl_schemas.transactions import read_committed, repeated
 
 from .registry import LONG, LONG_FRAMES, NEW
 
@@ -116,8 +116,7 @@ def _is_long(keys: Any) -> str:
 def _committed(connection: Any, statement: Callable[[], int]) -> int:
     """Run one statement that reads much and writes little: without locks on what it reads, again after a deadlock.
     Returns how many rows it changed."""
-    connection.query("SET TRANSACTION ISOLATION LEVEL READ COMMITTED")
-    with connection.transaction:
+    with read_committed(connection):
         return statement()
 
 
