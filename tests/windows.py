@@ -79,7 +79,7 @@ class Chromium:
 
 
 class Firefox:
-    """A window of a Firefox, with cookies of its own."""
+    """A window of a Firefox, with its own cookies."""
 
     def __init__(self, send: Callable[..., Any], width: int, height: int) -> None:
         self._send = send

@@ -1,7 +1,7 @@
 """Wearable sensors: the orientation of a segment and the one that a sensor on it measured.
 
-With R the rotation of the segment, S that of the sensor on it, M what the sensor measured in a world of its own, A from
-that world to the trial's, and b the gyroscope's bias, which turns M by exp(-B b) since the middle of the trial, the
+With R the rotation of the segment, S that of the sensor on it, M what the sensor measured in its own world, A from that
+world to the trial's, and b the gyroscope's bias, which turns M by exp(-B b) since the middle of the trial, the
 error is log(R S (A exp(-B b) M)^-1). It comes from soft tissue, which has a memory, so each frame's error is compared
 with the next one's.
 """

@@ -30,8 +30,8 @@ FEWEST, SETTLES_S = 20, 8.0
 class Orientation:
     """Rotations of a sensor, its axes to a world whose z is up, in unbroken runs of samples.
 
-    runs: of each, times (T,) in s of the log, increasing, and quaternions (T, 4), scalar first. Each run has a heading
-    of its own.
+    runs: of each, times (T,) in s of the log, increasing, and quaternions (T, 4), scalar first. Each run has its own
+    heading.
     """
 
     log: SensorLog

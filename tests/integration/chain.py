@@ -176,7 +176,7 @@ def install(patch: pytest.MonkeyPatch) -> None:
 
 
 def replace(patch: pytest.MonkeyPatch, **functions: Any) -> None:
-    """Put these functions in place of the stages of their names."""
+    """Put these functions instead of the stages of their names."""
     for name, function in functions.items():
         patch.setattr(STAGES[name], name, function)
 

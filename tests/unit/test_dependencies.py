@@ -141,7 +141,7 @@ def test_no_module_puts_something_into_another(package: str):
 
 
 def _put_in(tree: ast.Module) -> list[str]:
-    """Assignments to attributes of what was imported from our packages (DataJoint's settings are no module's)."""
+    """Assignments to attributes of what was imported from our packages (not to DataJoint's settings)."""
     imported: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.level or str(node.module).startswith("pbl_")):
