@@ -817,7 +817,7 @@ def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, monkey
 
 
 def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):
-    """Its log beside it could be that of a registered one: the tables say so, and are not asked in a thread of files."""
+    """Its log beside it could be that of a registered one: the tables know, and no thread of files asks them."""
     target = tmp_path / "archive" / "P001" / "2026-01-10" / "0123-walk.mp4"
     note_placed(tmp_path / "archive", target)
     target.parent.mkdir(parents=True)
