@@ -23,11 +23,12 @@ from click.testing import CliRunner
 import pbl_pipeline.fit
 import pbl_pipeline.video
 import pbl_schemas
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.fit import METHODS
 from pbl_schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.cli.why import why as why_command
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import embedded
 from pbl_schemas.reading.status import live_workers, pipeline_status
 from pbl_schemas.reading.why import why
@@ -588,6 +589,16 @@ def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: 
     assert work().failed == 2
     with pytest.raises(PblError, match="USAGE"):
         requeue.retry(table="Tables")
+
+
+def test_the_cause_of_a_code_decides_what_is_tried_again_every_night(tables: None):
+    own = {"status": "error", "priority": 5}
+    failed = [{"video_id": i, "error_message": f"{code}: why", **own} for i, code in enumerate(CODES)]
+    jobs_of(video.VideoInfo).insert(failed)
+    again = {code for code, one in CODES.items() if one.cause == MACHINE} - {"INTERNAL", "TIME_LIMIT"}
+    assert {"FILE_UNWRITABLE", "STORE_FULL", "PACKAGE_MISSING", "WORKER_CRASH"} < again
+    assert requeue.retry_outside() == dict.fromkeys(again, 1)
+    assert len(video.VideoInfo.jobs.pending) == len(again)
 
 
 def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: Path):

@@ -7,7 +7,7 @@ import datetime
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_schemas import computed_tables, fit, gait, gdi, keypoints, kinetics, tracking, video
 from pbl_schemas.datajoint_setup import columns_read_once, dj
 from pbl_schemas.intake import Methods
@@ -16,23 +16,24 @@ from pbl_schemas.jobs import jobs_of, keys_of
 from pbl_schemas.method_names import keys_named
 from pbl_schemas.method_rows import resolve_method
 from pbl_schemas.plan import default_fit, plan_fits, unsuited
+from pbl_schemas.reading.status import error_counts, queue_counts
 from pbl_schemas.rows import delete_below, inside, parts
 
 from . import queue
 from .registry import AGAIN, table_named
 
-#: Errors whose cause lies outside of the recording and may be gone tomorrow.
-OUTSIDE = (
-    "ASSET_MISSING",
-    "MODEL_MISSING",
-    "VIDEO_MISSING",
-    "WORKER_CRASH",
-    "DEVICE_UNAVAILABLE",
-    "STORE_UNAVAILABLE",
-    "MACHINE_SHORT",
-)
+#: Codes of the machine that the same program and limits meet again.
+_STAY = ("INTERNAL", "TIME_LIMIT")
 #: Rows deleted in one transaction, and most of which the dependent ones are counted before.
 CHUNK = 200
+
+
+def retry_outside() -> dict[str, int]:
+    """Make error rows pending again whose cause lies in the machine or its services (`errors.CODES`) and may be gone
+    tomorrow; code -> how many."""
+    server = video.Video.connection
+    there = {code for _, code in error_counts(server, queue_counts(server))} - {*_STAY}
+    return {code: sum(retry(code).values()) for code in sorted(there) if CODES[code].cause == MACHINE}
 
 
 def retry(
