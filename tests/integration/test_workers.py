@@ -609,7 +609,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
         for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)
     }
     plan = requeue.plan_new_method("SessionFit", "paper-2025")
-    assert (len(plan.add), plan.outdated) == (1, [])
+    assert (len(plan.add), len(plan.outdated)) == (1, 0)
     list(requeue.carry_out(plan))
     pending = {t: c["pending"] for t, c in jobs_left().items()}
     assert pending == {"TrialInput": 2}  # nothing above the fit
@@ -624,7 +624,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
     assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts(order_by="KEY")] == [
         r["fit_computed"] for r in before["SessionFit"]
     ]
-    assert requeue.plan_new_method("SessionFit", "paper-2025").add == []
+    assert not requeue.plan_new_method("SessionFit", "paper-2025").add
     assert METHODS["paper-2025"].name == "paper-2025"
     with pytest.raises(PblError, match="USAGE"):
         requeue.plan_new_method("VideoInfo", "paper-2025")
@@ -634,7 +634,7 @@ def test_results_are_computed_again_behind_new_work(tables: None, tmp_path: Path
     register(*videos(tmp_path, "walk1"), session_label="1")
     work()
     plan = requeue.plan_again("GaitEvents", before=datetime.datetime(2000, 1, 1))
-    assert plan.outdated == []
+    assert not plan.outdated
     plan = requeue.plan_again("GaitEvents", since=datetime.datetime(2000, 1, 1))
     assert len(plan.outdated) == 1
     assert any("gait_cycle" in name for name in plan.below)
