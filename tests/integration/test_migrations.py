@@ -463,7 +463,7 @@ def test_slices_of_visits_whose_words_become_codes_are_named(put: Put):
     said = "changes: 2 visits of the slice of words; a backup of before has its numbers"
     assert migrations.migrate(dry_run=True).touched == [said]
     migrations.migrate()
-    assert study.Visit.fetch("assistive_device", order_by="session_id").tolist() == ["none", "cane", "my own"]
+    assert study.Visit.to_arrays("assistive_device", order_by="session_id").tolist() == ["none", "cane", "my own"]
     assert slices.changes("of words") == [f"visit 2026-0{n}-01 of P001 has other rows" for n in (3, 6)]
 
 

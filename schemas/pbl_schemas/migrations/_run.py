@@ -221,9 +221,8 @@ def _touched(conn: Any, due: Sequence[Migration]) -> list[str]:
         out += [f"changes: the check {c} of {said}, which {who} accepted, is to be accepted again" for c, who in checks]
         of_slices.update(names)
     for some in parts({number for m in due for number in m.restated(conn)}):
-        of_slices.update(
-            conn.query(f"SELECT study_slice, session_id FROM {members} WHERE {inside('session_id', some)}")
-        )  # noqa: S608
+        frozen = f"SELECT study_slice, session_id FROM {members} WHERE {inside('session_id', some)}"  # noqa: S608
+        of_slices.update(conn.query(frozen).fetchall())
     counts = sorted(Counter(name for name, _ in of_slices).items())
     slices = [f"changes: {n} visits of the slice {name}" for name, n in counts]
     return out + [f"{line}; a backup of before has its numbers" for line in slices]
