@@ -11,7 +11,6 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 from __future__ import annotations
 
 import contextlib
-import functools
 import gc
 import importlib
 import importlib.util
@@ -117,8 +116,11 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
 
 
 @pytest.fixture
-def until_the_end(request: pytest.FixtureRequest) -> Callable[[], tuple[pytest.MonkeyPatch, contextlib.ExitStack]]:
-    """Changes of the fixtures below: each is made when it is called and ends with its `with`, or with the test."""
+def until_the_end(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], tuple[pytest.MonkeyPatch, contextlib.ExitStack]]:
+    """Changes of the fixtures below, which end with their `with` or with the test: the last one first, and before those
+    of `monkeypatch`."""
 
     def change() -> tuple[pytest.MonkeyPatch, contextlib.ExitStack]:
         patch, end = pytest.MonkeyPatch(), contextlib.ExitStack()
@@ -146,8 +148,8 @@ def limits(until_the_end: Callable[..., Any]) -> Limits:
 
 @pytest.fixture
 def machine(until_the_end: Callable[..., Any]) -> Machine:
-    """What the machine has, for a test: bytes free on every disk, the number of the account, no package of a name, no
-    database server outside PATH, a GPU or the address of the process that computes on one."""
+    """What the machine has, for a test: bytes free of 1 TB on every disk, the number of the account, no package of a
+    name, no database server outside PATH, a GPU or the address of the process that computes on one."""
 
     def has(
         *,
@@ -159,7 +161,7 @@ def machine(until_the_end: Callable[..., Any]) -> Machine:
     ) -> contextlib.ExitStack:
         patch, end = until_the_end()
         if free_bytes is not None:
-            disk = shutil.disk_usage("/")._replace(free=free_bytes)
+            disk = shutil.disk_usage("/")._replace(total=10**12, free=free_bytes)
             patch.setattr(shutil, "disk_usage", lambda _: disk)
         if account is not None:
             patch.setattr(os, "geteuid", lambda: account)
@@ -216,11 +218,11 @@ def faults(until_the_end: Callable[..., Any]) -> Faults:
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+def stand_in(until_the_end: Callable[..., Any]) -> StandIn:
     """Replaces stages of the chain by their names (`tests.integration.chain.STAGES`)."""
     from tests.integration import chain
 
-    return functools.partial(chain.replace, monkeypatch)
+    return lambda **functions: chain.replace(until_the_end()[0], **functions)
 
 
 @pytest.fixture

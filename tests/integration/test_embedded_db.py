@@ -89,7 +89,7 @@ def servers_of(home: Path) -> list[int]:
 # ---------------------------------------------------------------- start and stop
 
 
-def test_two_starts_at_once_give_one_server(home: Path, environment: Environment):
+def test_two_starts_at_once_give_one_server(home: Path):
     embedded.stop(folder=folder(home))
     both = [
         subprocess.Popen([*PBL, "db", "start"], env=environment(home), stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
