@@ -36,6 +36,7 @@ from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
 from pbl_schemas.intake.protocols import ProtocolStep, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
+from pbl_schemas.operations.archive import note_placed
 from pbl_schemas.reading import usable as module_usable
 from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
@@ -815,6 +816,16 @@ def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, killed
     machine(free_bytes=incoming.KEPT_FREE + len(whole))
     answer = browser.post("/phone/recordings.json", json=stated(whole))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
+
+
+def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):
+    """Its log beside it could be that of a registered one: the tables know, and no thread of files asks them."""
+    target = tmp_path / "archive" / "P001" / "2026-01-10" / "0123-walk.mp4"
+    note_placed(tmp_path / "archive", target)
+    target.parent.mkdir(parents=True)
+    for ending in (".mp4", ".mov", ".json"):
+        target.with_suffix(ending).touch()
+    assert send(phone(visit), film(tmp_path))["state"] == "received"
 
 
 def test_a_database_that_goes_away_before_the_question_is_not_running(visit: int, faults: Faults):

@@ -23,11 +23,12 @@ from click.testing import CliRunner
 import pbl_pipeline.fit
 import pbl_pipeline.video
 import pbl_schemas
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.fit import METHODS
 from pbl_schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.cli.why import why as why_command
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import embedded
 from pbl_schemas.reading.status import live_workers, pipeline_status
 from pbl_schemas.reading.why import why
@@ -577,6 +578,16 @@ def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: 
         requeue.retry(table="Tables")
 
 
+def test_the_cause_of_a_code_decides_what_is_tried_again_every_night(tables: None):
+    own = {"status": "error", "priority": 5}
+    failed = [{"video_id": i, "error_message": f"{code}: why", **own} for i, code in enumerate(CODES)]
+    jobs_of(video.VideoInfo).insert(failed)
+    again = {code for code, one in CODES.items() if one.cause == MACHINE} - {"INTERNAL", "TIME_LIMIT"}
+    assert {"FILE_UNWRITABLE", "STORE_FULL", "PACKAGE_MISSING", "WORKER_CRASH"} < again
+    assert requeue.retry_outside() == dict.fromkeys(again, 1)
+    assert len(video.VideoInfo.jobs.pending) == len(again)
+
+
 def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: Path):
     register(*videos(tmp_path, "walk1", "walk2"))
     work()
@@ -585,7 +596,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
         for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)
     }
     plan = requeue.plan_new_method("SessionFit", "paper-2025")
-    assert (len(plan.add), plan.outdated) == (1, [])
+    assert (len(plan.add), len(plan.outdated)) == (1, 0)
     list(requeue.carry_out(plan))
     pending = {t: c["pending"] for t, c in jobs_left().items()}
     assert pending == {"TrialInput": 2}  # nothing above the fit
@@ -600,7 +611,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
     assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts(order_by="KEY")] == [
         r["fit_computed"] for r in before["SessionFit"]
     ]
-    assert requeue.plan_new_method("SessionFit", "paper-2025").add == []
+    assert not requeue.plan_new_method("SessionFit", "paper-2025").add
     assert METHODS["paper-2025"].name == "paper-2025"
     with pytest.raises(PblError, match="USAGE"):
         requeue.plan_new_method("VideoInfo", "paper-2025")
@@ -610,7 +621,7 @@ def test_results_are_computed_again_behind_new_work(tables: None, tmp_path: Path
     register(*videos(tmp_path, "walk1"), session_label="1")
     work()
     plan = requeue.plan_again("GaitEvents", before=datetime.datetime(2000, 1, 1))
-    assert plan.outdated == []
+    assert not plan.outdated
     plan = requeue.plan_again("GaitEvents", since=datetime.datetime(2000, 1, 1))
     assert len(plan.outdated) == 1
     assert any("gait_cycle" in name for name in plan.below)

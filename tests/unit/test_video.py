@@ -1,9 +1,12 @@
 """Probe and frames against files whose frames, stamps and damage are known, and against OpenCV as a second decoder."""
 
 import dataclasses
+import errno
 import gc
 import hashlib
+import io
 import json
+import os
 import random
 import shutil
 import struct
@@ -276,6 +279,25 @@ def test_missing_and_empty(tmp_path):
     assert code_of(tmp_path / "empty.mp4") == "VIDEO_EMPTY"
     refused("VIDEO_MISSING", read_frames, tmp_path / "absent.mp4")  # at the call, not at the first frame
     refused("VIDEO_EMPTY", check_file, tmp_path / "empty.mp4")
+
+
+@pytest.mark.parametrize("name", ["lost_end.mp4", "text.mp4"])
+def test_a_disk_that_fails_is_no_fault_of_the_recording(tmp_path, monkeypatch, name):
+    """FFmpeg takes what it cannot read for the end of the file."""
+    path = write_video(tmp_path / "whole.mp4", numbered_frames(10), constant_rate(10))
+    content = path.read_bytes()[:-2000] if name == "lost_end.mp4" else b"not a video" * 1000
+    lost = tmp_path / name
+    lost.write_bytes(content)
+    assert code_of(lost) in ("VIDEO_TRUNCATED", "VIDEO_NOT_A_VIDEO")
+
+    def fails(file: io.BufferedReader, *n: int) -> bytes:
+        if file.tell() and n == (1 << 20,):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return io.BufferedReader.read(file, *n)
+
+    reader = type("Failing", (io.BufferedReader,), {"read": fails})
+    monkeypatch.setattr(Path, "open", lambda self, *_, **__: reader(io.FileIO(self)))
+    assert refused("VIDEO_MISSING", probe, lost).found == "the file cannot be read (Input/output error)"
 
 
 def test_not_a_video(tmp_path):
