@@ -171,7 +171,7 @@ def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path,
     taken = twice(drop, archive)
     assert taken.registered == [str(hostile.relative_to(drop))]
     (kept,) = files(archive)
-    assert re.fullmatch(r"P001/[\w. -]+/[0-9a-f]{12}-[\w. -]+\.mp4", kept), kept
+    assert re.fullmatch(r"P001/[\w. -]+/[\w. -]+-[0-9a-f]{8}\.mp4", kept), kept
     assert sorted(p.name for p in tmp_path.iterdir()) == ["archive", "uploads"]
 
 

@@ -182,3 +182,15 @@ def test_an_error_of_a_job_is_german_and_whole_on_pages(tables: None, tmp_path: 
         assert "Aufnahme gang: Doppelschritte von 0,12 s" in browser.get(path).text, path
     assert "ie Zeiten der Bilder berichtigen" in browser.get("/visits/1").text
     assert why(1).verdict.startswith("reading of the video failed (FIT_INPUT: trial gang: strides of 0.12 s)")
+
+
+def test_an_error_without_german_words_has_no_english_ones_on_german_pages(tables: None, tmp_path: Path):
+    job = first_job(tmp_path, "gang")
+    broken = PblError("INTERNAL", "a value that no person foresaw", "another", "see what it was")
+    queue.fail(job, error_message(broken, "VideoInfo", job.key))
+    browser = web.client(role="reviewer,operator")
+    for path in ("/visits/1", "/recordings/1", "/operate"):
+        pages = {name: browser.get(path, headers={"accept-language": name}).text for name in ("en", "de")}
+        assert "foresaw" in pages["en"], path
+        assert "Einzelheiten stehen auf der englischen Seite" in pages["de"], path
+        assert "foresaw" not in pages["de"], path

@@ -328,6 +328,27 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     assert len(gait.EventCorrection()) == len(gait.EventCorrection.Event()) == 0
 
 
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_body_marks_and_curves_are_in_one_view_where_there_is_no_picture(chromium: Any, visit: str, language: str):
+    """Of a laboratory's markers the 3D view is in the place of the video."""
+
+    def of_markers(route: Any) -> None:
+        movement = route.fetch().json()
+        movement["body"]["camera"] = None
+        route.fulfill(json=movement)
+
+    with web.shown(chromium, locale=language) as page:
+        page.route("**/movement", of_markers)
+        for width, height in ((1280, 900), (1024, 768), (390, 844)):
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto("/recordings/1")
+            page.wait_for_selector("[data-ready]")
+            page.locator("#correct").click()
+            for seen in (".space-view", ".line", "#curves figure >> nth=0"):
+                box = page.locator(seen).bounding_box()
+                assert 0 <= box["y"] < box["y"] + box["height"] <= height, (seen, width, box)
+
+
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):
     before = not_none(event_corrections.shown_events(1))
     with web.shown(chromium, name="A. First", size=(1200, 900), bypass_csp=True, refused=True) as page:

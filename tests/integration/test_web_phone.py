@@ -194,6 +194,15 @@ def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
     assert "opened by a phone" not in reviewer.get(f"/visits/{visit}").text
 
 
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_the_link_as_text_can_be_tapped(visit: int, language: str):
+    browser = web.client(target=nothing)
+    browser.headers["accept-language"] = language
+    page = web.post(browser, f"/visits/{visit}/film", hours=2).text
+    tapped = not_none(re.search(r'<a href="(http[^"]*/phone/open\?key=[\w-]+)">(?:<code>)?\1', page))
+    assert stranger().get(tapped[1]).status_code == 200
+
+
 def test_a_link_ends_by_its_time(visit: int):
     browser = phone(visit)
     assert browser.get("/phone/state.json").json()["visit"] == visit
