@@ -7,7 +7,6 @@ import functools
 import logging
 import os
 import signal
-import subprocess
 import threading
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
@@ -15,37 +14,13 @@ from typing import Any
 
 from pbl_pipeline import temporary
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import VISIBLE_GPUS
 from pbl_pipeline.video import frames_kept
 
 from . import registry, run_job
 from .log import event, to_stderr
 from .queue import Claim
 from .run_job import Outcome
-
-#: Variable by which a process sees only some of the GPUs; batch systems set it for a job.
-VISIBLE = "CUDA_VISIBLE_DEVICES"
-#: Time after which a driver that does not answer counts as missing (s).
-QUERY_S = 30.0
-
-
-def gpus(*columns: str) -> list[list[str]]:
-    """Index and these columns of `nvidia-smi` of each GPU of the machine, as text; none without an NVIDIA driver."""
-    query = ["nvidia-smi", f"--query-gpu={','.join(('index', *columns))}", "--format=csv,noheader,nounits"]
-    try:
-        done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return [[cell.strip() for cell in line.split(",")] for line in done.stdout.splitlines()]
-
-
-def given_gpus() -> tuple[str, ...]:
-    """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
-    none if there is no NVIDIA driver."""
-    listed = os.environ.get(VISIBLE)
-    if listed is None:
-        listed = ",".join(row[0] for row in gpus())
-    return tuple(name for name in map(str.strip, listed.split(",")) if name not in ("", "-1", "NoDevFiles"))
-
 
 log = logging.getLogger("pbl.worker")
 
@@ -112,7 +87,7 @@ class Options:
 def work(options: Options, pipe: Connection) -> None:
     """Run a working process (`Options.of_process`): connect, run the self-test, work."""
     if options.gpus:
-        os.environ[VISIBLE] = options.gpus[0]
+        os.environ[VISIBLE_GPUS] = options.gpus[0]
     if options.phone:
         os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
     if options.processes > 1:
