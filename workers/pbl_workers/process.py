@@ -13,8 +13,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from pbl_pipeline import temporary
+from pbl_pipeline.bench.profile import profiled
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.resources import VISIBLE_GPUS
+from pbl_pipeline.resources import VISIBLE_GPUS, fewer_collections
 from pbl_pipeline.video import frames_kept
 
 from . import registry, run_job
@@ -49,6 +50,7 @@ class Options:
     short: bool = False
     long: bool = False
     phone: bool = False
+    profile: str = ""  # folder for the processor times of each process (`bench.profile`)
 
     @property
     def lone(self) -> bool:
@@ -86,6 +88,7 @@ class Options:
 
 def work(options: Options, pipe: Connection) -> None:
     """Run a working process (`Options.of_process`): connect, run the self-test, work."""
+    fewer_collections()
     if options.gpus:
         os.environ[VISIBLE_GPUS] = options.gpus[0]
     if options.phone:
@@ -129,6 +132,8 @@ def work(options: Options, pipe: Connection) -> None:
             raise SystemExit(SELFTEST_FAILED) from error
 
     def report(job: Claim | None, outcome: Outcome | None) -> None:
+        if job is not None:
+            stage_is(job.table.__name__ if outcome is None else "-")
         try:
             pipe.send((job, outcome))
         except OSError:  # the supervisor has ended: so does this process
@@ -145,7 +150,7 @@ def work(options: Options, pipe: Connection) -> None:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
-            with frames_kept():
+            with frames_kept(), profiled(options.profile) as stage_is:
                 worker.run(once=options.once, max_jobs=options.max_jobs)
         finally:
             event(log, logging.INFO, "worker ended", done=worker.done, failed=worker.failed)
