@@ -103,7 +103,7 @@ def test_a_worker_divides_the_cores_by_its_processes(
             seen.append({name: os.environ[name] for name in names})
 
     monkeypatch.setattr("multiprocessing.get_context", lambda _: SimpleNamespace(Process=Process, Pipe=Pipe))
-    monkeypatch.setattr("pbl_workers.process.given_gpus", tuple)
+    monkeypatch.setattr("pbl_pipeline.resources.given_gpus", tuple)
     assert pbl("worker", *asked).code == 0
     assert seen == [dict.fromkeys(names, share) | {"OMP_NUM_THREADS": "7"} for share in shares]
     assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
@@ -117,7 +117,7 @@ def worker_options(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Options]:
     monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
 
     def asked_for(gpus: tuple[str, ...], *asked: str) -> Options:
-        monkeypatch.setattr("pbl_workers.process.given_gpus", lambda: gpus)
+        monkeypatch.setattr("pbl_pipeline.resources.given_gpus", lambda: gpus)
         assert pbl("worker", "--processes", "auto", *asked).code == 0
         return found[-1]
 

@@ -17,11 +17,13 @@ import pymysql
 import pytest
 from prometheus_client.core import GaugeMetricFamily
 
+from pbl_pipeline import resources
+from pbl_pipeline.resources import VISIBLE_GPUS, given_gpus
 from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
 from pbl_workers import metrics, process, recover, registry, run_job, selftest
 from pbl_workers.metrics import Metrics
-from pbl_workers.process import VISIBLE, Options, given_gpus
+from pbl_workers.process import Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import Supervisor, _Child
@@ -236,7 +238,7 @@ CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
     [("2,5", ("2", "5")), ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")), ("", ()), ("-1", ()), ("NoDevFiles", ())],
 )
 def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, environment: Environment):
-    environment(**{VISIBLE: listed})
+    environment(**{VISIBLE_GPUS: listed})
     assert given_gpus() == expected
 
 
@@ -246,8 +248,8 @@ def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, e
 def test_otherwise_the_driver_lists_them(
     answer: str | None, expected: tuple, tmp_path: Path, environment, limits: Limits
 ):
-    environment(**{VISIBLE: None}, PATH=tmp_path)
-    limits(process, QUERY_S=0.5)
+    environment(**{VISIBLE_GPUS: None}, PATH=tmp_path)
+    limits(resources, QUERY_S=0.5)
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected
@@ -305,9 +307,9 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch, enviro
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
         for value in ("", None):  # put back what the process sets
-            environment(**dict.fromkeys((VISIBLE, MEMORY, *CPU), value))
+            environment(**dict.fromkeys((VISIBLE_GPUS, MEMORY, *CPU), value))
         process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
-        seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, *CPU))))
+        seen.append(tuple(map(os.environ.get, (VISIBLE_GPUS, MEMORY, *CPU))))
     no = (None, None)
     assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
 
