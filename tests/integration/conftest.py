@@ -45,12 +45,6 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> chain.StandIn:
-    """Replaces stages of the chain by their names (`chain.STAGES`)."""
-    return functools.partial(chain.replace, monkeypatch)
-
-
-@pytest.fixture
 def change_fits(stand_ins: None, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Lets the library fit what a function makes of the fits of the stand-in (`chain.change_fits`)."""
     return functools.partial(chain.change_fits, monkeypatch)

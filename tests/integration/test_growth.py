@@ -22,7 +22,7 @@ from pbl_schemas.studies import study_sheets
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
 from research.benchmarks import growth, many_recordings, worker_standins, workers
-from tests import Environment, mysql, not_none
+from tests import Environment, Limits, mysql, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.integration import chain
@@ -43,11 +43,12 @@ def test_statements_stay_as_short_as_they_are(
     monkeypatch: pytest.MonkeyPatch,
     environment: Environment,
     capsys: pytest.CaptureFixture,
+    limits: Limits,
 ):
-    monkeypatch.setattr(rows, "PART", PART)
-    monkeypatch.setattr(datajoint_setup, "ROWS", PART)
-    monkeypatch.setattr(requeue, "CHUNK", PART)
-    monkeypatch.setattr(workers, "EACH", 1)  # a video a visit
+    limits(rows, PART=PART)
+    limits(datajoint_setup, ROWS=PART)
+    limits(requeue, CHUNK=PART)
+    limits(workers, EACH=1)  # a video a visit
     environment(**{worker_standins.RECORDED: chain.small_video(tmp_path, "recorded")})
     worker_standins.install(monkeypatch)
     first = [t.__name__ for t in computed_tables() if t.__name__ not in ON_REQUEST]
