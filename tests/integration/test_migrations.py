@@ -488,9 +488,11 @@ def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
 
 def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, forget: Callable[[], None]):
     before = everything()
-    for command in (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")):
+    commands = (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init"), ("web", "--port", "0"))
+    for command in commands:
         refused = pbl(*command)
         assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION"), command
+        assert "http" not in refused.out  # no address of a page that does not come
         for part in ("0003 height_of_fits", "video.video_size", "pbl db migrate --dry-run"):
             assert part in refused.err, refused.err
         assert everything() == before
