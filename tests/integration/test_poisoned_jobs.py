@@ -14,6 +14,7 @@ from pbl_schemas.job_errors import error_message, stored_error
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.why import why
 from pbl_workers import queue, requeue, run_job
+from tests import Faults
 from tests.rows import register
 
 from . import web
@@ -146,13 +147,10 @@ def test_a_damaged_file_of_the_store_is_an_error_that_names_it(tables, tmp_path:
         assert requeue.retry(table=reader.__name__) == {reader.__name__: 1}
 
 
-def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, monkeypatch):
+def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, faults: Faults):
     queued(tmp_path, video.VideoInfo)
 
-    def insert(self, key, info, origin):
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    monkeypatch.setattr(video.VideoInfo, "make_insert", insert)
+    faults(video.VideoInfo, "make_insert", np.linalg.LinAlgError("Singular matrix"))
     outcome = run_job.run(claimed(video.VideoInfo))
     assert (outcome.what, outcome.code) == (run_job.FAILED, "INTERNAL")
     assert error(video.VideoInfo) == ("INTERNAL", "LinAlgError: Singular matrix")

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pbl_pipeline
-import pbl_pipeline.fit
 from pbl_pipeline import texts
 from pbl_pipeline.errors import CALL, CODES
 from pbl_pipeline.kinetics import REASONS
@@ -26,7 +24,7 @@ from tests import not_none
 from tests.german import english_of, english_words
 from tests.html_page import Page, commands_in
 from tests.integration import web
-from tests.integration.chain import fit_upright, small_video
+from tests.integration.chain import fit_upright, replace, small_video
 from tests.rows import register
 from tests.source import ROOT, files, nodes
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -40,7 +38,7 @@ def english() -> set[str]:
 @pytest.fixture(scope="module")
 def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     """P001 at three visits, one not computed; a chair test, nobody, two people alike, a screen recording, a film."""
-    module_patch.setattr(pbl_pipeline.fit, "fit_session", fit_upright)
+    replace(module_patch, fit_session=fit_upright)
     for name, day in (("gang", "2026-01-10"), ("gang zwei", "2026-04-10")):
         register(small_video(module_tables, name), session_label=day, mass_kg=70.5)
     chair = register(small_video(module_tables, "stuhl"), subject="P002", session_label="2026-02-01")

@@ -18,7 +18,7 @@ from pbl_pipeline.resources import keep_large_blocks
 from pbl_schemas.operations.embedded import process
 from pbl_workers import supervisor
 from pbl_workers.process import Options
-from tests import Environment
+from tests import Environment, Limits
 from tests.command import pbl
 from tests.ended_process import Ended
 
@@ -26,10 +26,9 @@ GB = 2**30
 
 
 @pytest.fixture
-def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, dict[str, str]], None]:
+def groups(tmp_path: Path, limits: Limits) -> Callable[[str, dict[str, str]], None]:
     """Writes a tree of control groups as the kernel shows it."""
-    monkeypatch.setattr(resources, "_GROUPS", tmp_path)
-    monkeypatch.setattr(resources, "_OWN", tmp_path / "own")
+    limits(resources, _GROUPS=tmp_path, _OWN=tmp_path / "own")
 
     def write(own: str, files: dict[str, str]) -> None:
         (tmp_path / "own").write_text(own)
