@@ -46,7 +46,7 @@ class GaitEvents:
 
     status: str = column("events_status", type="enum('PASS', 'EMPTY')")
     events: tuple[GaitEvent, ...]
-    reason: str = column("events_reason", "why EMPTY", "varchar(1000)")
+    reason: str = column("events_reason", "why EMPTY", "varchar(1000)", cut=True)
     method: str = column("events_detector", "name of the method in the library", "varchar(64)")
     params_hash: str
     source: str = column("events_source", "what the feet come from", "varchar(64)")

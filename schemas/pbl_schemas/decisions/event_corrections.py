@@ -14,7 +14,7 @@ from ..plan import locked
 from ..reading.objects import load_trial_fit
 from ..rows import delete_below, utc_now
 from ..transactions import repeated
-from .review_decisions import last_decision, meanwhile, record
+from .review_decisions import last_decision, meanwhile, queue_visit, record
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -127,7 +127,8 @@ def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
 @repeated
 def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
     trial = int(before.key["video_id"])
-    with locked(int((video.Video & {"video_id": trial}).fetch1("session_id"))):
+    session_id = int((video.Video & {"video_id": trial}).fetch1("session_id"))
+    with locked(session_id):
         now = _must_be_shown(trial)
         if now.state != seen:
             raise meanwhile(trial, "events")
@@ -148,6 +149,7 @@ def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen
             )
         was = {"by": "automatic" if now.hand is None else "hand", "events": _listed(now.events)}
         record("events", by, {"method": now.method}, was, after, video_id=trial)
+        queue_visit(session_id)
         cycles = (gait.GaitCycle & _of_events(now.key)).proj("correction_no").to_dicts()
         outdated = [r for r in cycles if (gait.correction_of(r) or {}).get("correction_no") != r["correction_no"]]
         return delete_below(gait.GaitCycle, [{k: r[k] for k in gait.GaitCycle.primary_key} for r in outdated])
@@ -174,7 +176,7 @@ def _insert(key: Mapping[str, Any], person: Person, by: str, **columns: Any) -> 
             "correction_changed": 0,
             "correction_tracking": person[0],
             "correction_person": person[1],
-            "correction_by": by[:64],
+            "correction_by": by,
             "correction_at": utc_now(),
             **columns,
         }
