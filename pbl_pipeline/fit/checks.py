@@ -81,7 +81,7 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
     """Checks of wearable sensors; empty if there are none."""
     if not sensors:
         return []
-    elsewhere = ", ".join(f"{s.segment} (moves like {s.moves_with})" for s in sensors if s.moves_with != s.segment)
+    elsewhere = ", ".join(f"{s.segment} moves like {s.moves_with}" for s in sensors if s.moves_with != s.segment)
     n = sum(s.moves_with != s.segment for s in sensors)
     moved = max(float(np.nanmax(s.rate_rad_s)) for s in sensors)
 

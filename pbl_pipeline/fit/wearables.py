@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import PblError, said
-from pbl_pipeline.sensors.orientation import Orientation, rate_of
+from pbl_pipeline.sensors.orientation import Orientation, input_error, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
-from pbl_pipeline.sensors.worn import SensorFit, input_error
+from pbl_pipeline.sensors.worn import SensorFit
 
 from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples

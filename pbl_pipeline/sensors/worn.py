@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import said
 
 from .log import SEGMENTS, SensorLog
-from .orientation import Orientation, oriented
+from .orientation import Orientation, input_error, oriented
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,3 @@ def worn(logs: Sequence[SensorLog], clock_s: Sequence[float | None] | None, n_tr
     if len(clocks) != n_trials:
         raise input_error(said("{n} clocks of sensors", n=len(clocks)), said("one for each of {n} trials", n=n_trials))
     return Worn(tuple(oriented(log) for log in logs), tuple(clocks))
-
-
-def input_error(found: str, expected: str, next_step: str = "") -> PblError:
-    return PblError("FIT_INPUT", found=found, expected=expected, next_step=next_step or "see docs/imu.md")
