@@ -35,6 +35,18 @@ class GaitEvent:
 
 
 @record
+class SetEvent:
+    """One event of a correction."""
+
+    time_s: float = column("corrected_time", "(s) time of the trial")
+    side: str = column("corrected_side", type="enum('left', 'right')")
+    event: str = column("corrected_kind", type="enum('foot_down', 'foot_up')")
+    probability: float | None = column(
+        "corrected_probability", "(0..1) of the detection, which found it there; null: set by hand"
+    )
+
+
+@record
 class GaitEvents:
     """The events of one trial in order of time.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.qc import in_order
 from pbl_pipeline.records import definition, from_row, number, to_row
 from pbl_pipeline.results.cycles import GaitCycle as Cycle
-from pbl_pipeline.results.events import GaitEvent
+from pbl_pipeline.results.events import GaitEvent, SetEvent
 from pbl_pipeline.results.events import GaitEvents as Events
 from pbl_pipeline.results.measures import COUNTS, Measure
 from pbl_pipeline.results.measures import Spatiotemporal as Measures
@@ -91,16 +92,7 @@ class EventCorrection(dj.Manual):
     correction_at            : datetime        # when, UTC
     """  # noqa: E501
 
-    class Event(dj.Part):
-        definition = """
-        -> master
-        corrected_no       : int16             # in order of time, from 1
-        ---
-        corrected_time     : float64           # (s) time of the trial
-        corrected_side     : enum('left', 'right')
-        corrected_kind     : enum('foot_down', 'foot_up')
-        corrected_probability=null : float64   # (0..1) of the detection, which found it there; null: set by hand
-        """
+    Event = part_of("Event", SetEvent, key="corrected_no : int16  # in order of time, from 1")
 
 
 def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -301,9 +293,8 @@ def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = Non
     from pbl_pipeline import gait as lib
 
     changed = row_of(EventCorrection, correction, rows)["correction_changed"]
-    names = ("corrected_time", "corrected_side", "corrected_kind", "corrected_probability")
-    found = [[e[name] for name in names] for e in rows(EventCorrection.Event, correction)]
-    events = [GaitEvent(float(t), side, kind, 1.0 if p is None else float(p)) for t, side, kind, p in found]
+    found = map(dataclasses.astuple, EventCorrection.Event.records(correction, rows))
+    events = [GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in found]
     return lib.apply_correction(detected, events, int(changed))
 
 

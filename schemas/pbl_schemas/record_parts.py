@@ -18,7 +18,7 @@ class Records:
 
     record: Any
     prefix: str
-    number: str  # column that counts the records of a result, from 1; "" if they have a key of their own
+    number: str  # column that counts the records of a result, from 1; "" if they have their own key
 
     @classmethod
     def insert_records(cls: Any, key: Mapping[str, Any], records: Iterable[Any]) -> None:
