@@ -116,7 +116,7 @@ def freeze(
                 "slice_roles": list(roles),
                 "slice_n": len(rows),
                 "slice_hash": digest,
-                "slice_code_version": code_version()[:64],
+                "slice_code_version": code_version(),
                 "slice_created": utc_now(),
             }
         )

@@ -18,7 +18,7 @@ from pbl_pipeline.names import check_height, check_label, check_mass, normalised
 from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
-from ..decisions.review_decisions import decisions, record
+from ..decisions.review_decisions import decisions, queue_visit, record
 from ..intake.records import set_condition, set_height, set_mass, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..rows import moment
@@ -314,6 +314,9 @@ def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
         was, after = ({"value": now.stored(name, v)} for v in (now.values[name], text))
         of = {"video_id": int(number)} if number else {"session_id": now.session_id}
         record(_KINDS[kind], by, {}, was, after, reason, **of)
+    of_all = {"subject": now.subject} if "height_m" in changed else {"session_id": now.session_id}
+    for visit in (session.Session & of_all).to_arrays("session_id"):
+        queue_visit(int(visit))
 
 
 def _stripped(values: Mapping[str, str]) -> dict[str, str]:
