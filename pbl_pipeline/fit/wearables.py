@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.results import SensorFit
 from pbl_pipeline.sensors.orientation import Orientation, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
-from pbl_pipeline.sensors.worn import SensorFit, input_error
+from pbl_pipeline.sensors.worn import input_error
 
 from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
@@ -221,50 +222,50 @@ def _errors(body: Body, p: Problem, end: State) -> tuple[Array, Array]:
 
 def sensor_fits(
     session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
-) -> tuple[SensorFit, ...]:
-    """What a solution says of its sensors."""
+) -> tuple[tuple[SensorFit, ...], ...]:
+    """What a solution says of the sensors in each trial."""
     assert session.worn is not None
     worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
     assert worn is not None
     errors, turned = (np.asarray(a) for a in _errors(session.body, p, end))
     z = np.linalg.norm(errors, axis=-1)
     turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
-    trials, out = range(len(session.arrays)), []
 
-    def of_trial(i: int, j: int) -> tuple[float, ...]:
-        """z, share dropped, slip and rate."""
+    def of_trial(i: int, j: int, sensor: Orientation) -> SensorFit:
         at, used = session.frames(i), session.arrays[i].used
         measured = np.asarray(worn.count)[at, j] > 0
         size, off = z[at, j][measured], turned[at, j][measured]
+        R, bounds = turn(state.world[i, j], worn.world[i, j]).as_matrix(), session.worn.clock_s[i]
+        found = SensorFit(
+            segment=sensor.log.segment,
+            name=sensor.log.name,
+            moves_with=moves_with[j],
+            mounting=turn(state.mount[j], worn.mount[j]).as_quat(scalar_first=True),
+            bias_rad_s=state.bias[j],
+            heading_rad=float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])),
+            tilt_rad=float(np.arccos(np.clip(R[2, 2], -1, 1))),
+            **dict.fromkeys(("clock_s", "off_s", "z", "slip", "rate_rad_s"), np.nan),
+            gain=float(state.clock[i, 1] / MINUTE_S),
+            dropped=1.0,
+        )
         if not len(size):
-            return np.nan, 1.0, np.nan, np.nan
+            return found
         third = -(-len(off) // 3)
         seconds = 2 * float(worn.middle_s[i]) / 3
         likely = np.hypot(SLIP_SD_RAD, float(worn.sd_rad[j]) * np.sqrt(12 * MEMORY_S / seconds))
         slip = np.linalg.norm(off[-third:].mean(axis=0) - off[:third].mean(axis=0)) / likely
         first, last = (int((t + CLOCK_RANGE_S) / SAMPLE_S) for t in (0.0, 2 * float(worn.middle_s[i])))
         rate = rate_of(np.asarray(worn.quat_wxyz, float)[i, j, first : last + 1])
-        dropped = 1 - np.sum(size < width) / np.sum(used)
-        return np.sqrt(np.mean(size**2) / 3), dropped, slip, np.sqrt(np.mean(np.sum(rate**2, axis=1)))
-
-    for j, sensor in enumerate(session.worn.sensors):
-        R = np.stack([turn(state.world[i, j], worn.world[i, j]).as_matrix() for i in trials])
-        each = np.array([of_trial(i, j) for i in trials])
-        out.append(
-            SensorFit(
-                name=sensor.log.name,
-                segment=sensor.log.segment,
-                moves_with=moves_with[j],
-                mounting=turn(state.mount[j], worn.mount[j]).as_quat(scalar_first=True),
-                bias_rad_s=state.bias[j],
-                heading_rad=np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1]),
-                tilt_rad=np.arccos(np.clip(R[:, 2, 2], -1, 1)),
-                clock_s=np.where(each[:, 1] < 1, worn.clock_s[: len(trials)] + state.clock[: len(trials), 0], np.nan),
-                gain=state.clock[: len(trials), 1] / MINUTE_S,
-                z=each[:, 0],
-                dropped=each[:, 1],
-                slip=each[:, 2],
-                rate_rad_s=each[:, 3],
-            )
+        clock = float(worn.clock_s[i] + state.clock[i, 0])
+        return dataclasses.replace(
+            found,
+            clock_s=clock,
+            off_s=clock - float(np.clip(clock, *bounds)) if isinstance(bounds, tuple) else np.nan,
+            z=float(np.sqrt(np.mean(size**2) / 3)),
+            dropped=float(1 - np.sum(size < width) / np.sum(used)),
+            slip=float(slip),
+            rate_rad_s=float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))),
         )
-    return tuple(out)
+
+    sensors = session.worn.sensors
+    return tuple(tuple(of_trial(i, j, s) for j, s in enumerate(sensors)) for i in range(len(session.arrays)))

@@ -28,7 +28,7 @@ class Records:
         return [from_row(cls.record, row, cls.prefix) for row in rows(cls, key)]
 
 
-def part_of(name: str, record: type, prefix: str = "", comment: str = "") -> Any:
-    """Return a part table of this name of records of a class; `prefix`: of its columns."""
-    lines = "\n".join([f"# {comment}"] * bool(comment) + ["-> master", definition(record, prefix)])
+def part_of(name: str, record: type, prefix: str = "", comment: str = "", of: tuple[str, ...] = ("master",)) -> Any:
+    """Return a part table of this name of records of a class; `prefix`: of its columns; `of`: tables in its key."""
+    lines = "\n".join([f"# {comment}"] * bool(comment) + [f"-> {table}" for table in of] + [definition(record, prefix)])
     return type(dj.Part)(name, (Records, dj.Part), {"definition": lines, "record": record, "prefix": prefix})
