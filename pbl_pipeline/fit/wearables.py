@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results import SensorFit
+from pbl_pipeline.sensors.log import input_error
 from pbl_pipeline.sensors.orientation import Orientation, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
-from pbl_pipeline.sensors.worn import input_error
 
 from .imu_term import MINUTE_S, on_segments, segments_at, whitened
 from .problem import CLOCK_RANGE_S, FRAME_S, SAMPLE_S, Problem, State, Wearables, Wearing, pad_samples
@@ -224,9 +224,9 @@ def sensor_fits(
     session: Session, p: Problem, end: State, width: float, moves_with: Sequence[str]
 ) -> tuple[tuple[SensorFit, ...], ...]:
     """What a solution says of the sensors in each trial."""
-    assert session.worn is not None
-    worn, state = p.wearables, jax.tree.map(np.asarray, end.wearing)
+    worn, state, given = p.wearables, jax.tree.map(np.asarray, end.wearing), session.worn
     assert worn is not None
+    assert given is not None
     errors, turned = (np.asarray(a) for a in _errors(session.body, p, end))
     z = np.linalg.norm(errors, axis=-1)
     turn = lambda more, q: Rotation.from_rotvec(more) * Rotation.from_quat(q, scalar_first=True)  # noqa: E731
@@ -235,7 +235,7 @@ def sensor_fits(
         at, used = session.frames(i), session.arrays[i].used
         measured = np.asarray(worn.count)[at, j] > 0
         size, off = z[at, j][measured], turned[at, j][measured]
-        R, bounds = turn(state.world[i, j], worn.world[i, j]).as_matrix(), session.worn.clock_s[i]
+        R, bounds = turn(state.world[i, j], worn.world[i, j]).as_matrix(), given.clock_s[i]
         found = SensorFit(
             segment=sensor.log.segment,
             name=sensor.log.name,
@@ -267,5 +267,4 @@ def sensor_fits(
             rate_rad_s=float(np.sqrt(np.mean(np.sum(rate**2, axis=1)))),
         )
 
-    sensors = session.worn.sensors
-    return tuple(tuple(of_trial(i, j, s) for j, s in enumerate(sensors)) for i in range(len(session.arrays)))
+    return tuple(tuple(of_trial(i, j, s) for j, s in enumerate(given.sensors)) for i in range(len(session.arrays)))

@@ -16,7 +16,7 @@ from vqf import offlineVQF
 
 from pbl_pipeline.errors import PblError, said
 
-from .log import SensorLog
+from .log import SensorLog, input_error
 
 #: Longest gap (s) between samples that is bridged.
 BRIDGED_S = 0.05
@@ -124,10 +124,5 @@ def _strapdown(rate: np.ndarray, acceleration: np.ndarray, step: float) -> Rotat
 
 
 def _log_error(log: SensorLog, found: str, expected: str) -> PblError:
-    return PblError(
-        "FIT_INPUT",
-        found=said("sensor {name} on {segment}: {found}", name=log.name, segment=log.segment, found=found),
-        expected=expected,
-        next_step="see docs/imu.md for what a log holds",
-        key=log.name,
-    )
+    about = said("sensor {name} on {segment}: {found}", name=log.name, segment=log.segment, found=found)
+    return input_error(about, expected, key=log.name)

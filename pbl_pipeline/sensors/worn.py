@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import said
 
-from .log import SEGMENTS, SensorLog
+from .log import SEGMENTS, SensorLog, input_error
 from .orientation import Orientation, oriented
 from .start import Stated
 
@@ -37,7 +37,3 @@ def worn(logs: Sequence[SensorLog], clock_s: Sequence[Stated] | None, n_trials: 
     if len(clocks) != n_trials:
         raise input_error(said("{n} clocks of sensors", n=len(clocks)), said("one for each of {n} trials", n=n_trials))
     return Worn(tuple(oriented(log) for log in logs), tuple(clocks))
-
-
-def input_error(found: str, expected: str, next_step: str = "") -> PblError:
-    return PblError("FIT_INPUT", found=found, expected=expected, next_step=next_step or "see docs/imu.md")
