@@ -140,7 +140,7 @@ def _prior(at: At) -> Array:
     worn, state, w = at.problem.wearables, at.state.wearing, at.weights
     if worn is None or state is None:
         return jnp.zeros(())
-    z2 = jnp.sum((state.mount / jnp.deg2rad(w["mount_sd_deg"])) ** 2)
+    z2 = jnp.sum((state.mount / jnp.deg2rad(jnp.minimum(w["mount_sd_deg"], worn.mount_sd_deg))[:, None]) ** 2)
     z2 += jnp.sum((state.bias / worn.bias_sd_rad_s[:, None]) ** 2)
     z2 += jnp.sum((state.clock / jnp.stack([w["sensor_clock_sd_s"], w["sensor_gain_sd_s"]])) ** 2)
     # The vertical of a world is off by its own error and by that of the trial, which all sensors share; the heading is

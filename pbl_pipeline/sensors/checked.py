@@ -96,7 +96,8 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     elif turns is not None:
         notes.append("no angular rate: the orientation is that of the sensor's program, its heading may be a magnet's")
     start = None if samples.start_utc is None else float(samples.start_utc + begin)
-    return SensorLog(samples.name, segment, time - begin, rate, acceleration, turns, start, tuple(notes))
+    measured = time - begin, rate, acceleration, turns
+    return SensorLog(samples.name, segment, *measured, start, tuple(notes), samples.mounting)
 
 
 def _kept(samples: Samples, notes: list[str], refuse: Refuse) -> np.ndarray:

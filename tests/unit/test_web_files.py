@@ -40,7 +40,7 @@ def test_every_text_that_a_page_names_is_in_the_catalogue():
 _BY_VALUE = re.compile(
     r"(role|state|quality|trend|enter|decided|instruments|register|expects|upload)\.|visits\.(cohort|role|quality|state)|recording\.foot_"
     r"|operate\.(done|empty|pending|reserved|error|waiting|oldest|per_hour|left)$"
-    r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\.|capture\.|coded\.|film\.is_|curves\.(matched|far)_"
+    r"|unusable\.|usable\.(yes|no)|byhand\.(automatic|hand)|differs\.|filmed\.|capture\.|coded\.|worn\.|film\.is_|curves\.(matched|far)_"
 )
 
 
