@@ -82,7 +82,7 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
     if not sensors:
         return []
     of = {s.segment: [t for t in sensors if t.segment == s.segment] for s in sensors}
-    wrong = [f"{k} (moves like {found[0].moves_with})" for k, found in of.items() if found[0].moves_with != k]
+    wrong = [f"{k} moves like {found[0].moves_with}" for k, found in of.items() if found[0].moves_with != k]
     elsewhere = ", ".join(wrong)
     n = len(wrong)
     moved = max((s.rate_rad_s for s in sensors if np.isfinite(s.rate_rad_s)), default=0.0)

@@ -15,7 +15,8 @@ from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.methods import Method
 from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
-from pbl_pipeline.sensors.log import SensorLog, input_error
+from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors.orientation import input_error
 from pbl_pipeline.sensors.start import Stated
 from pbl_pipeline.sensors.worn import worn
 from pbl_pipeline.video import Camera

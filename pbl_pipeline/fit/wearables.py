@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import Body, body_frames, scale_multipliers
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.results import SensorFit
-from pbl_pipeline.sensors.log import input_error
-from pbl_pipeline.sensors.orientation import Orientation, rate_of
+from pbl_pipeline.sensors.orientation import Orientation, input_error, rate_of
 from pbl_pipeline.sensors.pairing import better_pairing
 from pbl_pipeline.sensors.start import BODY_OF, Moved, clock_of, moved, vectors, wahba
 
@@ -48,11 +47,11 @@ AROUND_S = 0.05
 #: held 85 to 95 % of the samples of four synthetic persons from the side and the front, where both views allow it.
 #: Sensors show how an angle changes: a detector's constant error stays, which is most of it at the hip's rotation.
 FLOOR_SHARES = {
-    "hip_flexion": (("pelvis", "thigh"), (1.0, 0.8, 0.65)),
-    "hip_adduction": (("pelvis", "thigh"), (1.0, 0.72, 0.62)),
-    "hip_rotation": (("pelvis", "thigh"), (1.0, 0.8, 0.75)),
-    "knee_": (("thigh", "shank"), (1.0, 0.75, 0.45)),
-    "ankle_": (("shank", "foot"), (1.0, 0.8, 0.7)),
+    "hip_flexion": (("pelvis", "thigh"), (1.0, 0.8, 0.7)),
+    "hip_adduction": (("pelvis", "thigh"), (1.0, 0.67, 0.62)),
+    "hip_rotation": (("pelvis", "thigh"), (1.0, 0.75, 0.7)),
+    "knee_": (("thigh", "shank"), (1.0, 0.75, 0.5)),
+    "ankle_": (("shank", "foot"), (1.0, 0.78, 0.7)),
 }
 
 

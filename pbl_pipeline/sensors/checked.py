@@ -58,7 +58,9 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     notes: list[str] = []
 
     def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
-        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=segment, found=as_said(found))
+        about = said(
+            "sensor {name} on {segment}: {found}", name=samples.name, segment=as_said(segment), found=as_said(found)
+        )
         more = {"next_step": next_step} if next_step else {}
         raise log_error(about, expected, key=path, **more)
 

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pbl_pipeline.errors import PblError
-
 SEGMENTS = ("pelvis", "thigh_r", "thigh_l", "shank_r", "shank_l", "foot_r", "foot_l")
 """The segments of the body that a sensor can be worn on."""
 
@@ -29,8 +27,3 @@ class SensorLog:
     started_utc: float | None = None  # s since 1970, of time 0
     notes: tuple[str, ...] = ()  # remarks: samples that were left out, differences from the file's own statements
     mounting: np.ndarray | None = None  # (4,) unit quaternion from its axes to the segment's, as the file states it
-
-
-def input_error(found: str, expected: str, next_step: str = "see docs/imu.md", key: object = None) -> PblError:
-    """The error FIT_INPUT about sensors of a fit."""
-    return PblError("FIT_INPUT", found=found, expected=expected, next_step=next_step, key=key)

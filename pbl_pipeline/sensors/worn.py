@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from pbl_pipeline.errors import said
 
-from .log import SEGMENTS, SensorLog, input_error
-from .orientation import Orientation, oriented
+from .log import SEGMENTS, SensorLog
+from .orientation import Orientation, input_error, oriented
 from .start import Stated
 
 

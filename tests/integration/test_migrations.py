@@ -39,7 +39,7 @@ from pbl_schemas.reading import frames
 from pbl_schemas.studies import slices
 from pbl_workers import heartbeat, loop
 from pbl_workers.populate import populate
-from tests import mysql, not_none
+from tests import Limits, mysql, not_none
 from tests.command import pbl
 from tests.database import keep, new_home, put_back, remove_home, server
 from tests.rows import everything, register
@@ -552,9 +552,8 @@ STARTS = (
 
 @pytest.mark.parametrize(("number", "name"), [(999, "x"), (1, "another_of_this_number")])
 def test_a_database_of_a_newer_version_is_left_alone(
-    put: Put, forget: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
+    put: Put, forget: Callable[[], None], in_empty_folder: Path, number: int, name: str
 ):
-    monkeypatch.chdir(tmp_path)
     put(new)
     assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
@@ -571,7 +570,7 @@ def test_a_database_of_a_newer_version_is_left_alone(
         for part in (f"{number:04} {name}", "9.9+gabc", code_version()):
             assert part in refused.err, command
     assert everything() == before
-    assert not list(tmp_path.iterdir())
+    assert not list(in_empty_folder.iterdir())
     # Also a worker that runs while the tables are migrated stops at its next look.
     forget()
     pbl_schemas.stages.modules()
@@ -597,8 +596,8 @@ def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_miss
     assert pbl("status").code == 0
 
 
-def test_one_process_migrates_at_a_time(database: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("pbl_schemas.migrations._run.LOCK_S", 1)
+def test_one_process_migrates_at_a_time(database: Path, limits: Limits):
+    limits("pbl_schemas.migrations._run", LOCK_S=1)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 0)", (f"{connection.prefix()}_migrate",))
         assert cursor.fetchone() == (1,)

@@ -18,7 +18,7 @@ from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
-from tests import worn_sensor
+from tests import StandIn, worn_sensor
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
@@ -47,7 +47,7 @@ def stored_keypoints() -> Keypoints:
         return Keypoints.load(path)
 
 
-def test_the_log_reaches_keypoints_and_fit(capture, stand_in: chain.StandIn):
+def test_the_log_reaches_keypoints_and_fit(capture, stand_in: StandIn):
     seen = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static"):
@@ -152,7 +152,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
 
 
-def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: chain.StandIn):
+def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     given = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
@@ -216,7 +216,7 @@ def found_of(log: SensorLog, clock: tuple[float, float] | None) -> SensorFit:
     return SensorFit(log.segment, log.name, log.segment, turn, clock_s=start, off_s=np.nan, **known)
 
 
-def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: chain.StandIn):
+def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: StandIn):
     stand_in(fit_session=with_sensors)
     path = chain.small_video(tmp_path, "a")
     insert(path, of_file=meta({"com.apple.quicktime.creationdate": "2026-03-01T09:16:10Z"}))
@@ -233,7 +233,7 @@ def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: chain.S
     assert plain(trial.fit.sensors) == plain([from_row(SensorFit, row)])
 
 
-def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: chain.StandIn):
+def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: StandIn):
     def fails(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
         if sensors:
             raise PblError("FIT_INPUT", found="a log of another walk", expected="this one", next_step="leave it out")
@@ -267,7 +267,7 @@ def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
     assert len(video.WearableImu()) == 1
 
 
-def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: chain.StandIn):
+def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: StandIn):
     stand_in(fit_session=with_sensors)
     path, shank = chain.small_video(tmp_path, "a"), worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
     assert pbl("ingest", path, "--subject", "P001", "--imu", f"shank_r={shank}").code == 0
@@ -287,7 +287,7 @@ def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, st
     assert len(table) == 1
 
 
-def test_sensors_stay_at_their_visit_when_their_video_moves(tmp_path: Path, stand_in: chain.StandIn):
+def test_sensors_stay_at_their_visit_when_their_video_moves(tmp_path: Path, stand_in: StandIn):
     stand_in(fit_session=with_sensors)
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b", "c")]
     shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")

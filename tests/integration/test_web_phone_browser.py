@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from pbl_pipeline import assets
-from pbl_pipeline.keypoints import framing
 from pbl_pipeline.keypoints.framing import Framing
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_phone_log
 from pbl_schemas import connection, video
@@ -25,7 +24,7 @@ from pbl_schemas.intake.protocols import ProtocolStep, add_protocol
 from pbl_schemas.reading.usable import Usable
 from pbl_workers import phone_uploads
 from pbl_workers.web import Options, Where, certificates, create_app, phone
-from tests import Environment
+from tests import Environment, Limits, StandIn
 from tests.integration import web
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
@@ -93,10 +92,10 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
+def visit(tables: None, tmp_path: Path, environment: Environment, limits: Limits) -> int:
     environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads, phone):
-        monkeypatch.setattr(module, "PART_BYTES", 65536)
+        limits(module, PART_BYTES=65536)
     return new_visit("2026-01-10")
 
 
@@ -113,8 +112,8 @@ def filming(
     script: str = "",
     **context: Any,
 ) -> Iterator[Any]:
-    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network; `refused`: but
-    of answers that refuse. script: a function that runs before those of the page."""
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network;
+    `refused`: but of answers that refuse. script: a function that runs before those of the page."""
     where, scheme = Where(), "https" if tls else "http"
     if tls:
         cert, key = certificates.server_certificate(("127.0.0.1",))
@@ -249,7 +248,7 @@ def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: i
     assert (info.width_px, info.height_px, info.n_frames) == (1920, 1080, about["frames"])
 
 
-def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: int, monkeypatch: pytest.MonkeyPatch):
+def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: int, stand_in: StandIn):
     """The woman of the demo, whole and then without feet, in turns of 5 s: within 2 s the page says which."""
     (frame,) = read_frames(assets.fetch("demo_video"), start=110, stop=111)
     x, pictures = 915, []
@@ -259,7 +258,7 @@ def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: i
     looked = Framing()
     assert [looked.cut_off(p) for p in pictures] == ["", "feet"]
     turns = [p for p in pictures for _ in range(150)]
-    monkeypatch.setattr(framing, "Framing", lambda: looked)
+    stand_in(Framing=lambda: looked)
     with with_camera(chromium, tmp_path / "camera.mjpeg", turns) as browser, filming(browser, visit) as page:
         start(page)
         said = page.evaluate(CUT_WHEN)

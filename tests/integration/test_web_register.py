@@ -383,7 +383,10 @@ def test_recordings_are_taken_into_the_archive_and_queued(tmp_path: Path, archiv
         assert Path(row["video_path"]).read_bytes() == sent.read_bytes()
     assert {c.pace for c in video.conditions(video.Video().proj()).values()} == {"fast"}
     assert decided().count(("recording", None, None)) == 2
-    assert "Compute now" in browser.get("/visits/1").text
+    page = browser.get("/visits/1").text
+    assert "Compute now" in page
+    assert re.search(r">walk-[0-9a-f]{8}\.mp4</a>", page)
+    assert ">registered<" not in page  # the word of the row
     assert not list(archive.rglob("browser-*"))
     # The same again is not stored twice.
     again = upload(browser, first)

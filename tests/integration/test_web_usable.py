@@ -17,9 +17,10 @@ from pbl_schemas.reading.why import why
 from pbl_schemas.review import Decision
 from pbl_schemas.studies import slices
 from pbl_workers.populate import populate
+from tests import StandIn
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
-from tests.integration.chain import StandIn, computed_once, small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 
 

@@ -311,7 +311,8 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
     visit.check(file)
     recording, *logs = copies
     folder = private_folder(folder_of(archive, "", visit.subject) / plain_name(visit.session_label))
-    target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
+    name = Path(plain_name(file))
+    target = folder / f"{name.stem}-{recording.sha256[:8]}{name.suffix}"
     came, note = [copy.path for copy in copies], note_placed(archive, target)
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)

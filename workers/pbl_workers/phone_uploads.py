@@ -57,7 +57,7 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
 def check_promised(begun: Mapping[int, int], next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE if all recordings that were begun (byte by number) do not fit, each twice: the
     parts stay until the whole is registered."""
-    here = {one.path.name: one.n_bytes for one in unfinished(archive_dir())}
+    here = {one.path.name: one.n_bytes for one in unfinished(archive_dir(), parts_alone=True)}
     check_room(sum(max(2 * n - here.get(str(number), 0), 0) for number, n in begun.items()), next_step)
 
 

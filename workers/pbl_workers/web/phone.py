@@ -204,7 +204,7 @@ async def worn(request: Request) -> Response:
     with contextlib.suppress(PblError):  # others wait
         compute(request, phone.session_id, False)
     language = reader_language(request)
-    return JSONResponse({"segments": ", ".join(texts.text(language, f"worn.{segment}") for segment in segments)})
+    return JSONResponse({"segments": ", ".join(texts.library_words(language, segment) for segment in segments)})
 
 
 class Phones:
