@@ -77,6 +77,7 @@ ORDER = (
     "sensor_share_dropped",
     "sensor_bias",
     "sensor_rate",
+    "sensor_wall_clock_s",
     "input_assumptions",
     "walking",
     "double_support_present",

@@ -16,7 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.fits import Residuals, Solution
+from pbl_pipeline.results.fits import Residuals, SensorFit, Solution
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
@@ -92,6 +92,9 @@ class SessionFit(dj.Computed):
         """  # noqa: E501
 
     Check = part_of("Check", Quality, "fit", "quality checks of the fit")
+    Sensor = part_of(
+        "Sensor", SensorFit, comment="what was found of a wearable sensor in a trial", of=("master", "FitSet.Video")
+    )
 
     @property
     def key_source(self) -> Any:
@@ -189,6 +192,7 @@ class SessionFit(dj.Computed):
         the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
+        from pbl_pipeline.sensors import places
 
         _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
         own, more = None, {}
@@ -198,7 +202,8 @@ class SessionFit(dj.Computed):
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
             if worn is not None:
-                more = {"sensors": _read_worn(*worn[:2])[0], "sensor_clock_s": [None] * len(trials)}
+                logs, recorded = _read_worn(*worn[:2])[0], [worn[1].get(name) for name in names]
+                more = {"sensors": logs, "sensor_clock_s": places(logs, recorded, loaded)}
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m, **more)
@@ -243,6 +248,7 @@ class SessionFit(dj.Computed):
                         "trial_file": path,
                     }
                 )
+                self.Sensor.insert_records({**key, "video_id": video_id}, trial.sensors)
         self.Check.insert_records(key, result.qc)
 
 

@@ -67,7 +67,9 @@ class Measures:
         return {r[cls.by]: (cls.measure(r), str(r[f"{cls.prefix}_missing"])) for r in rows(cls, key)}
 
 
-def part_of(name: str, record: type, prefix: str = "", comment: str = "", key: str = "") -> Any:
+def part_of(
+    name: str, record: type, prefix: str = "", comment: str = "", key: str = "", of: tuple[str, ...] = ("master",)
+) -> Any:
     """Return a part table of this name of records of a class.
 
     Parameters
@@ -76,9 +78,11 @@ def part_of(name: str, record: type, prefix: str = "", comment: str = "", key: s
         Of its columns.
     key
         Line of the definition that stands for the key of the class: a table above, or a column that counts the records.
+    of
+        Tables whose keys are in its own.
     """
     own = [d.path[0] for d in declared(record) if d.column.key and key]
-    lines = [f"# {comment}"] * bool(comment) + ["-> master"] + [key, "---"] * bool(key)
+    lines = [f"# {comment}"] * bool(comment) + [f"-> {table}" for table in of] + [key, "---"] * bool(key)
     number = key.partition(":")[0].strip() if ":" in key else ""
     text = "\n".join([*lines, definition(record, prefix, without=own)])
     return _part(name, Records, {"definition": text, "record": record, "prefix": prefix, "number": number})
