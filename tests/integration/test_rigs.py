@@ -24,11 +24,12 @@ from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
 from research.walker.views import observe_views
-from tests import StandIn
+from tests import StandIn, worn_sensor
 from tests.command import pbl
 from tests.rows import outcomes
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walking_fit import CYCLE_S
+from tests.worn_sensor import Swing
 
 from . import chain
 
@@ -263,6 +264,9 @@ def test_trials_that_cannot_be_are_refused(rig: None, tmp_path: Path):
     assert codes([one, two, three]) == {"USAGE"}
     made = register([SeveralCameras([one, two], toml, VisitRecord("P001"))])
     assert outcomes(made) == ["registered"] * 2
+    shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    said = pbl("ingest", one, two, "--rig", toml, "--subject", "P001", "--imu", f"shank_r={shank}")
+    assert (said.code, video.WearableImu.fetch1("imu_segments")) == (0, {"shank_r": "00B42D4B"})
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
     assert outcomes(ingest([one], VisitRecord("P001", camera_file=toml))) == ["USAGE"]

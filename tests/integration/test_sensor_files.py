@@ -1,5 +1,6 @@
 """Files that come with a video, in the tables: the phone's log reaches keypoints and fit, the others are kept."""
 
+import dataclasses
 from contextlib import closing
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.records import from_row, plain
+from pbl_pipeline.results import SensorFit
 from pbl_pipeline.sensors import SensorLog
 from pbl_schemas import connection, fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
@@ -195,7 +198,39 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
 
 
 def with_sensors(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
-    return chain.fit_session(trials, names, paramset)
+    """A fit, and what would have been found of the sensors: the clock is the earliest that the wall clocks allow."""
+    result = chain.fit_session(trials, names, paramset)
+    if not sensors:
+        return result
+    made = [
+        dataclasses.replace(trial, sensors=tuple(found_of(log, clock) for log in sensors))
+        for trial, clock in zip(result.trials, sensor_clock_s or (), strict=True)
+    ]
+    return dataclasses.replace(result, trials=tuple(made))
+
+
+def found_of(log: SensorLog, clock: tuple[float, float] | None) -> SensorFit:
+    turn, rest = np.array([0.6, 0.8, 0.0, 0.0]), dict.fromkeys(("heading_rad", "tilt_rad", "gain", "slip"), 0.1)
+    known = {"bias_rad_s": np.zeros(3), "dropped": 0.0, "z": 0.9, "rate_rad_s": 1.0, **rest}
+    start = np.nan if clock is None else clock[0]
+    return SensorFit(log.segment, log.name, log.segment, turn, clock_s=start, off_s=np.nan, **known)
+
+
+def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: StandIn):
+    stand_in(fit_session=with_sensors)
+    path = chain.small_video(tmp_path, "a")
+    insert(path, of_file=meta({"com.apple.quicktime.creationdate": "2026-03-01T09:16:10Z"}))
+    table = Swing().own().assign(start_utc="2026-03-01T09:15:30Z")
+    given = f"shank_r={Swing().write(tmp_path / 'shank.csv', table)}"
+    assert pbl("ingest", path, "--subject", "P001", "--imu", given).code == 0
+    assert not errors(populate())
+    row = fit.SessionFit.Sensor.fetch1()
+    assert (row["sensor_segment"], row["sensor_name"], row["sensor_z"]) == ("shank_r", "shank", 0.9)
+    assert (row["sensor_mounting"], row["sensor_clock_off"]) == ([0.6, 0.8, 0.0, 0.0], None)
+    # The video ended or began 40 s after the sensors, give or take 10.
+    assert 40 - 10 - 15 < row["sensor_clock"] < 40 - 10
+    (trial,) = load_visit({"subject": "P001"}).fitted
+    assert plain(trial.fit.sensors) == plain([from_row(SensorFit, row)])
 
 
 def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: StandIn):

@@ -30,6 +30,7 @@ from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
 from tests.rows import new_visit
 from tests.videos import numbered_frames
+from tests.worn_sensor import Swing
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 #: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.
@@ -104,14 +105,15 @@ def filming(
     visit: int,
     orientation: bool = True,
     torn: bool = False,
+    refused: bool = False,
     denied: bool = False,
     protocol: str = "",
     tls: bool = False,
     script: str = "",
     **context: Any,
 ) -> Iterator[Any]:
-    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network. script: a
-    function that runs before those of the page."""
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network;
+    `refused`: but of answers that refuse. script: a function that runs before those of the page."""
     where, scheme = Where(), "https" if tls else "http"
     if tls:
         cert, key = certificates.server_certificate(("127.0.0.1",))
@@ -135,7 +137,7 @@ def filming(
             page.wait_for_selector("main[data-ready]")
             yield page
             # A service worker needs a certificate that the browser trusts.
-            known = ("net::ERR",) if torn else ("fetching the script",) if tls else ()
+            known = ("net::ERR",) * torn + ("status of 4",) * refused + ("fetching the script",) * tls
             assert not [e for e in errors if not any(k in e for k in known)]
         finally:
             made.close()
@@ -434,6 +436,28 @@ def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch:
         assert usual.is_hidden()
     assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
     assert list(video.Pace().to_arrays("pace")) == ["fast"]
+
+
+def test_sensors_on_takes_their_log_after_filming(camera: Any, visit: int, tmp_path: Path):
+    shank, none = Swing().write(tmp_path / "shank.csv"), tmp_path / "none.csv"
+    none.write_text("frame,x\n1,2\n")
+    with filming(camera, visit, refused=True) as page:
+        log = page.get_by_label("Log of the sensors")
+        assert log.is_hidden()
+        page.get_by_label("Sensors on").check()
+        for file, said in ((none, "no known format"), (shank, "which segment")):
+            log.set_input_files(file)
+            page.locator(".worn li", has_text=said).wait_for()
+        page.get_by_label("Worn on").select_option("shank_r")
+        log.set_input_files(shank)
+        page.locator(".worn li", has_text="without a recording").wait_for()
+        film(page, 1.0)
+        keep(page)
+        log.set_input_files(shank)
+        page.locator(".worn li", has_text="right shank").wait_for()
+    row = video.WearableImu.fetch1()
+    assert (row["imu_name"], row["imu_segments"]) == ("shank.csv", {"shank_r": "shank"})
+    assert about_the_recording()["worn"] == "on"
 
 
 def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):
