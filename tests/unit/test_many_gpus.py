@@ -4,6 +4,7 @@ import functools
 import subprocess
 import threading
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,7 +31,7 @@ class Sums:
 
 
 @pytest.fixture
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> SimpleNamespace:
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> Iterator[SimpleNamespace]:
     """Three GPUs: the servers that were started on each, and those on which none starts."""
     found = SimpleNamespace(servers=dict[str, Server](), gpu_at=dict[str, str](), dead=set[str](), started=list[str]())
 

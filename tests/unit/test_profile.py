@@ -5,6 +5,7 @@ import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -24,7 +25,7 @@ NETWORK: dict = {"spend": spend}
 exec(compile("def compute(seconds):\n    spend(seconds)", "/x/pbl_pipeline/models/network.py", "exec"), NETWORK)
 
 
-def frames(*stack: tuple[str, str]) -> SimpleNamespace | None:
+def frames(*stack: tuple[str, str]) -> Any:
     """Frames by their files and functions, the innermost first."""
     found = None
     for file, name in reversed(stack):
