@@ -83,6 +83,7 @@ def test_processes_take_the_gpus_in_turn_each_with_a_server(machine: SimpleNames
 
 def test_where_a_gpu_disappears_the_next_one_computes(machine: SimpleNamespace) -> None:
     first, second = in_new_process(), in_new_process()
+    assert [n(PICTURE)[1].item() for n in (first, second)] == [48] * 2
     machine.dead.add("1")
     machine.servers["1"].close()
     address = next(at for at, gpu in machine.gpu_at.items() if gpu == "1")
