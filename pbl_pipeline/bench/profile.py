@@ -67,17 +67,22 @@ def profiled(folder: str) -> Iterator[Callable[[str], None]]:
 
 
 def _sample(found: Counter[tuple[str, str]], stage: list[str], ended: threading.Event) -> None:
-    main, before, all_before = threading.main_thread().ident, dict[int, float](), time.process_time()
+    main, before, all_before = threading.main_thread().ident, _clocks(), time.process_time()
     while not ended.wait(EVERY_S):
-        spent, all_now, frames = Counter[str](), time.process_time(), sys._current_frames()
-        for thread, frame in frames.items():
-            try:
-                now = time.clock_gettime(time.pthread_getcpuclockid(thread))
-            except OSError:  # it has ended
-                continue
-            spent[kind_of(frame)] += now - before.get(thread, now)
-            before[thread] = now
+        spent, all_now, frames, clocks = Counter[str](), time.process_time(), sys._current_frames(), _clocks()
+        for thread, now in clocks.items():
+            last = before.get(thread, 0.0)  # of an earlier thread of that number if it is later than now
+            spent[kind_of(frames.get(thread))] += now - last if now >= last else now
         spent[kind_of(frames.get(main or 0))] += max(0.0, all_now - all_before - sum(spent.values()))
-        all_before = all_now
+        before, all_before = clocks, all_now
         for kind, seconds in spent.items():
             found[stage[0], kind] += seconds
+
+
+def _clocks() -> dict[int, float]:
+    """Processor time (s) of each thread that has a Python stack."""
+    found = {}
+    for thread in sys._current_frames():
+        with contextlib.suppress(OSError):  # it has ended
+            found[thread] = time.clock_gettime(time.pthread_getcpuclockid(thread))
+    return found

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from pbl_pipeline.records import column, record, stored
@@ -34,6 +37,20 @@ class Solution:
     def loss(self) -> float:
         """Total loss at the end."""
         return float(self.loss_trace[-1, 1])
+
+
+@record
+class Residuals:
+    """Medians over frames and points, None where nothing was seen."""
+
+    px: float | None = column("{}_residual_2d", "(px) median distance of body and keypoints in the picture")
+    cm: float | None = column("{}_residual_3d", "(cm) median distance of body and 3D keypoints")
+
+    @classmethod
+    def of(cls, trials: Sequence[Any]) -> Residuals:
+        """Return the residuals of fitted trials (`TrialFit`) together."""
+        px, m = (np.concatenate([getattr(t, n).ravel() for t in trials]) for n in ("residual_2d_px", "residual_3d_m"))
+        return cls(*(float(np.median(s)) if len(s := v[np.isfinite(v)]) else None for v in (px, 100 * m)))
 
 
 @record

@@ -302,6 +302,7 @@ def _run(site: Site, minutes: float, supervisors: int, can_fill: bool, people: A
     until, weights = time.monotonic() + 60 * minutes, _faults(site, can_fill)
     if people is not None:
         weights += people.faults()
+        people.registered = registered
         people.start()
     refreshed = 0.0
     while time.monotonic() < until:
@@ -403,7 +404,7 @@ def _drain(site: Site, supervisors: int, until: float) -> list[str]:
 def _left(registered: int, people: Any | None) -> list[str]:
     """Return the faults: missing results, jobs and files that were left behind."""
     from pbl_schemas import computed_tables, connection, fit
-    from pbl_schemas.operations.orphans import orphans
+    from pbl_schemas.operations.orphans import WRITING, orphans, remove
     from pbl_schemas.video import Video
 
     connection.connect()
@@ -420,6 +421,9 @@ def _left(registered: int, people: Any | None) -> list[str]:
         if n := len(table.jobs):
             wrong.append(f"{n} job rows of {table.__name__}")
     found = orphans(young_s=0.0)
+    if people is not None:  # what the page was writing when it was killed goes by `pbl cron disk`
+        remove(found, 0.0, WRITING)
+        found = orphans(young_s=0.0)
     click.echo(f"{found.n_files} files in the store, {len(found.orphans)} without a row, {len(found.lost)} lost")
     wrong += [f"file without a row: {f.path} ({f.age_s:.0f} s old)" for f in found.orphans]
     return wrong + [f"lost: {path}" for path in found.lost]

@@ -271,7 +271,7 @@ class Films:
 
 
 def _log(number: int) -> bytes:
-    time_s = [i / 60 for i in range(100 + number % 50)]
+    time_s = [i / 60 for i in range(400 + number % 50)]  # longer than the recorded stages of `chaos`
     values = {"qw": 0.5**0.5, "qx": 0.5**0.5, "qy": 0.0, "qz": 0.0}
     sensor = {"time_s": time_s, **{name: [v] * len(time_s) for name, v in values.items()}}
     return json.dumps({"frame": "device", "phone": {"make": "B", "model": str(number)}, "orientation": sensor}).encode()

@@ -78,6 +78,8 @@ REPEAT = (1020, 1205, 1213)
 #: Those that say that the server cannot be reached, and that it is full or read-only.
 AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
 FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
+#: That of a text that is longer than its column.
+LONGER = (1406,)
 #: That which says that it ended a query after `LIMIT_S`.
 TOO_LONG = (1969, 3024)
 #: Most rows of a statement that inserts.

@@ -47,9 +47,9 @@ class Sample(NamedTuple):
     value: float
 
 
-def samples() -> list[Sample]:
+def samples(figures: Any = None) -> list[Sample]:
     registry = CollectorRegistry()
-    registry.register(Printed())  # type: ignore[arg-type]
+    registry.register(figures or Printed())
     families = text_string_to_metric_families(generate_latest(registry).decode())
     return [Sample(s.name, s.labels, s.value) for family in families for s in family.samples]
 
@@ -70,8 +70,8 @@ def holds(expression: str, found: list[Sample]) -> bool:
     return by_us
 
 
-def firing() -> set[str]:
-    found = samples()
+def firing(figures: Any = None) -> set[str]:
+    found = samples(figures)
     rules = yaml.safe_load(RULES.read_text())["groups"][0]["rules"]
     out = {rule["alert"] for rule in rules if holds(rule["expr"], found)}
     if _PROMTOOL is not None:
@@ -177,6 +177,14 @@ def test_an_old_queue_a_full_disk_and_a_lost_worker_are_seen(healthy: Path, tmp_
     assert "1 workers lost" in pbl("status").out
     later(300.0, where="worker='alive'")
     assert "PblNoWorker" in firing()
+
+
+def test_a_database_that_is_away_is_seen(healthy: Path):
+    def away() -> Any:
+        raise OSError("no route to it")
+
+    with closing(metrics._Installation(away)) as figures:
+        assert "PblDatabaseDown" in firing(figures)
 
 
 def test_workers_count_regular_work_not_as_workers(healthy: Path):

@@ -228,6 +228,17 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
     return rows
 
 
+def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
+    """Freeze three visits, about two of which something was stated in words, and take migration 0011 back."""
+    rows = _visits(folder, "2026-03-01", "2026-06-01", "2026-09-01")
+    for number, aid in enumerate(("Keine", "Gehstock", "my own"), 1):
+        study.Visit.insert1({"session_id": number, "visit_role": "pre", "assistive_device": aid})
+    slices.freeze("of words")
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 11")
+    return rows
+
+
 def _visits(folder: Path, *days: str) -> dict[str, list[tuple]]:
     pbl_schemas.activate()
     for day in days:
@@ -447,6 +458,15 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
+def test_slices_of_visits_whose_words_become_codes_are_named(put: Put):
+    put(stated_in_words)
+    said = "changes: 2 visits of the slice of words; a backup of before has its numbers"
+    assert migrations.migrate(dry_run=True).touched == [said]
+    migrations.migrate()
+    assert study.Visit.to_arrays("assistive_device", order_by="session_id").tolist() == ["none", "cane", "my own"]
+    assert slices.changes("of words") == [f"visit 2026-0{n}-01 of P001 has other rows" for n in (3, 6)]
+
+
 def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
     rows = put(tracked_without_video_info)
     dry = migrations.migrate(dry_run=True)
@@ -468,9 +488,11 @@ def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
 
 def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, forget: Callable[[], None]):
     before = everything()
-    for command in (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")):
+    commands = (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init"), ("web", "--port", "0"))
+    for command in commands:
         refused = pbl(*command)
         assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION"), command
+        assert "http" not in refused.out  # no address of a page that does not come
         for part in ("0003 height_of_fits", "video.video_size", "pbl db migrate --dry-run"):
             assert part in refused.err, refused.err
         assert everything() == before

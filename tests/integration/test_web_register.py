@@ -93,6 +93,7 @@ def test_a_visit_is_registered_with_its_person(archive: Path):
         ({"height_m": "1,720"}, "height_m", "SHEET_FORMAT"),
         ({"height_m": "9" * 500}, "height_m", "FIT_INPUT"),
         ({"population": "x" * 33}, "population", "USAGE"),
+        *(({"visit": text}, "visit", "SHEET_FORMAT") for text in ("9/3/2026", "28.11.26", "31.2.2026")),
     ],
 )
 @pytest.mark.parametrize("language", ["en", "de"])

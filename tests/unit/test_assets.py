@@ -195,6 +195,20 @@ def test_two_at_once_fetch_once(index, faults):
     assert assets.status()["one"] == "ok"
 
 
+def test_files_that_go_while_they_are_counted_end_no_thread(tmp_path, monkeypatch):
+    looked, ended = threading.Event(), []
+
+    def gone(*_):
+        looked.set()
+        raise FileNotFoundError("pip removed it")
+
+    monkeypatch.setattr(Path, "rglob", gone)
+    monkeypatch.setattr(threading, "excepthook", ended.append)
+    with assets._watch(tmp_path, "models", 10**6):
+        assert looked.wait(60)
+    assert ended == []
+
+
 def test_leftovers_of_a_killed_process_are_removed(index):
     (assets.folder() / ".pbl-tmp-999999999-abc").mkdir()
     (assets.folder() / ".pbl-tmp-999999999-abc" / "part.whl").write_bytes(b"half")

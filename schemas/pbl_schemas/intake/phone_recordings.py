@@ -105,7 +105,7 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
                 "session_id": session_id,
                 "protocol": protocol,
                 "link_key_sha256": hashed(key),
-                "link_by": by[:64],
+                "link_by": by,
                 "link_created": now,
                 "link_expires": now + datetime.timedelta(hours=hours),
             }
