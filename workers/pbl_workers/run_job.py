@@ -108,7 +108,7 @@ def run(
         except (KeyboardInterrupt, SystemExit):
             queue.put_back(job)
             raise
-        except Exception as error:  # noqa: BLE001  each kind is settled below
+        except Exception as error:
             repeated += 1
             if is_gone(error) or number_of(error) in FULL:
                 kept = repeated * DATABASE_PAUSE_S < DATABASE_WAIT_S
