@@ -45,11 +45,17 @@ format: $(READY) ## rewrite the source in the project's format
 LOCK := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 	  --no-emit-find-links --upgrade --custom-compile-command "make lock"
 
+IMAGE := workers/deploy/requirements-cpu.lock
+# Only what that lock lacks, in its versions: the longer locks begin with `-r`. uv lists the others after an empty line.
+BEYOND = --constraint $(IMAGE) $$(sed -n 's/^\([a-z0-9._-]*\)==.*/--no-emit-package \1/p' $(IMAGE))
+
 lock: $(READY)  ## choose the newest allowed version of every dependency and write requirements.lock and the images' three
 	$(BIN)/pip install --quiet uv
-	$(LOCK) --extra dev --output-file requirements.lock pyproject.toml
-	$(LOCK) --extra s3 --extra figures --output-file workers/deploy/requirements-cpu.lock pyproject.toml
-	$(LOCK) --extra s3 --extra figures --extra gpu --output-file workers/deploy/requirements-gpu.lock pyproject.toml
+	$(LOCK) --extra s3 --extra figures --output-file $(IMAGE) pyproject.toml
+	$(LOCK) --extra dev $(BEYOND) --output-file requirements.lock pyproject.toml
+	$(LOCK) --extra s3 --extra figures --extra gpu $(BEYOND) --output-file workers/deploy/requirements-gpu.lock pyproject.toml
+	sed -i -e '1i -r $(IMAGE)' -e '/^$$/,$$d' requirements.lock
+	sed -i -e '1i -r $(notdir $(IMAGE))' -e '/^$$/,$$d' workers/deploy/requirements-gpu.lock
 	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"])' \
 	  | $(LOCK) --output-file workers/deploy/requirements-build.lock -
 
@@ -68,7 +74,7 @@ dist: $(READY)  ## source archive and wheel of the commit, checked: dist/
 	$(TOOLS)/cffconvert --validate --infile build/dist/source/CITATION.cff
 
 # Debian splits `venv` off; without it the environment cannot hold pip, so it is installed once (root or sudo).
-$(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
+$(RUNS): pyproject.toml $(IMAGE)
 	@command -v $(PYTHON) >/dev/null || { echo "PYTHON_UNSUPPORTED: there is no $(PYTHON) on this machine. Python 3.11 or \
 	newer of 64 bits is needed: apt-get install python3-venv, or make demo PYTHON=/path/to/python3.11"; exit 1; }
 	@$(PYTHON) $(FITS)
@@ -83,7 +89,7 @@ $(RUNS): pyproject.toml workers/deploy/requirements-cpu.lock
 	@test ! -x $(BIN)/python || $(BIN)/python $(FITS)
 	@$(BIN)/python -c 'import pip' 2>/dev/null || $(PYTHON) -m venv $(VENV)
 	@echo "installing the locked dependencies into $(VENV) (some minutes the first time)"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r workers/deploy/requirements-cpu.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r $(IMAGE)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@touch $(RUNS)
 

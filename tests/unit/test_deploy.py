@@ -114,6 +114,19 @@ def test_the_builder_gets_what_the_image_takes_and_every_package_has_a_hash():
         assert re.search(rf"^{re.split('[<>=]', requirement)[0]}==\S+ \\\n    --hash=sha256:", lock, re.MULTILINE)
 
 
+def test_no_lock_repeats_what_the_lock_of_the_image_has():
+    image = DEPLOY / "requirements-cpu.lock"
+    for lock in (DEPLOY / "requirements-gpu.lock", ROOT / "requirements.lock"):
+        first, *others = lock.read_text().splitlines()
+        assert (lock.parent / first.removeprefix("-r ")).resolve() == image.resolve()
+        packages, of_image = (
+            {line.partition("==")[0] for line in lines if "==" in line and not line.startswith((" ", "#"))}
+            for lines in (others, image.read_text().splitlines())
+        )
+        assert packages
+        assert not packages & of_image
+
+
 def test_a_worker_has_longer_to_end_than_it_takes():
     grace: Any = next(p for p in command(["worker"]).params if p.name == "grace_s").default
     for name in ("worker-cpu", "cron"):  # Docker's own 10 s are too short for an import
