@@ -8,6 +8,7 @@ import multiprocessing
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -111,14 +112,14 @@ def run_visit(
         raise next(iter(problems.values()))
     check_day(sensors, {r.name: r.video.recorded_utc for r in recordings if r.video is not None})
     # Where a video lies in the log is looked for: its time of recording is rounded to seconds.
-    more = {"sensors": sensors, "sensor_clock_s": [None] * len(recordings)} if sensors else {}
+    more: dict[str, Any] = {"sensors": sensors, "sensor_clock_s": [None] * len(recordings)} if sensors else {}
+    more |= {"depths": depths} if any(d is not None for d in depths) else {}
     fit = fit_session(
         [r.keypoints for r in recordings if r.keypoints is not None],
         [r.name for r in recordings],
         method,
         camera_motion,
         height_m=height_m,
-        depths=depths,
         **more,
     )
     fitted = [dataclasses.replace(r, load_fit=Held(t)) for r, t in zip(recordings, fit.trials, strict=True)]

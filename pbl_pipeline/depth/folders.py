@@ -2,7 +2,7 @@
 
 Stray Scanner (github.com/strayrobots/scanner, docs/format.md) writes `depth/` (16-bit PNG, older versions npy, in mm),
 `confidence/` (PNG, 0 to 2), `odometry.csv` with a time (s) for each frame, and `camera_matrix.csv` of the video. Other
-folders may hold the last one, too, and `depth_matrix.csv` where the depth camera has another field of view.
+folders may also hold the last one, and `depth_matrix.csv` where the depth camera has another field of view.
 """
 
 from __future__ import annotations

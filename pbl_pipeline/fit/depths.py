@@ -31,7 +31,7 @@ MOST_OFF_M, LEAST_SHARE, LEAST_DEPTHS = 0.3, 0.5, 20
 
 @dataclasses.dataclass(frozen=True)
 class DepthFit:
-    """What a fit of N trials found of the depths.
+    """The depths of N trials, as a fit found them.
 
     `used` (N,): share of the used frames' large joints with a depth that was used; `fits` (N,): share of the depths of
     joints in sight that lie where the person is; `distance` (N,): distance of the fit without depths over theirs;
@@ -126,7 +126,7 @@ def _share(some: np.ndarray, of: np.ndarray) -> float:
 def depth_fit(
     session: Session, p: Problem, start: State, end: State, x: Float[Array, "F J 3"], share: np.ndarray, sd_m: float
 ) -> DepthFit:
-    """What a solution with markers at `x` says of the depths."""
+    """The depths as a solution with markers at `x` finds them."""
     seen, surface = p.depths, end.surface
     assert seen is not None
     assert surface is not None

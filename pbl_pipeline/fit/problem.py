@@ -94,7 +94,7 @@ class Wearing:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Depths:
-    """What a depth camera measured at the markers, along the axis of the camera of the video.
+    """Depths at the markers as a depth camera measured them, along the axis of the camera of the video.
 
     `depth_m`: of the surface there, and `count`: 1 where it counts; `skin_m`: the surface's depth less the marker's, by
     the body's shapes; `offset_sd_m`: of its error on each marker; `dispersion`: of the keypoints (`Linearised`).

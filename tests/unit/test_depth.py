@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 from pbl_pipeline.body import capsules, load_body, ray_lengths
+from pbl_pipeline.cli.fit import _with_depths
+from pbl_pipeline.cli.options import depth_files
 from pbl_pipeline.depth import Depth, at_points, read_depth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import GaussNewtonParams, fit_session
@@ -284,3 +286,24 @@ def test_a_fit_with_depths_is_in_their_metres():
     assert trial.sized
     assert fit.depth is not None
     assert fit.depth.after[0] == pytest.approx(1.0, abs=0.005)
+
+
+def test_keypoints_take_the_camera_and_the_depths_of_a_recording(tmp_path: Path):
+    made = synthesise(SynthSpec(seconds=1.0, marker_set="blazepose_33", seed=512)).keypoints
+    width, height = made.image_size_px
+    folder = write(tmp_path / "a", lambda i: np.full((160, 90), 3000, np.uint16), len(made.time_s))
+    matrix = f"1600, 0, {width / 2}\n0, 1600, {height / 2}\n0, 0, 1\n"
+    (folder / "camera_matrix.csv").write_text(matrix)
+    guessed = dataclasses.replace(made, camera=dataclasses.replace(made.camera, source="guess: a phone"))
+    (trial, other), (depth, none) = _with_depths([guessed, made], [folder, None], 0.001)
+    assert trial.camera.focal_px == 1600
+    assert other is made
+    assert none is None
+    assert set(depth[np.isfinite(depth)]) == {3.0}
+    assert depth.shape == (*made.confidence.shape, 2)
+    assert _with_depths([made], [None], None) == ([made], [])
+    assert depth_files(["none", "b"], 2) == [None, Path("b")]
+    with pytest.raises(PblError, match="USAGE"):
+        depth_files(["b"], 2)
+    with pytest.raises(PblError, match="USAGE"):
+        _with_depths([SimpleNamespace(markers="of a laboratory")], [folder], 0.001)
