@@ -27,6 +27,10 @@ SKIN_M = -0.14, 0.02
 #: Differences (m) from the expected depth up to which a depth is used; least share and number of such depths, so that
 #: the recording counts as one of this person.
 MOST_OFF_M, LEAST_SHARE, LEAST_DEPTHS = 0.3, 0.5, 20
+#: Share of a joint's least standard deviation that is left in trials of which at least this share of the joints had a
+#: depth: such that 90 % intervals hold 90 % of the samples of two synthetic persons from the front.
+FLOOR_SHARES = {"hip_flexion": 0.75, "hip_adduction": 0.9, "hip_rotation": 0.75, "knee_angle": 0.75}
+FLOOR_LEAST_USED = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +125,18 @@ def _large(session: Session) -> np.ndarray:
 
 def _share(some: np.ndarray, of: np.ndarray) -> float:
     return float(some.sum() / of.sum()) if of.any() else np.nan
+
+
+def shares_of_floors(session: Session, p: Problem) -> Float[np.ndarray, "F Q"]:
+    """Shares of the joints' least standard deviations that are left in each frame."""
+    assert p.depths is not None
+    count, names = np.asarray(p.depths.count), session.body.joint_names
+    out = np.ones((len(count), len(names)))
+    left = [next((share for k, share in FLOOR_SHARES.items() if n.startswith(k)), 1.0) for n in names]
+    for i, arrays in enumerate(session.arrays):
+        if count[session.frames(i)].sum() >= FLOOR_LEAST_USED * arrays.used.sum() * np.count_nonzero(_large(session)):
+            out[session.frames(i)] = left
+    return out
 
 
 def depth_fit(

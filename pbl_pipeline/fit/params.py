@@ -162,6 +162,8 @@ class GaussNewtonParams:
     weight_depth: float = later(1.0)
     huber_depth: float = later(2.0)
     depth_point_sd_m: float = later(0.02)
+    #: Share of `depth_ratio` at points whose depth was measured: a detector's own errs for long times.
+    depth_ratio_measured: float = later(0.3)
     sd_factor: tuple[tuple[str, float], ...] = SD_FACTOR
     #: Least standard deviation in deg (slides: cm), added in squares: detector errors that are common to many frames,
     #: which averaging does not reduce.

@@ -25,9 +25,9 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.jax_setup import compile_seconds
 from pbl_pipeline.sampling import interval_of
 
+from . import depths
 from .augmented_pelvis import with_augmented_pelvis
 from .blas_threads import one_blas_thread
-from .depths import depth_fit, with_depths
 from .initial_pose import placed_poses
 from .lanes import Found, Task, begin_one, fetch, fit_many, fit_one
 from .measured_weights import with_measured_weights
@@ -143,7 +143,7 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
             p, start, moves_with = with_wearables(session, p, start, float(found.dispersion))
         if session.depths:
             assert found.x is not None
-            p, start, in_place = with_depths(session, p, start, p.split(found.x)[0], float(found.dispersion))
+            p, start, in_place = depths.with_depths(session, p, start, p.split(found.x)[0], float(found.dispersion))
         found = yield Task(p, start, last=True)
         # The cost of the second one has a term more.
         trace = np.concatenate([trace, found.trace + np.array([len(trace), 0.0])])
@@ -153,7 +153,7 @@ def _steps(session: Session, start: State, params: GaussNewtonParams) -> _Steps:
         solution = dataclasses.replace(solution, sensors=sensors)
     if session.depths:
         x = solution.outcome.x_world_m
-        depth = depth_fit(session, p, start, found.end.state, x, in_place, params.depth_point_sd_m)
+        depth = depths.depth_fit(session, p, start, found.end.state, x, in_place, params.depth_point_sd_m)
         solution = dataclasses.replace(solution, depth=depth)
     return solution
 
@@ -248,6 +248,8 @@ def _solution(
     factor, floor = by_joint(names, params.sd_factor, 1.0), floors_of(session.body, params.sd_floor)
     if session.worn is not None:
         floor = floor * shares_of_floors(session, p)
+    if session.depths:
+        floor = floor * depths.shares_of_floors(session, p)
     assert found.variance is not None
     assert found.outcome is not None
     variance = np.maximum(found.variance[:, : len(factor)], 0.0)

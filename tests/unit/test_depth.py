@@ -20,7 +20,7 @@ from pbl_pipeline.depth import Depth, at_points, read_depth
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import GaussNewtonParams, fit_session
 from pbl_pipeline.fit.checks import _depths
-from pbl_pipeline.fit.depths import DepthFit, check_depths, with_depths
+from pbl_pipeline.fit.depths import DepthFit, check_depths, shares_of_floors, with_depths
 from pbl_pipeline.fit.per_frame import start_of
 from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.qc import FAIL, PASS, WARN
@@ -238,6 +238,10 @@ def test_depths_on_the_way_into_a_fit(monkeypatch: pytest.MonkeyPatch):
     names = np.array(session.markers.names)[used[:, : len(session.markers)].any(axis=0)]
     assert {n.split("_")[1] for n in names} == {"shoulder", "elbow", "wrist", "hip", "knee", "ankle"}
     assert np.all((np.asarray(p.depths.skin_m)[used] < 0) & (np.asarray(p.depths.skin_m)[used] > -0.14))
+    floors = dict(zip(session.body.joint_names, shares_of_floors(session, p)[0], strict=True))
+    assert (floors["knee_angle_l"], floors["ankle_angle_l"]) == (0.75, 1.0)
+    few = dataclasses.replace(p, depths=dataclasses.replace(p.depths, count=0.2 * p.depths.count))
+    assert np.all(shares_of_floors(session, few) == 1.0)
     # Another person's recording: depths of a wall, and of a path that comes nearer.
     away = np.broadcast_to(np.linspace(1, 4.5, len(depth))[:, None, None], depth.shape)
     with pytest.raises(PblError, match="DEPTH_FILE"):
