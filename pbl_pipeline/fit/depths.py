@@ -28,8 +28,8 @@ SKIN_M = -0.14, 0.02
 #: the recording counts as one of this person.
 MOST_OFF_M, LEAST_SHARE, LEAST_DEPTHS = 0.3, 0.5, 20
 #: Share of a joint's least standard deviation that is left in trials of which at least this share of the joints had a
-#: depth: such that 90 % intervals hold 90 % of the samples of two synthetic persons from the front.
-FLOOR_SHARES = {"hip_flexion": 0.75, "hip_adduction": 0.9, "hip_rotation": 0.75, "knee_angle": 0.75}
+#: depth: such that 90 % intervals hold 90 % of the samples of synthetic persons.
+FLOOR_SHARES = {"hip_flexion": 0.75, "knee_angle": 0.75}
 FLOOR_LEAST_USED = 0.3
 
 
