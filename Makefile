@@ -9,7 +9,8 @@ FITS   := -B -c 'from pbl_pipeline.interpreter import require; require()'
 PYTHON ?= $(shell for p in python3.11 python3.12 python3.13; do $$p $(FITS) 2>/dev/null && break; p=python3; done; echo $$p)
 ROOM   := 2500# MB: 1,300 for the environment of the demo, the rest for what pip downloads and for tests
 OUT    ?= pbl_demo
-JOBS   ?= 2# test processes, a file of tests at a time, in the order of the folders: the longest come first
+JOBS   ?= 3# test processes, a file of tests at a time, in the order of the folders: the longest come first. On two
+# cores two of them leave a fifth of the time idle: they wait for browsers, phones and processes that end
 # Whatever the shell says, compiled modules are kept: tests start many processes that import them.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 

@@ -10,17 +10,21 @@ into an empty cache on purpose). Set PBL_CACHE to try a cold start. The database
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import importlib
 import importlib.util
 import os
 import shutil
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
-from tests import SHARED, Environment, compiled
+from tests import SHARED, Calls, Environment, Faults, Limits, Machine, StandIn, compiled
 from tests.database import installation, leave_nothing_of_the_developer
 from tests.remembered import points_kept_in, remembered
 
@@ -109,6 +113,123 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> Environment:
                 monkeypatch.setenv(name, str(value))
 
     return set_for_the_test
+
+
+@pytest.fixture
+def until_the_end(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], tuple[pytest.MonkeyPatch, contextlib.ExitStack]]:
+    """Changes of the fixtures below, which end with their `with` or with the test: the last one first, and before those
+    of `monkeypatch`."""
+
+    def change() -> tuple[pytest.MonkeyPatch, contextlib.ExitStack]:
+        patch, end = pytest.MonkeyPatch(), contextlib.ExitStack()
+        end.callback(patch.undo)
+        request.addfinalizer(patch.undo)
+        return patch, end
+
+    return change
+
+
+@pytest.fixture
+def limits(until_the_end: Callable[..., Any]) -> Limits:
+    """Times, sizes and numbers that a module states as constants, for a test: `limits(loop, REFRESH_EVERY_S=0.1)`."""
+
+    def are(module: ModuleType | str, **values: object) -> contextlib.ExitStack:
+        patch, end = until_the_end()
+        module = importlib.import_module(module) if isinstance(module, str) else module
+        for name, value in values.items():
+            assert name.isupper(), f"{name} is not a constant"
+            patch.setattr(module, name, value)
+        return end
+
+    return are
+
+
+@pytest.fixture
+def machine(until_the_end: Callable[..., Any]) -> Machine:
+    """What the machine has, for a test: bytes free of 1 TB on every disk, the number of the account, no package of a
+    name, no database server outside PATH, a GPU or the address of the process that computes on one."""
+
+    def has(
+        *,
+        free_bytes: int | None = None,
+        account: int | None = None,
+        without: Iterable[str] = (),
+        servers: bool = True,
+        gpu: str | bool | None = None,
+    ) -> contextlib.ExitStack:
+        patch, end = until_the_end()
+        if free_bytes is not None:
+            disk = shutil.disk_usage("/")._replace(total=10**12, free=free_bytes)
+            patch.setattr(shutil, "disk_usage", lambda _: disk)
+        if account is not None:
+            patch.setattr(os, "geteuid", lambda: account)
+        for package in without:
+            patch.setitem(sys.modules, package, None)  # import raises ImportError
+        if not servers:
+            patch.setattr("pbl_schemas.operations.embedded.binaries.PLACES", ())
+            patch.setattr("pbl_pipeline.cli.doctor._SERVER_PLACES", ())
+        if gpu is not None:
+            patch.setattr("pbl_pipeline.models.gpu_address.gpu_visible", lambda: bool(gpu))
+        if isinstance(gpu, str):
+            patch.setattr("pbl_pipeline.models.gpu_address.running_server", lambda _: gpu)
+        return end
+
+    return has
+
+
+@pytest.fixture
+def faults(until_the_end: Callable[..., Any]) -> Faults:
+    """Lets a function fail: `faults(incoming, "register", None, OSError())` raises an error at the second call; returns
+    the arguments of the calls, and works as before at the end of its `with`.
+
+    The error comes before the function does what it does, with `after=True` behind it. `before` and `then` are called
+    with the arguments, before and after that."""
+
+    def let(
+        where: Any,
+        name: str,
+        *errors: BaseException | type[BaseException] | None,
+        after: bool = False,
+        before: Callable[..., object] = lambda *_, **__: None,
+        then: Callable[..., object] = lambda *_, **__: None,
+    ) -> Calls:
+        patch, end = until_the_end()
+        where = importlib.import_module(where) if isinstance(where, str) else where
+        real, left, calls = getattr(where, name), list(errors), Calls(end)
+
+        def fails(*args: Any, **options: Any) -> Any:
+            calls.append(args)
+            before(*args, **options)
+            error = left.pop(0) if left else None
+            if error is not None and not after:
+                raise error
+            done = real(*args, **options)
+            then(*args, **options)
+            if error is not None:
+                raise error
+            return done
+
+        patch.setattr(where, name, fails)
+        return calls
+
+    return let
+
+
+@pytest.fixture
+def stand_in(until_the_end: Callable[..., Any]) -> StandIn:
+    """Replaces stages of the chain by their names (`tests.integration.chain.STAGES`)."""
+    from tests.integration import chain
+
+    return lambda **functions: chain.replace(until_the_end()[0], **functions)
+
+
+@pytest.fixture
+def in_empty_folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder of the test's own, which is the working folder."""
+    with contextlib.chdir(tmp_path):
+        yield tmp_path
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -29,6 +29,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from pbl_pipeline.errors import PblError
+
 MIB = 1 << 20
 #: Bytes of a text (JSON, CSV, TRC, MOT), unpacked: an hour of a sensor at 100 Hz.
 MAX_TEXT = 32 * MIB
@@ -58,6 +60,8 @@ _LARGEST_INT = 10**308
 _JSON_TEXT, _BRACKETS = re.compile(r'"(?:[^"\\]|\\.?)*+"?', re.DOTALL), re.compile(r"[][{}]")
 _HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
 
+#: Numbers of errors in reading that say nothing about the file: a disk, a network or a limit of this machine failed.
+_OF_MACHINE = (errno.EIO, errno.ESTALE, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ENOTCONN, errno.ETIMEDOUT)
 #: Errors that readers of packed files raise for damaged ones; RuntimeError: for one with a password.
 DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, RuntimeError, EOFError, gzip.BadGzipFile)
 
@@ -174,6 +178,8 @@ def opened_zip(path: str | Path) -> Iterator[zipfile.ZipFile]:
             with zipfile.ZipFile(file) as archive:
                 yield archive
         except (*DAMAGED, OSError) as error:  # OSError: places that no file has
+            if getattr(error, "errno", None) in _OF_MACHINE:
+                raise
             raise ValueError(f"no readable archive: {error}") from error
 
 
@@ -266,11 +272,18 @@ def _cost(count: int, dtype: np.dtype) -> int:
 
 @contextlib.contextmanager
 def _opened(path: str | Path) -> Iterator[BinaryIO]:
-    """A regular file; a pipe or device is refused and not waited for."""
-    with open(path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file", str(path))
-        yield file
+    """A regular file; a pipe or device is refused and not waited for. Raises `PblError` FILE_MISSING for an error that
+    says nothing about the file."""
+    try:
+        with open(path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+            yield file
+    except OSError as error:
+        if error.errno not in _OF_MACHINE:
+            raise
+        found, next_step = error.strerror or str(error), "check disk, network and limits of this machine, and try again"
+        raise PblError("FILE_MISSING", found, "a file that can be read to its end", next_step, path) from error
 
 
 def _size(n: int) -> str:

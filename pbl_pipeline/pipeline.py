@@ -32,7 +32,7 @@ from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.render import overlay_frames, render_overlay, report_indices
 from pbl_pipeline.report import Picture, write_report
 from pbl_pipeline.resources import processes_at_once, shared_cores
-from pbl_pipeline.sensors import SensorLog, check_day
+from pbl_pipeline.sensors import SensorLog, check_day, places
 from pbl_pipeline.temporary import new_folder
 from pbl_pipeline.texts import LANGUAGES
 from pbl_pipeline.tracking import METHODS as TRACKING_METHODS
@@ -111,11 +111,14 @@ def run_visit(
     if not recordings:
         raise next(iter(problems.values()))
     check_day(sensors, {r.name: r.video.recorded_utc for r in recordings if r.video is not None})
-    # Where a video lies in the log is looked for: its time of recording is rounded to seconds.
-    more: dict[str, Any] = {"sensors": sensors, "sensor_clock_s": [None] * len(recordings)} if sensors else {}
+    points = [r.keypoints for r in recordings if r.keypoints is not None]
+    recorded = [None if r.video is None else r.video.recorded_utc for r in recordings]
+    more: dict[str, Any] = {}
+    if sensors:
+        more = {"sensors": sensors, "sensor_clock_s": places(sensors, recorded, points)}
     more |= {"depths": depths} if any(d is not None for d in depths) else {}
     fit = fit_session(
-        [r.keypoints for r in recordings if r.keypoints is not None],
+        points,
         [r.name for r in recordings],
         method,
         camera_motion,

@@ -31,6 +31,13 @@ def enabled() -> bool:
     return _enabled
 
 
+def note(text: str) -> None:
+    """Print a line on stderr when enabled, for what takes time before the first bar."""
+    if _enabled:
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
+
+
 def track(items: Iterable[T], label: str, total: int | None = None, unit: str = "frame") -> Iterator[T]:
     """Iterate over `items`, drawing a bar on stderr when enabled. `total` may be unknown."""
     bar = tqdm(items, desc=label, total=total, unit=unit, disable=not _enabled, **_style())

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import structured
 
 T = TypeVar("T")
@@ -34,7 +35,8 @@ class Column(NamedTuple):
     comment: str = ""  # (unit) meaning
     type: str = "float64"  # of DataJoint, such as varchar(64)
     null: bool = False  # NULL for None, "" and what is not finite; always so where the field may be None
-    empty: bool = False  # '' in the rows that were there when it was added
+    old: str | None = None  # value in the rows that were there when it was added
+    cut: bool = False  # text in words, which is cut to its length; of a name that is too long `to_row` raises
     key: bool = False  # in the primary key of the table
     digits: int | None = None  # decimals of the numbers of a json column
     meaning: str = ""  # in words, for files
@@ -133,19 +135,20 @@ def meanings(cls: type) -> dict[str, str]:
 
 
 def _line(c: Column, prefix: str) -> str:
-    default = "=null" if c.null else "=''" if c.empty else ""
+    default = "=null" if c.null else "" if c.old is None else f"='{c.old}'"
     comment = f"  # {c.comment.format(prefix)}" if c.comment else ""
     return f"{c.name.format(prefix)}{default} : {c.type}{comment}"
 
 
 def to_row(record: Any, prefix: str = "", without: Collection[str] = ()) -> dict[str, Any]:
-    """Return the values of a record by column: texts as long as their column, numbers as plain Python's."""
-    row = {}
-    for path, c, write, *_ in declared(type(record)):
+    """Return the values of a record by column, numbers as plain Python's; of a class those of an unknown record.
+
+    Raises `PblError` USAGE for a name that is longer than its column, or is not one plain line.
+    """
+    row, unknown = {}, isinstance(record, type)
+    for path, c, write, _, missing in declared(record if unknown else type(record)):
         if path[0] not in without:
-            value = record
-            for field in path:
-                value = getattr(value, field)
+            value = missing if unknown else functools.reduce(getattr, path, record)
             row[c.name.format(prefix) if prefix else c.name] = write(value)
     return row
 
@@ -234,9 +237,15 @@ def _writer(c: Column) -> Callable[[Any], Any]:
         return number if c.null else float
     kind: Callable[[Any], Any] = {"int": int, "bool": bool}.get(c.type.rstrip("0123456789"), _same)
     if c.type.startswith("varchar"):
-        longest = int(c.type[8:-1])
-        kind = lambda value: str(value)[:longest]  # noqa: E731
+        longest, name = int(c.type[8:-1]), c.name.format("").strip("_")
+        kind = (lambda text: str(text)[:longest]) if c.cut else functools.partial(_name, name, longest)
     return (lambda value: None if value is None or value == "" else kind(value)) if c.null else kind
+
+
+def _name(column: str, longest: int, value: object) -> str:
+    text = str(value)
+    check_label(column, text, longest)
+    return text
 
 
 def _same(value: T) -> T:

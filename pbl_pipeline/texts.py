@@ -17,14 +17,14 @@ from pbl_pipeline.words import capital
 
 #: The first is the default.
 LANGUAGES = ("en", "de")
-_NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?")
+_NUMBER = re.compile(r"[-+\N{MINUS SIGN}]?\d+([.,]\d+)?(e[-+]?\d+)?%?")
 #: A text with this many letters outside its places is used even if a place stays English.
 _LEAST = 12
 #: Text between two marks of a chart.
 _TEXT = re.compile(r">[^<]+<")
 #: Between the words of a list.
 _LIST = re.compile(r"(, |; )")
-_POINT = re.compile(r"(?<=\d)\.(?=\d)")
+_POINT, _PERCENT = re.compile(r"(?<=\d)\.(?=\d)"), re.compile(r"(?<=\d)%")
 #: A command or its option, and one in brackets behind what it does.
 _COMMAND = re.compile(r"\bpbl [a-z]|(?<![\w-])--[a-z]")
 _IN_BRACKETS = re.compile(r" \((?:--|pbl )[^()]*\)")
@@ -185,8 +185,8 @@ def _patterns(language: str) -> tuple[tuple[re.Pattern[str], str], ...]:
 
 
 def decimals(language: str, text: str) -> str:
-    """Return a text with the decimal signs of the language."""
-    return _POINT.sub(",", text) if language == "de" else text
+    """Return a text with the decimal and percent signs of the language."""
+    return _PERCENT.sub("\N{NO-BREAK SPACE}%", _POINT.sub(",", text)) if language == "de" else text
 
 
 def in_chart(language: str, chart: Markup) -> Markup:

@@ -147,6 +147,11 @@ def unit_of(name: str) -> str:
     return next((unit for end, unit in _UNITS if name.endswith(end)), "")
 
 
+def without_unit(name: str) -> str:
+    """Return the name of an instrument or a measure without the unit in its end: "10MWT" of "10MWT_m_per_s"."""
+    return name.removesuffix(next((end for end, _ in _UNITS if name.endswith(end)), ""))
+
+
 #: Ends of the names of checks and their units, and words of these names that are displayed differently.
 _CHECK_UNITS = {"cm": "cm", "px": "px", "s": "s", "deg": "\N{DEGREE SIGN}", "percent": "%", "m": "m"}
 _SPELLED = {"2d": "2D", "3d": "3D", "gdi": "GDI", "trial": "recording"}

@@ -14,8 +14,33 @@ T = TypeVar("T")
 
 #: The fixture `environment`: sets variables for a test; None removes one.
 Environment = Callable[..., None]
+#: The fixture `limits`: constants of a module for a test, by their names; ends with its `with`, else with the test.
+Limits = Callable[..., contextlib.ExitStack]
+#: The fixture `machine`: what the machine has; ends likewise.
+Machine = Callable[..., contextlib.ExitStack]
+#: The fixture `stand_in`: functions that stand in for stages of the chain, by their names.
+StandIn = Callable[..., None]
 #: The development data beside the project.
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+class Calls(list[tuple[Any, ...]]):
+    """Arguments of the calls of a function that fails (fixture `faults`), which ends with its `with`, else with the
+    test."""
+
+    def __init__(self, end: contextlib.ExitStack) -> None:
+        super().__init__()
+        self._end = end
+
+    def __enter__(self) -> "Calls":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.close()
+
+
+#: The fixture `faults`.
+Faults = Callable[..., Calls]
 
 
 def not_none(value: T | None) -> T:

@@ -45,13 +45,13 @@ def check(python: str) -> list[str]:
     FOLDER.mkdir(parents=True)
     _run(sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(FOLDER))
     (wheel,) = FOLDER.glob("*.whl")
-    _run(python, "-m", "venv", str(FOLDER / "env"))
     program = FOLDER / "env" / "bin" / "python"
     install = [str(program), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    _run(*install, str(wheel))
-    demos = [subprocess.Popen(_demo(p), cwd=FOLDER, env=_environment()) for p in (program, Path(sys.executable))]
-    ended = [demo.wait() for demo in demos]
-    if any(ended):
+    with subprocess.Popen(_demo(Path(sys.executable)), cwd=FOLDER, env=_environment()) as of_this:  # while pip works
+        _run(python, "-m", "venv", str(FOLDER / "env"))
+        _run(*install, str(wheel))
+        of_the_other = subprocess.run(_demo(program), cwd=FOLDER, env=_environment(), check=False)
+    if of_this.returncode or of_the_other.returncode:
         return ["the demo"]
     here, there = (_measures(_out(p)) for p in (Path(sys.executable), program))
     other = [name for name in here.keys() | there.keys() if not _alike(here.get(name), there.get(name))]

@@ -16,6 +16,7 @@ from pbl_pipeline import progress, temporary
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import CODERS, INTERRUPTS, PblError
 from pbl_pipeline.extras import absent
+from pbl_pipeline.resources import fewer_collections
 
 #: Exit codes: 0 done, 1 a coded error, 2 wrong usage (click's own), 130 interrupted.
 EXIT_ERROR, EXIT_INTERRUPTED = 1, 130
@@ -98,6 +99,7 @@ def cli(quiet: bool, debug: bool) -> None:
 
 def main() -> None:
     """Run the `pbl` script."""
+    fewer_collections()
     for stream in (sys.stdout, sys.stderr):  # a character that the terminal's encoding lacks must not end the work
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -79,6 +79,8 @@ def fit(
 
     Writes <name>.fit.npz and <name>.angles.csv for each trial, and session.json.
     """
+    import numpy as np
+
     from pbl_pipeline.files import check_out_folder
     from pbl_pipeline.fit import fit_session, points_of
     from pbl_pipeline.keypoints import WorldMarkers
@@ -113,6 +115,10 @@ def fit(
     visit = Visit(recordings, solution_of(session), session.qc, kind=kind, methods={"Fit": paramset.key})
     for path in save_visit(visit, out):
         click.echo(path)
+    for trial in session.trials:
+        for s in trial.sensors:
+            found = f"clock {s.clock_s:.3f} s, error {s.z:.2f} standard deviations, {s.dropped:.0%} left out"
+            click.echo(f"{trial.name}, sensor on {s.segment}: {found if np.isfinite(s.clock_s) else 'not used'}")
     click.echo(f"fitted in {session.seconds:.0f} s, of which {session.compile_seconds:.0f} s compiling")
     for check in session.qc:
         if check.outcome != "PASS":

@@ -93,11 +93,8 @@ def run(
     events, the forces and a video with the body drawn over it. A video that cannot be used is reported and left out;
     the others are processed, and the exit code is 1.
     """
-    from pbl_pipeline.change import earlier_visit
+    from pbl_pipeline import progress
     from pbl_pipeline.errors import PblError
-    from pbl_pipeline.files import check_out_folder
-    from pbl_pipeline.pipeline import run_visit, write_results
-    from pbl_pipeline.visit import METRICS
 
     # Wrong arguments are found before minutes of work.
     if person is not None and len(videos) > 1:
@@ -115,6 +112,12 @@ def run(
             expected="none, or one for each video, in the same order",
             next_step="name a log for each video; run videos without a log in another call",
         )
+    progress.note(f"{', '.join(p.name for p in videos)}: loading")
+    from pbl_pipeline.change import earlier_visit
+    from pbl_pipeline.files import check_out_folder
+    from pbl_pipeline.pipeline import run_visit, write_results
+    from pbl_pipeline.visit import METRICS
+
     before = None if earlier is None else earlier_visit(earlier, out, subject, height_m)
     check_out_folder(out)
     sensors, depths = sensor_logs(imu), depth_files(depth, len(videos))

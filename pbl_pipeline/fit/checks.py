@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pbl_pipeline.body import stature_m
 from pbl_pipeline.keypoints import Keypoints, MultiView, WorldMarkers
 from pbl_pipeline.qc import FAIL, PASS, WARN, Check, warn_if
-from pbl_pipeline.sensors.worn import SensorFit
+from pbl_pipeline.results import SensorFit
 
 from .augmented_pelvis import folds
 from .depths import DepthFit
@@ -77,7 +77,8 @@ def check_fit(
         checks += _pelvis_told(session, trials, solution.pelvis_told)
     if np.any(np.isfinite([t.phone_clock_offset_s for t in trials])):
         checks += [_clock(trials)]
-    checks += [*_sensors(solution.sensors), *_depths(solution.depth)]
+    checks += _sensors([sensor for trial in trials for sensor in trial.sensors])
+    checks += _depths(solution.depth)
     # Only a check that did not pass has advice.
     return tuple(dataclasses.replace(c, advice="") if c.outcome == PASS else c for c in checks)
 
@@ -86,19 +87,23 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
     """Checks of wearable sensors; empty if there are none."""
     if not sensors:
         return []
-    elsewhere = ", ".join(f"{s.segment} (moves like {s.moves_with})" for s in sensors if s.moves_with != s.segment)
-    n = sum(s.moves_with != s.segment for s in sensors)
-    moved = max(float(np.nanmax(s.rate_rad_s)) for s in sensors)
+    of = {s.segment: [t for t in sensors if t.segment == s.segment] for s in sensors}
+    wrong = [f"{k} moves like {found[0].moves_with}" for k, found in of.items() if found[0].moves_with != k]
+    elsewhere = ", ".join(wrong)
+    n = len(wrong)
+    moved = max((s.rate_rad_s for s in sensors if np.isfinite(s.rate_rad_s)), default=0.0)
 
-    def each(values: Sequence[np.ndarray], most: float) -> tuple[float, str]:
-        """The largest value, and the sensors whose value is above the most."""
-        worst = [float(np.nanmax(v)) if np.isfinite(v).any() else np.inf for v in values]
-        return max(worst), ", ".join(s.segment for s, w in zip(sensors, worst, strict=True) if w > most)
+    def each(value: Callable[[SensorFit], float], most: float) -> tuple[float, str]:
+        """The largest value, and the segments whose value is above the most."""
+        known = {k: [x for t in found if np.isfinite(x := value(t))] for k, found in of.items()}
+        worst = {k: max(x, default=np.inf) for k, x in known.items()}
+        return max(worst.values()), ", ".join(k for k, x in worst.items() if x > most)
 
-    z, loose = each([s.z for s in sensors], SENSOR_Z_WARN)
-    dropped, lost = each([s.dropped for s in sensors], SENSOR_DROPPED_WARN)
-    slip, slipped = each([s.slip for s in sensors], SENSOR_SLIP_WARN)
-    bias, drifting = each([np.rad2deg(np.abs(s.bias_rad_s)) for s in sensors], SENSOR_BIAS_WARN_DEG_S)
+    z, loose = each(lambda s: s.z, SENSOR_Z_WARN)
+    dropped, lost = each(lambda s: s.dropped, SENSOR_DROPPED_WARN)
+    slip, slipped = each(lambda s: s.slip, SENSOR_SLIP_WARN)
+    bias, drifting = each(lambda s: float(np.rad2deg(np.max(np.abs(s.bias_rad_s)))), SENSOR_BIAS_WARN_DEG_S)
+    off = max((abs(s.off_s) for s in sensors if np.isfinite(s.off_s)), default=0.0)
     return [
         Check(
             "sensors_on_another_segment",
@@ -126,7 +131,7 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
             "sensor_share_dropped",
             dropped,
             SENSOR_DROPPED_WARN,
-            f"sensors did not measure in many of the frames, or do not fit there: {lost}",
+            f"sensors did not measure in many frames, do not fit there, or fit the video at several times: {lost}",
         ),
         warn_if(
             drifting,
@@ -141,6 +146,14 @@ def _sensors(sensors: Sequence[SensorFit]) -> list[Check]:
             moved,
             SENSOR_RATE_WARN,
             "a person who hardly moves does not show how the sensors sit, nor their clock: they add next to nothing",
+        ),
+        warn_if(
+            off > 0,
+            "sensor_wall_clock_s",
+            off,
+            0.0,
+            f"by its movement a video lies {off:.0f} s from where its time of recording is in the log of the sensors; "
+            "set the clocks of phone and sensors, or name the log of this recording",
         ),
     ]
 

@@ -40,10 +40,14 @@ class _Errors(NamedTuple):
     by_sensor: Float[Array, "F m 3 11"]
 
 
+def _worn(at: At) -> Wearables:
+    assert at.problem.wearables is not None
+    return at.problem.wearables
+
+
 def _errors(at: At) -> _Errors:
     """The error turns with a segment like `log(exp(d) X)`, whose derivative by d is that of the logarithm."""
-    p, worn, state = at.problem, at.problem.wearables, at.state.wearing
-    assert worn is not None
+    p, worn, state = at.problem, _worn(at), at.state.wearing
     assert state is not None
     assert at.segments is not None
     trial, R = p.trial, at.segments.rotation
@@ -110,8 +114,7 @@ def _polynomial(w: Float[Array, "*n 3"], first: Array, second: Array) -> Float[A
 def whitened(at: At) -> tuple[Float[Array, "F m 3"], Float[Array, "F m 3 17"]]:
     """Each frame's error less what the next one's tells of it, in standard deviations, and its derivatives by turns of
     the segment in the frame and in the next one and by the unknowns of the sensor."""
-    worn, here = at.problem.wearables, _errors(at)
-    assert worn is not None
+    worn, here = _worn(at), _errors(at)
     there = _Errors(*(later(a) for a in here))
     size = 1 / (jnp.sqrt(1 - worn.follows**2) * worn.sd_rad)
     tells = (size * worn.follows)[..., None]
@@ -137,7 +140,7 @@ def _prior(at: At) -> Array:
     worn, state, w = at.problem.wearables, at.state.wearing, at.weights
     assert worn is not None
     assert state is not None
-    z2 = jnp.sum((state.mount / jnp.deg2rad(w["mount_sd_deg"])) ** 2)
+    z2 = jnp.sum((state.mount / jnp.deg2rad(jnp.minimum(w["mount_sd_deg"], worn.mount_sd_deg))[:, None]) ** 2)
     z2 += jnp.sum((state.bias / worn.bias_sd_rad_s[:, None]) ** 2)
     z2 += jnp.sum((state.clock / jnp.stack([w["sensor_clock_sd_s"], w["sensor_gain_sd_s"]])) ** 2)
     # The vertical of a world is off by its own error and by that of the trial, which all sensors share; the heading is
@@ -155,9 +158,9 @@ LIMU = Term(
     weight="weight_sensor",
     width="huber_sensor",
     unknowns=Unknowns.SEGMENT_IN_TWO_FRAMES,
-    variables=lambda at: jnp.zeros((*at.problem.wearables.count.shape, 17)),
+    variables=lambda at: jnp.zeros((*_worn(at).count.shape, 17)),
     residual=_residual,
     count=lambda at: jnp.zeros(0) if at.problem.wearables is None else at.problem.wearables.count,
-    frames=lambda at: at.problem.weight * at.problem.wearables.dispersion,
+    frames=lambda at: at.problem.weight * _worn(at).dispersion,
 )
 WEARING = SharedTerm("sensor prior", "weight_sensor", _prior, empty=lambda at: at.state.wearing is None)

@@ -57,6 +57,7 @@ class Wearables:
     the middle of the trial to a frame, by which an error of the rate turns M in the sensor's world. `count`: 1 in
     frames that were measured; `follows`: correlation of the error there with that of the next frame, 0 if that was not.
     `mount`, `world`: start of the rotations from sensor to segment and from a sensor's world to that of a trial.
+    `mount_sd_deg`: most that the standard deviation of that is;
     `sd_rad`: of a sensor on its segment; `bias_sd_rad_s`: of its gyroscope; `level_sd_rad`: of the vertical of a
     sensor's world; `tilt_sd_rad`: of that of a trial's world, 0 where it was measured. `middle_s`: of the trials;
     `clock_s`: start of the clock. `dispersion`: of the keypoints (`Linearised`).
@@ -68,6 +69,7 @@ class Wearables:
     count: Float[Array, "F m"]
     follows: Float[Array, "F m"]
     mount: Float[Array, "m 4"]
+    mount_sd_deg: Float[Array, " m"]
     world: Float[Array, "N m 4"]
     sd_rad: Float[Array, " m"]
     bias_sd_rad_s: Float[Array, " m"]

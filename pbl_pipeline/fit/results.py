@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 from pathlib import Path
 
 import numpy as np
 
 from pbl_pipeline.body import SCALE_NAMES, SLIDES
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.bounded import parse_json
+from pbl_pipeline.errors import PblError, unread_file
 from pbl_pipeline.files import check_numbers, load_npz, picture_size, text_of, texts_of
 from pbl_pipeline.qc import Check
-from pbl_pipeline.records import record
-from pbl_pipeline.results import Solution
-from pbl_pipeline.sensors.worn import SensorFit
+from pbl_pipeline.records import from_json, plain, record
+from pbl_pipeline.results import SensorFit, Solution
 from pbl_pipeline.video import Camera, check_lens
 
 from .depths import DepthFit
@@ -36,8 +37,8 @@ class TrialFit:
     laboratory markers have none (NaN). phone_clock_offset_s: the sensor's clock minus the video's, NaN where not
     estimated. orientation_source: source of the world's vertical. height_m: the person's stated body height, which sets
     the scale of a fit to one camera (`known_height.py`), NaN if it was not stated. confidence_curve: that of the
-    keypoints, which tells their detector, "" if they have none or the file is from before it was kept. with_depths:
-    depth recordings set the scale.
+    keypoints, which tells their detector, "" if they have none or the file is from before it was kept. sensors: what
+    was found of each wearable sensor. with_depths: depth recordings set the scale.
     """
 
     name: str
@@ -66,6 +67,7 @@ class TrialFit:
     seconds: float
     height_m: float = float("nan")
     confidence_curve: str = ""
+    sensors: tuple[SensorFit, ...] = ()
     with_depths: bool = False
 
     @property
@@ -88,7 +90,9 @@ class TrialFit:
 
     def save(self, path: str | Path) -> None:
         """Write `<name>.fit.npz`."""
-        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "camera"}
+        arrays = {k: np.asarray(getattr(self, k)) for k in _ARRAYS}
+        if self.sensors:
+            arrays["sensors"] = np.asarray(json.dumps(plain(self.sensors)))
         arrays["camera_matrix"] = np.asarray(self.camera.matrix)
         arrays["distortion"] = np.asarray(self.camera.distortion)
         arrays["camera_source"] = np.asarray(self.camera.source)
@@ -97,11 +101,15 @@ class TrialFit:
     @classmethod
     def load(cls, path: str | Path) -> TrialFit:
         """Read `<name>.fit.npz`. Raises `PblError` FILE_MISSING, FILE_FORMAT, CAMERA_INVALID. Never unpickles."""
-        wanted = [f.name for f in dataclasses.fields(cls) if f.name != "camera"]
-        fields = [*wanted, "camera_matrix", "distortion", "camera_source"]
-        # Older files lack what could not be stated or was not kept then.
-        data = {"height_m": np.asarray(np.nan), "confidence_curve": np.asarray(""), "with_depths": np.asarray(False)}
-        data |= load_npz(path, fields)
+        fields = [*_ARRAYS, "camera_matrix", "distortion", "camera_source"]
+        # Older files lack what could not be stated or was not kept then, others have no sensors.
+        data = {
+            "height_m": np.asarray(np.nan),
+            "confidence_curve": np.asarray(""),
+            "with_depths": np.asarray(False),
+            "sensors": np.asarray("[]"),
+            **load_npz(path, [*fields, "sensors"]),
+        }
         missing = [k for k in fields if k not in data]
         if missing:
             raise PblError(
@@ -111,7 +119,13 @@ class TrialFit:
                 next_step="see docs/files.md, section fit.npz",
             )
         check_numbers(path, data, _shapes(data["time_s"].size, data["joint_names"].size, data["marker_names"].size))
-        values = {k: data[k] for k in wanted}
+        values = {k: data[k] for k in _ARRAYS}
+        try:
+            values["sensors"] = tuple(from_json(SensorFit, s) for s in parse_json(text_of(path, data, "sensors")))
+        except (ValueError, TypeError, AttributeError) as error:
+            raise unread_file(
+                error, "a file that `pbl fit` wrote", "see docs/files.md, section fit.npz", path
+            ) from error
         for k in ("joint_names", "marker_names"):
             values[k] = texts_of(path, data, k)
         for k in ("name", "marker_set", "camera_motion", "orientation_source", "solver", "params_hash", "body_sha256"):
@@ -135,8 +149,11 @@ class SessionFit(Solution):
     trials: tuple[TrialFit, ...]
     site_offset_m: np.ndarray
     qc: tuple[Check, ...]
-    sensors: tuple[SensorFit, ...] = ()
     depth: DepthFit | None = None
+
+
+#: Fields of a trial that its file has as they are.
+_ARRAYS = [f.name for f in dataclasses.fields(TrialFit) if f.name not in ("camera", "sensors")]
 
 
 def _shapes(n: int, q: int, j: int) -> dict[str, tuple[int | None, ...]]:

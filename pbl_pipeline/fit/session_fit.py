@@ -16,7 +16,9 @@ from pbl_pipeline.methods import Method
 from pbl_pipeline.names import check_height
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.sensors.log import SensorLog
-from pbl_pipeline.sensors.worn import input_error, worn
+from pbl_pipeline.sensors.orientation import input_error
+from pbl_pipeline.sensors.start import Stated
+from pbl_pipeline.sensors.worn import worn
 from pbl_pipeline.video import Camera
 
 from .checks import check_fit
@@ -50,7 +52,7 @@ class SessionInput:
     markers: MarkerSet | None = None
     height_m: float | None = None
     sensors: Sequence[SensorLog] = ()
-    sensor_clock_s: Sequence[float | None] | None = None
+    sensor_clock_s: Sequence[Stated] | None = None
     depths: Sequence[np.ndarray | None] = ()
 
 
@@ -62,7 +64,7 @@ def fit_session(
     markers: MarkerSet | None = None,
     height_m: float | None = None,
     sensors: Sequence[SensorLog] = (),
-    sensor_clock_s: Sequence[float | None] | None = None,
+    sensor_clock_s: Sequence[Stated] | None = None,
     depths: Sequence[np.ndarray | None] = (),
 ) -> SessionFit:
     """Fit the body to all trials of one session; scale and marker offsets are shared.
@@ -91,8 +93,9 @@ def fit_session(
         Logs of wearable sensors, one for each segment, all on one clock; one log for all trials. The method is
         `gauss-newton`'s.
     sensor_clock_s
-        Time of the logs at time 0 of each trial's video, to half a second; None where it is not known, so that it is
-        looked for in the whole log. Default: one trial, in which both begin together; not known of several.
+        Time of the logs at time 0 of each trial's video, to half a second, or the earliest and latest one by wall
+        clocks (`sensors.places`); None where it is not known, so that it is looked for in the whole log. Default: one
+        trial, in which both begin together; not known of several.
     depths
         Of each trial of one camera, (T, J, 2) in m at its keypoints (`depth.at_points`), or None.
     """
@@ -192,7 +195,6 @@ def _session_fit(packed: Packed, solution: Solution, method: Method[Params], giv
         compile_seconds=solution.compile_seconds,
         device=str(jax.devices()[0].device_kind),
         qc=check_fit(session, fits, solution, taller),
-        sensors=solution.sensors,
         depth=solution.depth,
     )
 
@@ -243,6 +245,7 @@ def _trial_fit(
         seconds=seconds,
         height_m=float("nan") if height_m is None else height_m,
         confidence_curve=view.confidence_curve if isinstance(view, Keypoints) else "",
+        sensors=solution.sensors[i] if solution.sensors else (),
         with_depths=solution.depth is not None,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from pbl_pipeline import words
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import LEFT, RIGHT
-from pbl_pipeline.results.measures import Measure
+from pbl_pipeline.results.measures import Measure, Spatiotemporal
 
 from .ground import is_metric
 from .motion import BodyPoses
@@ -109,38 +109,6 @@ def sampling_sd(usual: float, n: int, own: float | None = None, freedom: int = 0
     """
     excess = 0.0 if own is None else max(own**2 - usual**2, 0.0) * freedom / (USUAL_FREEDOM + freedom)
     return math.sqrt((usual**2 + excess) / n)
-
-
-@dataclasses.dataclass(frozen=True)
-class Spatiotemporal:
-    """Measures by name (`MEASURES`); None if one cannot be trusted, with the reason in `reasons`.
-
-    In a trial of a task the measures of the task (`TASK_MEASURES`) follow, whatever the `status`, which is that of
-    walking.
-
-    `reasons["spread"]`, if present, is the reason why no measure has a spread. `n_cycles_found` and `n_cycles_used`
-    count before and after the exclusions of `find_cycles`.
-    """
-
-    status: str
-    reason: str
-    measures: dict[str, Measure | None]
-    reasons: dict[str, str]
-    n_cycles_found: int
-    n_cycles_used: int
-    n_steps_used: int
-
-    def __getitem__(self, name: str) -> Measure | None:
-        return self.measures.get(name)
-
-    @property
-    def of_task(self) -> dict[str, Measure | None]:
-        """The measures of a task; empty for a trial of walking and for a session."""
-        return {name: m for name, m in self.measures.items() if name not in MEASURES}
-
-    def with_task(self, measures: Mapping[str, Measure | None], reasons: Mapping[str, str]) -> Spatiotemporal:
-        both = {**self.measures, **measures}, {**self.reasons, **reasons}
-        return dataclasses.replace(self, measures=both[0], reasons=both[1])
 
 
 def spatiotemporal(cycles: Sequence[GaitCycle]) -> Spatiotemporal:

@@ -13,9 +13,10 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.methods import Method
 from pbl_pipeline.paramset import Paramset
 from pbl_pipeline.qc import CADENCE, EMPTY, FAIL, OUTCOMES, PASS, Check, in_session, warn_if, worst
-from pbl_pipeline.records import plain
+from pbl_pipeline.records import plain, record
 from pbl_pipeline.results.cycles import GaitCycle
 from pbl_pipeline.results.events import GaitEvents
+from pbl_pipeline.results.index import SessionMetrics
 from pbl_pipeline.results.measures import OF_VISIT, Z90
 
 from ._cycles import check_sides, find_cycles, refused_cadence, with_cadence_accepted
@@ -91,22 +92,7 @@ class TrialMetrics(TrialCycles):
         return {"name": self.name, **_measures(self), **more}
 
 
-@dataclasses.dataclass(frozen=True)
-class SessionMetrics:
-    """Measures and index over all used cycles of the pooled trials of a session, with their checks `qc`.
-
-    `params_hash` identifies the method of the events and the parameters of the index together.
-    """
-
-    status: str
-    reason: str
-    spatiotemporal: Spatiotemporal
-    gdi: Gdi
-    qc: tuple[Check, ...]
-    params_hash: str
-
-
-@dataclasses.dataclass(frozen=True)
+@record
 class GaitMetrics(SessionMetrics):
     """The measures of a session and its trials. `before`: checks of the earlier stages (`with_checks`)."""
 

@@ -1,11 +1,12 @@
-"""Addresses and start of the processes that own the GPU (`gpu_server`); the first that needs one starts it.
+"""Addresses and start of the processes that own the GPUs (`gpu_server`); the first that needs one starts it.
 
-They are separate because many processes that detect share one GPU, and end by themselves after a while without
-connections.
+They are separate because many processes that detect share a GPU, and end by themselves after a while without
+connections. Each GPU has its own; a process that sees several GPUs uses the one whose turn it is.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.util
 import os
@@ -15,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 
+from pbl_pipeline.resources import VISIBLE_GPUS, given_gpus
 from pbl_pipeline.temporary import private_folder
 
 from .devices import asked_device
@@ -23,13 +25,14 @@ from .devices import asked_device
 NETWORKS, DECODER = "networks", "decoder"
 #: Time after which a GPU process that does not listen has failed (s): loading JAX and the driver takes some seconds.
 START_S = 120.0
+#: Time for which a process does not try again to start one that failed (s).
+AGAIN_S = 300.0
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def gpu_visible() -> bool:
     """True if JAX would find an NVIDIA GPU, without loading it: a driver, a GPU that is not hidden, a plugin."""
-    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
-    hidden = listed is not None and listed.split(",")[0].strip() in ("", "-1", "NoDevFiles")
+    hidden = VISIBLE_GPUS in os.environ and not given_gpus()
     other = os.environ.get("JAX_PLATFORMS", "")
     if hidden or (other and not {"cuda", "gpu"} & set(other.split(","))):
         return False
@@ -46,33 +49,75 @@ def gpu_wanted() -> bool:
 
 
 def running_server(what: str) -> str:
-    """Return the address of the process of the `NETWORKS` or the `DECODER`, which is started if none listens.
+    """Return the address of the process of the `NETWORKS` or the `DECODER` of a GPU, which is started if none listens:
+    of the GPU whose turn it is for this process, or of the next one where that fails.
 
     Raises
     ------
     RuntimeError
-        It does not start; the message is the last line that it printed.
+        It starts on no GPU; the message is the last line that it printed.
     OSError
         The folder of its socket cannot be made.
     """
+    error = RuntimeError("no GPU")
+    for gpu in _in_turn(os.environ.get(VISIBLE_GPUS)):
+        at, failed = _FAILED.get((what, gpu), (-AGAIN_S, error))
+        if time.monotonic() - at < AGAIN_S:
+            error = failed
+            continue
+        try:
+            return _running(what, gpu)
+        except RuntimeError as found:
+            error = found
+            _FAILED[what, gpu] = time.monotonic(), error
+    raise error
+
+
+#: When the processes that could not be started were tried, and why they failed.
+_FAILED = dict[tuple[str, str], tuple[float, RuntimeError]]()
+
+
+@functools.cache
+def _in_turn(_visible: str | None) -> tuple[str, ...]:
+    """The GPUs of this process, first the one whose turn it is: each process takes the next one. "" for an unknown."""
     import fcntl  # not on Windows, where JAX sees no GPU
 
-    base = private_folder("gpu") / f"{_name()}-{what}"
+    seen = given_gpus() or ("",)
+    if len(seen) == 1:
+        return seen
+    with (private_folder("gpu") / "turn").open("a+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        turn = int(file.read() or 0) % len(seen)
+        file.truncate(0)
+        file.write(b"%d" % (turn + 1))
+    return (*seen[turn:], *seen[:turn])
+
+
+def gpu_number() -> int:
+    """Number of the GPU whose turn it is for this process, among those that it sees."""
+    seen = given_gpus() or ("",)
+    return seen.index(_in_turn(os.environ.get(VISIBLE_GPUS))[0])
+
+
+def _running(what: str, gpu: str) -> str:
+    import fcntl
+
+    base = private_folder("gpu") / f"{_name(gpu)}-{what}"
     address = str(base.with_suffix(".sock"))
     with base.with_suffix(".lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not _listens(address):
-            _start(what, address, base.with_suffix(".log"))
+            _start(what, gpu, address, base.with_suffix(".log"))
     return address
 
 
-def _name() -> str:
-    """Name of the process for this code and the GPUs that this process may use."""
+def _name(gpu: str) -> str:
+    """Name of the process for this code and a GPU."""
     here = Path(__file__).parent
     names = ("gpu_server.py", "network.py", "nvdec.py", "tflite_jax.py")
     code = b"".join((here / name).read_bytes() for name in names)
-    seen = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
-    return hashlib.sha256(code + seen.encode() + sys.executable.encode()).hexdigest()[:16]
+    return hashlib.sha256(code + gpu.encode() + sys.executable.encode()).hexdigest()[:16]
 
 
 def _listens(address: str) -> bool:
@@ -84,8 +129,8 @@ def _listens(address: str) -> bool:
     return True
 
 
-def _start(what: str, address: str, log: Path) -> None:
-    env = dict(os.environ)
+def _start(what: str, gpu: str, address: str, log: Path) -> None:
+    env = os.environ | ({VISIBLE_GPUS: gpu} if gpu else {})
     # The fit may be another process on the same GPU.
     env.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     env["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)

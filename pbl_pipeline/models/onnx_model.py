@@ -13,6 +13,7 @@ from pbl_pipeline.errors import PblError, os_errors_as
 from pbl_pipeline.resources import cores
 
 from .devices import asked_device, device_of, providers_for, unavailable
+from .gpu_address import gpu_number
 from .network import batches
 from .spec import GRAPH_FILE, SPEC_FILE, WITHOUT_POINTS, ModelSpec, load_spec, model_invalid
 
@@ -49,7 +50,8 @@ class OnnxModel:
         options.intra_op_num_threads = cores()
         options.log_severity_level = 4  # its messages are raised below
         try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=providers)
+            options_of = [{"device_id": gpu_number()} if p.startswith("CUDA") else {} for p in providers]
+            self._session = onnxruntime.InferenceSession(data, options, providers, options_of)
         except Exception as error:
             if asked_device(device) == "cuda" and "CUDA" in str(error):
                 raise unavailable(_reason(error)) from error

@@ -21,7 +21,7 @@ class Check:
     outcome: str = column("{}_check_outcome", type=f"enum({', '.join(map(repr, OUTCOMES))})")
     value: float | None = column("{}_check_value", "in the unit (see {}_check)")
     threshold: float | None = column("{}_check_threshold", "in the unit (see {}_check)")
-    advice: str = column("{}_check_advice", "what to do about it", "varchar(1000)", default="")
+    advice: str = column("{}_check_advice", "what to do about it", "varchar(1000)", cut=True, default="")
 
     def __post_init__(self) -> None:
         if self.outcome not in OUTCOMES:
@@ -77,6 +77,7 @@ ORDER = (
     "sensor_share_dropped",
     "sensor_bias",
     "sensor_rate",
+    "sensor_wall_clock_s",
     "depth_distance_ratio",
     "depth_share_used",
     "depth_share_on_person",

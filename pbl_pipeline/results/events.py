@@ -35,6 +35,18 @@ class GaitEvent:
 
 
 @record
+class SetEvent:
+    """One event of a correction."""
+
+    time_s: float = column("corrected_time", "(s) time of the trial")
+    side: str = column("corrected_side", type="enum('left', 'right')")
+    event: str = column("corrected_kind", type="enum('foot_down', 'foot_up')")
+    probability: float | None = column(
+        "corrected_probability", "(0..1) of the detection, which found it there; null: set by hand"
+    )
+
+
+@record
 class GaitEvents:
     """The events of one trial in order of time.
 
@@ -46,7 +58,7 @@ class GaitEvents:
 
     status: str = column("events_status", type="enum('PASS', 'EMPTY')")
     events: tuple[GaitEvent, ...]
-    reason: str = column("events_reason", "why EMPTY", "varchar(1000)")
+    reason: str = column("events_reason", "why EMPTY", "varchar(1000)", cut=True)
     method: str = column("events_detector", "name of the method in the library", "varchar(64)")
     params_hash: str
     source: str = column("events_source", "what the feet come from", "varchar(64)")

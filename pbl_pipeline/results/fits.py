@@ -1,6 +1,9 @@
-"""Result of fitting the body of a visit, without the movements."""
+"""Results of fitting the body of a visit, without the movements."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -34,3 +37,41 @@ class Solution:
     def loss(self) -> float:
         """Total loss at the end."""
         return float(self.loss_trace[-1, 1])
+
+
+@record
+class Residuals:
+    """Medians over frames and points, None where nothing was seen."""
+
+    px: float | None = column("{}_residual_2d", "(px) median distance of body and keypoints in the picture")
+    cm: float | None = column("{}_residual_3d", "(cm) median distance of body and 3D keypoints")
+
+    @classmethod
+    def of(cls, trials: Sequence[Any]) -> Residuals:
+        """Return the residuals of fitted trials (`TrialFit`) together."""
+        px, m = (np.concatenate([getattr(t, n).ravel() for t in trials]) for n in ("residual_2d_px", "residual_3d_m"))
+        return cls(*(float(np.median(s)) if len(s := v[np.isfinite(v)]) else None for v in (px, 100 * m)))
+
+
+@record
+class SensorFit:
+    """What a fit found of a sensor in one of its trials; NaN where it was not measured or not stated."""
+
+    segment: str = column("sensor_segment", "segment of the body, such as shank_r", "varchar(8)", key=True)
+    name: str = column("sensor_name", "its name in the log", "varchar(255)")
+    moves_with: str = column("sensor_moves_with", "segment whose motion it shows, mostly the stated one", "varchar(8)")
+    mounting: np.ndarray = column(
+        "sensor_mounting", "quaternion (w, x, y, z) from its axes to the segment, of the visit", "json", digits=6
+    )
+    bias_rad_s: np.ndarray = column(
+        "sensor_bias", "(rad/s) of its gyroscope, three axes, beyond what its filter took off", "json", digits=6
+    )
+    heading_rad: float = column("sensor_heading", "(rad) of its world in that of the camera", null=True)
+    tilt_rad: float = column("sensor_tilt", "(rad) of its world against that of the camera", null=True)
+    clock_s: float = column("sensor_clock", "(s) its time at the start of the video", null=True)
+    off_s: float = column("sensor_clock_off", "(s) how far that is from where the wall clocks state it", null=True)
+    gain: float = column("sensor_gain", "(-) how much faster its clock runs", null=True)
+    z: float = column("sensor_z", "(-) its error in standard deviations, root mean square", null=True)
+    dropped: float = column("sensor_dropped", "(-) share of frames in which it was not measured, or errs by far")
+    slip: float = column("sensor_slip", "(-) turn on the segment from first to last third, in likely ones", null=True)
+    rate_rad_s: float = column("sensor_rate", "(rad/s) its angular velocity, root mean square", null=True)

@@ -1,4 +1,4 @@
-"""Index of a trial or a visit, and its Movement Analysis Profile."""
+"""Index of a trial or a visit, its Movement Analysis Profile, and all measures of a visit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pbl_pipeline.records import column, plain, record
 from pbl_pipeline.words import number
 
 from .events import RIGHT
-from .measures import Z90
+from .measures import Z90, Spatiotemporal
 
 #: The paper's index, and the original one (Schwartz & Rozumalski 2008).
 GDI_MODEL, GILLETTE_MODEL = "pbl-2025-three-angles", "gillette-2008"
@@ -27,6 +27,27 @@ _NAMES = {
 WITH_ERROR = ("mean", "sd", "minimal_change")
 #: Numbers of an index: fields of `Gdi`, statistics of files.
 NUMBERS = ("mean", "left", "right", "sd", "minimal_change", "unshrunk", "unshrunk_sd")
+
+
+@record(kw_only=True)
+class NormFacts:
+    """Identity of a normative set, number of its normative vectors, their source and definition of their angles."""
+
+    name: str = column("norm_name", type="varchar(40)")
+    version: int = column("norm_version", type="int16")
+    sha256: str = column("norm_sha256", "of its numbers", "char(64)", default="")  # checked at loading
+    n: int = column("norm_n", "normative vectors", "int32")
+    variables: tuple[str, ...] = column("norm_variables", "angles of the index, in order", "json")
+    source: str = column("norm_source", "who measured whom, and where it is published", "varchar(1000)", cut=True)
+    convention: str = column("norm_convention", "how its angles are defined", "varchar(1000)", cut=True)
+    licence: str = column("norm_licence", type="varchar(500)", cut=True)
+    angle_model: str = column(  # one of `ANGLE_MODELS`
+        "norm_angle_model",
+        "how pelvis and hip are defined: plug_in_gait or pbl_body",
+        "varchar(32)",
+        old="plug_in_gait",
+        default="plug_in_gait",
+    )
 
 
 @record
@@ -71,7 +92,7 @@ class GdiCycle:
     deviation from the normative mean that lies in the normative components; the rest does not count."""
 
     trial: str
-    number: int
+    number: int = column("cycle_no", type="int16", key=True)
     side: str
     gdi: float = column("cycle_gdi", "(-)")
     z: float = column("cycle_z", "(-) standardised log distance to the normative mean")
@@ -91,7 +112,7 @@ class Gdi:
     """
 
     status: str = column("{}_status", type="enum('PASS', 'EMPTY')")
-    reason: str = column("{}_reason", "why there is no index", "varchar(1000)")
+    reason: str = column("{}_reason", "why there is no index", "varchar(1000)", cut=True)
     left: float | None = column("{}_left", "(-)")
     right: float | None = column("{}_right", "(-)")
     mean: float | None = column("{}", "(-) mean over all used cycles", before="left")
@@ -150,6 +171,23 @@ class Gdi:
         own = {**rounded, "interval": plain(interval_90(rounded["mean"], rounded["sd"]), 3)}
         own |= {name: getattr(self, name) for name in ("n", "n_left", "n_right", "norm", "params_hash")}
         return {**own, "cycles": plain(self.cycles)}
+
+
+@record
+class SessionMetrics:
+    """Measures and index over all used cycles of the pooled trials of a session, with their checks `qc`.
+
+    `params_hash` identifies the method of the events and the parameters of the index together.
+    """
+
+    status: str = column("session_status", type="enum('PASS', 'EMPTY')")
+    reason: str = column("session_reason", "why EMPTY", "varchar(2000)", cut=True)
+    spatiotemporal: Spatiotemporal
+    gdi: Gdi
+    qc: tuple[Check, ...]
+    params_hash: str = column(
+        "session_params_hash", "hash over the parameters of events and index together", "char(16)"
+    )
 
 
 def numbers_of(told: Mapping[str, Any]) -> dict[str, float | None]:

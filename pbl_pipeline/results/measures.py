@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Mapping
 
 from pbl_pipeline.records import column, record
+from pbl_pipeline.words import MEASURES
 
 #: A 90 % interval of a normal error, in standard deviations.
 Z90 = 1.6449
 #: Fields of `Measure` that those of a visit have, not those of a trial.
 OF_VISIT = ("error_sd", "minimal_change")
+#: Fields of `Spatiotemporal` that stand in the row of the cycles.
+COUNTS = ("n_cycles_found", "n_cycles_used")
 
 
 @record
@@ -84,3 +89,35 @@ class Measure:
             return None
         half = float(t.isf(0.05, freedom)) * sd / math.sqrt(self.n)
         return self.mean - half, self.mean + half
+
+
+@record
+class Spatiotemporal:
+    """Measures by name (`MEASURES`); None if one cannot be trusted, with the reason in `reasons`.
+
+    In a trial of a task the measures of the task (`TASK_MEASURES`) follow, whatever the `status`, which is that of
+    walking.
+
+    `reasons["spread"]`, if present, is the reason why no measure has a spread. `n_cycles_found` and `n_cycles_used`
+    count before and after the exclusions of `find_cycles`.
+    """
+
+    status: str = column("measures_status", type="enum('PASS', 'EMPTY')")
+    reason: str = column("measures_reason", "why EMPTY", "varchar(1000)", cut=True)
+    measures: dict[str, Measure | None]
+    reasons: dict[str, str]
+    n_cycles_found: int = column("n_cycles", "all complete cycles", "int16")
+    n_cycles_used: int = column("n_cycles_used", "without first and last steps, odd lengths and odd curves", "int16")
+    n_steps_used: int = column("n_steps_used", type="int16")
+
+    def __getitem__(self, name: str) -> Measure | None:
+        return self.measures.get(name)
+
+    @property
+    def of_task(self) -> dict[str, Measure | None]:
+        """The measures of a task; empty for a trial of walking and for a session."""
+        return {name: m for name, m in self.measures.items() if name not in MEASURES}
+
+    def with_task(self, measures: Mapping[str, Measure | None], reasons: Mapping[str, str]) -> Spatiotemporal:
+        both = {**self.measures, **measures}, {**self.reasons, **reasons}
+        return dataclasses.replace(self, measures=both[0], reasons=both[1])

@@ -51,4 +51,4 @@ class SubjectChoice:
     runner_up_id: int | None = column("runner_up_id", "next best person", "int16")
     runner_up_score: float = column("runner_up_score", "(0..1) score of the next best person", null=True)
     scores: dict[int, float] = column("choice_scores", "person number to score (0..1)", "json")
-    reason: str = column("choice_reason", "why, in a sentence", "varchar(2000)")  # for clinicians
+    reason: str = column("choice_reason", "why, in a sentence", "varchar(2000)", cut=True)  # for clinicians

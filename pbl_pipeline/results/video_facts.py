@@ -1,4 +1,4 @@
-"""Facts of a video file."""
+"""Facts of a video file and of a camera."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class FirstPicture:
     width_px: int = column("width", "(px) of the upright frame", "int32", before="fps")
     height_px: int = column("height", "(px) of the upright frame", "int32", before="fps")
     rotation_deg: int = column("rotation", "(deg) rotation flag of the file", "int16", before="fps")
-    make: str | None = column("phone_make", type="varchar(64)", before="capture_fps")
-    model: str | None = column("phone_model", type="varchar(64)", before="capture_fps")
+    make: str | None = column("phone_make", type="varchar(64)", cut=True, before="capture_fps")
+    model: str | None = column("phone_model", type="varchar(64)", cut=True, before="capture_fps")
     lens: str | None = column(
-        "phone_lens", "lens as the phone names it", "varchar(128)", before="capture_fps", default=None
+        "phone_lens", "lens as the phone names it", "varchar(128)", cut=True, before="capture_fps", default=None
     )
     focal_35mm: float | None = column(
         "focal_35mm",
@@ -69,17 +69,35 @@ class VideoInfo(FirstPicture):
 
     sha256: str = column("video_sha256", "of its bytes: the same file is never registered twice", "char(64)")
     size_bytes: int = column("video_size", "(byte) length of the file", "int64")
-    container: str = column("container", type="varchar(64)")
-    codec: str = column("codec", type="varchar(32)")
-    pixel_format: str = column("pixel_format", type="varchar(32)")
+    container: str = column("container", type="varchar(64)", cut=True)
+    codec: str = column("codec", type="varchar(32)", cut=True)
+    pixel_format: str = column("pixel_format", type="varchar(32)", cut=True)
     time_s: np.ndarray
     fps: float = column("fps", "(1/s) 1 / sampling interval, a description only", null=True)
     duration_s: float = column("duration", "(s) from the first frame to the end of the last", null=True)
     n_frames: int = column("n_frames", "frames that decode", "int32")
     n_frames_announced: int = column("n_frames_announced", "frames the header claims, 0 when it says nothing", "int32")
     variable_frame_rate: bool = column("variable_frame_rate", "whether frame intervals differ", "bool")
-    recorded_utc: str | None = column("recorded_utc", "recording time as the file states it", "varchar(40)")
+    recorded_utc: str | None = column("recorded_utc", "recording time as the file states it", "varchar(40)", cut=True)
     notes: tuple[str, ...] = column(
         "video_notes", "remarks on the file, such as a mirrored picture", "json", before="(end)", default=()
     )
     capture_fps: float | None = column("capture_fps", "(1/s) rate at which the phone says it recorded", default=None)
+
+
+@record
+class Intrinsics:
+    """Figures of a calibrated camera, for upright pictures."""
+
+    origin: str = column("camera_origin", "how the figures were had", "enum('measured', 'exif', 'preset', 'estimated')")
+    width_px: int = column("camera_width", "(px) width of the upright frame they hold for", "int32")
+    height_px: int = column("camera_height", "(px) height of the upright frame they hold for", "int32")
+    fx_px: float = column("camera_fx", "(px) focal length, horizontal")
+    fy_px: float = column("camera_fy", "(px) focal length, vertical")
+    cx_px: float = column("camera_cx", "(px) principal point from the left edge")
+    cy_px: float = column("camera_cy", "(px) principal point from the upper edge")
+    distortion: np.ndarray = column("camera_distortion", "k1 k2 p1 p2 k3 (-), OpenCV's order", "json")
+    focal_sd_px: float | None = column(
+        "camera_focal_sd", "(px) standard deviation of the focal length, null when unknown"
+    )
+    note: str = column("camera_note", "file or rule they come from", "varchar(255)", cut=True)

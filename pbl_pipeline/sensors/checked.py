@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,8 +34,18 @@ _MOVES, _ENOUGH, _MOST_COMPARED = 0.3, 50, 50_000
 #: rates then leave of it. Right ones left up to 1 on recorded logs, 7 on a synthetic one; turned or dead axes left 23.
 _QUIET, _AGAINST_DEG = 0.2, 15.0
 _DAY_S = 86400.0
+#: Difference (s) of the wall clocks of a phone and of sensors, which networks set; the time of recording is cut to
+#: seconds. The next walk of a visit is further away.
+_WALL_CLOCKS_S = 10.0
 #: Raises the error for what was found, what is expected and the next step.
 Refuse = Callable[..., NoReturn]
+
+
+class HasTimes(Protocol):
+    """Has the times (T,) of its frames (s)."""
+
+    @property
+    def time_s(self) -> np.ndarray: ...
 
 
 def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> SensorLog:
@@ -48,7 +58,9 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     notes: list[str] = []
 
     def refuse(found: str, expected: str, next_step: str = "") -> NoReturn:
-        about = said("sensor {name} on {segment}: {found}", name=samples.name, segment=segment, found=as_said(found))
+        about = said(
+            "sensor {name} on {segment}: {found}", name=samples.name, segment=as_said(segment), found=as_said(found)
+        )
         more = {"next_step": next_step} if next_step else {}
         raise log_error(about, expected, key=path, **more)
 
@@ -86,7 +98,8 @@ def checked(samples: Samples, segment: str, path: Path, begin: float = 0.0) -> S
     elif turns is not None:
         notes.append("no angular rate: the orientation is that of the sensor's program, its heading may be a magnet's")
     start = None if samples.start_utc is None else float(samples.start_utc + begin)
-    return SensorLog(samples.name, segment, time - begin, rate, acceleration, turns, start, tuple(notes))
+    measured = time - begin, rate, acceleration, turns
+    return SensorLog(samples.name, segment, *measured, start, tuple(notes), samples.mounting)
 
 
 def _kept(samples: Samples, notes: list[str], refuse: Refuse) -> np.ndarray:
@@ -316,3 +329,17 @@ def check_day(logs: Sequence[SensorLog], recorded: Mapping[str, str | None]) -> 
                 key=name,
             )
     return [f"{name} states a day {off:.1f} days from the log of the sensors" for name, (off, _) in wrong.items()]
+
+
+def places(
+    logs: Sequence[SensorLog], recorded: Sequence[str | None], videos: Sequence[HasTimes]
+) -> list[tuple[float, float] | None]:
+    """Earliest and latest time of the logs (s) at time 0 of videos, by the wall clocks; None where a video or the logs
+    state no time. recorded: as in `check_day`, the moment of the first or of the last frame."""
+    starts = [log.started_utc for log in logs if log.started_utc is not None]
+    out: list[tuple[float, float] | None] = []
+    for utc, of_video in zip(recorded, videos, strict=True):
+        moment = None if utc is None else datetime.datetime.fromisoformat(utc).timestamp()
+        at = None if moment is None or not starts else moment - float(np.median(starts))
+        out.append(None if at is None else (at - float(of_video.time_s[-1]) - _WALL_CLOCKS_S, at + _WALL_CLOCKS_S))
+    return out

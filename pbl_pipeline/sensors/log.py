@@ -26,3 +26,4 @@ class SensorLog:
     orientation: np.ndarray | None  # (T, 4) unit quaternion, scalar first
     started_utc: float | None = None  # s since 1970, of time 0
     notes: tuple[str, ...] = ()  # remarks: samples that were left out, differences from the file's own statements
+    mounting: np.ndarray | None = None  # (4,) unit quaternion from its axes to the segment's, as the file states it

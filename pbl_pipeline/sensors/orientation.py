@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 from vqf import offlineVQF
 
-from pbl_pipeline.errors import PblError, said
+from pbl_pipeline.errors import PblError, as_said, said
 
 from .log import SensorLog
 
@@ -123,11 +123,12 @@ def _strapdown(rate: np.ndarray, acceleration: np.ndarray, step: float) -> Rotat
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0] * turned
 
 
+def input_error(found: str, expected: str, next_step: str = "check the logs of the sensors (docs/imu.md)") -> PblError:
+    return PblError("FIT_INPUT", found=found, expected=expected, next_step=next_step)
+
+
 def _log_error(log: SensorLog, found: str, expected: str) -> PblError:
-    return PblError(
-        "FIT_INPUT",
-        found=said("sensor {name} on {segment}: {found}", name=log.name, segment=log.segment, found=found),
-        expected=expected,
-        next_step="see docs/imu.md for what a log holds",
-        key=log.name,
+    about = said(
+        "sensor {name} on {segment}: {found}", name=log.name, segment=as_said(log.segment), found=as_said(found)
     )
+    return input_error(about, expected).about(log.name)

@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .orientation import SAMPLE_S, Orientation, rate_of
 
+#: What is stated of the log's time (s) at a video's time 0: it, its earliest and latest value, or nothing.
+Stated = float | tuple[float, float] | None
 #: Segment -> body of the model. A foot's sensor sits on the shoe, over the midfoot.
 BODY_OF = {
     "pelvis": "pelvis",
@@ -76,18 +78,21 @@ def smooth(x: np.ndarray, sd_s: float = SMOOTH_S) -> np.ndarray:
     return gaussian_filter1d(x, sd_s / SAMPLE_S, axis=0, mode="nearest")
 
 
-def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) -> tuple[float, float]:
-    """Time of the log at the video's time 0 (s), `stated` to `RANGE_S` or not, and how well the angular speeds agree
-    there (their weighted correlation, -1 to 1).
+def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: Stated) -> tuple[float, float]:
+    """Time of the log at the video's time 0 (s), and how well the angular speeds agree there (their weighted
+    correlation, -1 to 1).
+
+    stated: that time, to `RANGE_S`; the earliest and latest one by wall clocks, which a place elsewhere overrules whose
+    correlation is higher by `AMBIGUOUS`; or None.
 
     Raises `ValueError` if the log does not cover `COVERED` of the recording, fits it nowhere, or, where no time is
-    stated, as well at another stride.
+    stated to `RANGE_S`, as well at another stride.
     """
     n = len(seen.time)
     first, last = max(s.span[0] for s in sensors), min(s.span[1] for s in sensors)
     beyond = (1 - COVERED) * n * SAMPLE_S
     low, high = first - seen.time[0] - beyond, last - seen.time[-1] + beyond
-    if stated is not None:
+    if isinstance(stated, float):
         low, high = max(low, stated - RANGE_S), min(high, stated + RANGE_S)
     if not low < high:
         raise ValueError("the log does not reach the recording")
@@ -103,8 +108,13 @@ def clock_of(seen: Moved, sensors: Sequence[Orientation], stated: float | None) 
     share = weight / sum(np.linalg.norm(seen.rate[k], axis=1).var() for k in rates)
     score = np.sqrt(1 - (1 - score**2) ** share)  # the correlation over all of it that tells as much
     best = int(np.argmax(score))
+    if isinstance(stated, tuple):
+        at = low + SAMPLE_S * np.arange(len(score))
+        by_clocks = np.where((stated[0] <= at) & (at <= stated[1]), score, -1.0)
+        if by_clocks.max() >= score[best] - AMBIGUOUS:
+            best, score = int(np.argmax(by_clocks)), by_clocks
     away = np.abs(np.arange(len(score)) - best) * SAMPLE_S > APART_S
-    if stated is None and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
+    if not isinstance(stated, float) and np.max(score, where=away, initial=-1.0) > score[best] - AMBIGUOUS:
         raise ValueError("the log fits the recording at several times")
     ours = float(np.mean([np.abs(seen.rate[k]) for k in rates]))
     if ours > MOVES and np.nanmean([np.abs(r[best : best + n]) for r in rates.values()]) < TURNING * ours:

@@ -101,9 +101,8 @@ def short_of(name: str) -> str:
         return names[name][0]
     if name in _INDICES:
         return _INDICES[name]
-    unit = words.unit_of(name)
-    stem = name.removesuffix("_" + unit.replace("/", "_per_")) if unit else name
-    return stem.replace("_", " ") + (f" ({unit})" if stem != name else "")
+    stem = words.without_unit(name)
+    return stem.replace("_", " ") + (f" ({words.unit_of(name)})" if stem != name else "")
 
 
 def unit_of(study: StudyData, name: str) -> str:

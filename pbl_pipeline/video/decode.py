@@ -52,8 +52,9 @@ _EXPECTED = "an MP4, MOV, WebM, MKV or AVI video as the phone recorded it"
 _COPY_AGAIN = "copy the file from the phone or camera again and compare the sizes in bytes"
 
 
-def check_file(path: str | Path) -> Path:
-    """The path, if it is a file with bytes in it.
+def check_file(path: str | Path, whole: bool = False) -> Path:
+    """The path, if it is a file with bytes in it. `whole`: read all of them, so that a disk that fails is not taken for
+    a recording that is damaged.
 
     Raises `PblError` VIDEO_MISSING, VIDEO_EMPTY.
     """
@@ -69,6 +70,8 @@ def check_file(path: str | Path) -> Path:
     try:
         with path.open("rb") as file:
             first = file.read(1)
+            while whole and file.read(1 << 20):
+                pass
     except OSError as error:
         raise PblError(
             "VIDEO_MISSING",
@@ -232,6 +235,8 @@ class Decoder:
 
     def _check(self) -> None:
         lost = self._lost_end() if self.n_frames else missing_end(self.path)
+        if lost is not None or self._n_damaged or not self.n_frames:
+            check_file(self.path, whole=True)
         if lost is not None:
             raise PblError(
                 "VIDEO_TRUNCATED",
@@ -422,6 +427,7 @@ def _open(path: Path) -> InputContainer:
         return av.open(str(path), options=_OPTIONS, **_TEXTS)
     except FFMPEG_ERRORS as error:
         check_memory(error, path)
+        check_file(path, whole=True)
         lost = missing_end(path) if family(path) else None
         if lost is None:
             raise PblError(

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pbl_pipeline import bounded
-from pbl_pipeline.errors import said
+from pbl_pipeline.errors import os_errors_as, said
 from pbl_pipeline.names import is_plain
 
 from .attitude import DEVICE, MAX_HOLE_S, check_attitude, log_error
@@ -107,23 +107,25 @@ def member_text(path: Path, name: str) -> str | None:
     if path.is_dir():
         file = next((f for f in sorted(path.glob("*.csv")) if f.stem.lower() == name.lower()), None)
         return None if file is None else read_text(file)
-    try:
-        with bounded.opened_zip(path) as archive:
-            wanted = f"{name}.csv".lower()
-            members = [m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted]
-            if len(members) > 1:
-                found = ", ".join(m.filename for m in members[:4])
-                raise log_error(
-                    f"{len(members)} recordings in one archive: {found}"[:300],
-                    "the zip of one recording",
-                    next_step="pass the log of this video alone: its zip, or its Orientation.csv",
-                    key=path,
-                )
-            return bounded.read_member(archive, members[0], bounded.MAX_TEXT).decode("utf-8-sig") if members else None
-    except (OSError, ValueError) as error:
-        if isinstance(error, FileNotFoundError):
-            read_text(path)  # raises the error
-        raise log_error(f"no readable archive ({error})", "the zip that Sensor Logger exports", key=path) from error
+    with os_errors_as("FILE_MISSING", "the zip that Sensor Logger exports", "check the path", path):
+        try:
+            with bounded.opened_zip(path) as archive:
+                wanted = f"{name}.csv".lower()
+                members = [m for m in archive.infolist() if PurePosixPath(m.filename).name.lower() == wanted]
+                if len(members) > 1:
+                    found = ", ".join(m.filename for m in members[:4])
+                    raise log_error(
+                        f"{len(members)} recordings in one archive: {found}"[:300],
+                        "the zip of one recording",
+                        next_step="pass the log of this video alone: its zip, or its Orientation.csv",
+                        key=path,
+                    )
+                if not members:
+                    return None
+                return bounded.read_member(archive, members[0], bounded.MAX_TEXT).decode("utf-8-sig")
+        except ValueError as error:
+            found = f"no readable archive ({error})"
+            raise log_error(found, "the zip that Sensor Logger exports", key=path) from error
 
 
 def _time(path: Path, rows: _Rows) -> tuple[int, np.ndarray, _Rows, list[str]]:

@@ -2,6 +2,7 @@
 
     python -m research.benchmarks.chaos --minutes 20 --seed 1             # as root, who may mount two small disks
     python -m research.benchmarks.chaos --minutes 10 --database mysql     # on Debian's MySQL (tests/mysql.py)
+    python -m research.benchmarks.chaos --minutes 30 --people             # phones, decisions, forget, backups, cron
 
 Faults, one every few seconds: kill -9 of working processes, of supervisors, and of the database inside an insert,
 before or after its statement; pauses of processes for longer than it takes until they count as dead, and of the
@@ -231,7 +232,8 @@ def _faults(site: Site, can_fill: bool) -> list[tuple[float, Any]]:
 @click.option("--seed", default=0, show_default=True)
 @click.option("--supervisors", default=3, show_default=True)
 @click.option("--database", "kind", type=click.Choice(["embedded", "mysql"]), default="embedded", show_default=True)
-def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
+@click.option("--people", "with_people", is_flag=True, help="Also phones, decisions, `pbl forget`, backups and cron.")
+def main(minutes: float, seed: int, supervisors: int, kind: str, with_people: bool) -> None:
     """Let things fail for some minutes, then count."""
     home = database.new_home()
     sizes = {name: size(minutes) for name, size in DISKS.items()}
@@ -245,13 +247,22 @@ def main(minutes: float, seed: int, supervisors: int, kind: str) -> None:
         patch.setenv(worker_standins.RECORDED, str(chain.small_video(home, "recorded")))
         patch.setenv(worker_standins.SLEEP, "0.1")
         _pass_for_a_machine()
-        site = Site(home, random.Random(seed))
+        site, people = Site(home, random.Random(seed)), None
+        if with_people:
+            from research.benchmarks import chaos_people, phone_sends
+
+            site = phone_sends.Site(home, site.draw)
+            people = chaos_people.People(site)
+            for name, variable in (("tmp", "TMPDIR"), ("backup", "PBL_BACKUP")):
+                (home / name).mkdir()
+                patch.setenv(variable, str(home / name))
+            (home / "tmp").chmod(0o1777)
         if kind == "mysql":
             site.mysql = mysql.start(home / "db")
             for name, value in site.mysql.environment.items():
                 patch.setenv(name, value)
         try:
-            wrong = _run(site, minutes, supervisors, can_fill)
+            wrong = _run(site, minutes, supervisors, can_fill, people)
         finally:
             site.end_bosses()
             from pbl_schemas.operations import embedded
@@ -281,33 +292,42 @@ def disks(home: Path, sizes: Mapping[str, float]) -> Iterator[bool]:
             subprocess.run(["umount", "--lazy", str(disk)], check=False)
 
 
-def _run(site: Site, minutes: float, supervisors: int, can_fill: bool) -> list[str]:
+def _run(site: Site, minutes: float, supervisors: int, can_fill: bool, people: Any | None) -> list[str]:
+    """people: `chaos_people.People`."""
     from pbl_schemas.operations.declare import declare_all
 
     site.start_server()
     declare_all()
     registered = _register(0)
     until, weights = time.monotonic() + 60 * minutes, _faults(site, can_fill)
+    if people is not None:
+        weights += people.faults()
+        people.registered = registered
+        people.start()
     refreshed = 0.0
     while time.monotonic() < until:
         site.keep_bosses(supervisors)
         time.sleep(site.draw.uniform(0.5, 4.0))
-        if site.mysql is not None:
-            site.start_server()  # in case it ended by itself
         site.draw.choices([f for _, f in weights], [w for w, _ in weights])[0]()
         with contextlib.suppress(Exception):  # as a person and cron would: again later
+            site.start_server()
             if time.monotonic() - refreshed > 5.0:
                 _cron()
                 refreshed = time.monotonic()
             if _waiting() < 30:
                 registered = _register(registered)
-    ended = time.monotonic()
+                if people is not None:
+                    people.registered = registered
     click.echo(f"{minutes:g} minutes: " + ", ".join(f"{n} {what}" for what, n in sorted(site.done.items())))
+    if people is not None:
+        people.stop()
+        people.finish()
+    ended = time.monotonic()
     wrong = _status(site, supervisors, ended + STATUS_S)
     wrong += _drain(site, supervisors, ended + DRAIN_S)
     click.echo(f"all done {time.monotonic() - ended:.0f} s after the last fault; {registered} recordings")
     site.end_bosses()
-    return wrong + _left(registered)
+    return wrong + _left(registered, people) + (people.left() if people is not None else [])
 
 
 def _register(first: int) -> int:
@@ -381,13 +401,19 @@ def _drain(site: Site, supervisors: int, until: float) -> list[str]:
     return [f"not done after {DRAIN_S:g} s: {busy}"]
 
 
-def _left(registered: int) -> list[str]:
+def _left(registered: int, people: Any | None) -> list[str]:
     """Return the faults: missing results, jobs and files that were left behind."""
     from pbl_schemas import computed_tables, connection, fit
-    from pbl_schemas.operations.orphans import orphans
+    from pbl_schemas.operations.orphans import WRITING, orphans, remove
+    from pbl_schemas.video import Video
 
     connection.connect()
     wrong = []
+    if people is not None:  # of phones: `people.left`
+        numbered = len(Video & "video_path LIKE '/recordings/%%'")
+        if numbered != (expected := registered - workers.EACH * len(people.forgotten)):
+            wrong.append(f"{numbered} of {expected} recordings")
+        registered = len(Video())
     before_fit = computed_tables()[: computed_tables().index(fit.SessionFit)]
     for table in before_fit:
         if len(table()) != registered:
@@ -395,6 +421,9 @@ def _left(registered: int) -> list[str]:
         if n := len(table.jobs):
             wrong.append(f"{n} job rows of {table.__name__}")
     found = orphans(young_s=0.0)
+    if people is not None:  # what the page was writing when it was killed goes by `pbl cron disk`
+        remove(found, 0.0, WRITING)
+        found = orphans(young_s=0.0)
     click.echo(f"{found.n_files} files in the store, {len(found.orphans)} without a row, {len(found.lost)} lost")
     wrong += [f"file without a row: {f.path} ({f.age_s:.0f} s old)" for f in found.orphans]
     return wrong + [f"lost: {path}" for path in found.lost]

@@ -1,4 +1,4 @@
-"""Real wearable sensors through the orientation and alignment of the product.
+"""Real wearable sensors through the readers, the orientation and the alignment of the product.
 
     python -m research.benchmarks.imu_real FOLDER
 
@@ -12,7 +12,7 @@ root mean square difference of a foot's gyroscope from the angular velocity of i
 
 from __future__ import annotations
 
-import gzip
+import tempfile
 from pathlib import Path
 
 import click
@@ -21,27 +21,11 @@ import pandas as pd
 from scipy.signal import butter, filtfilt, find_peaks
 from scipy.spatial.transform import Rotation, Slerp
 
-from pbl_pipeline.sensors.log import SensorLog
+from pbl_pipeline.sensors import Given, SensorLog, given_sensors, read_given
 from pbl_pipeline.sensors.orientation import SAMPLE_S, oriented, rate_of
 from pbl_pipeline.sensors.start import wahba
 
-#: Segment -> sensor of the OpenSense walk.
-XSENS = {"shank_r": "00B4227D", "thigh_r": "00B4227C", "shank_l": "00B421ED", "thigh_l": "00B421EE"}
 GAITMAP_HZ, MOCAP_HZ = 204.8, 100.0
-
-
-def xsens(path: Path, segment: str) -> SensorLog:
-    """A text file of MT Manager at 100 Hz with rotation matrices."""
-    lines = gzip.decompress(path.read_bytes()).decode().splitlines()
-    head = next(i for i, line in enumerate(lines) if line.startswith("PacketCounter"))
-    columns = lines[head].split("\t")
-    rows = np.array(
-        [[float(x or "nan") for x in line.split("\t")[: len(columns)]] for line in lines[head + 1 :] if line]
-    )
-    take = lambda names: rows[:, [columns.index(n) for n in names]]  # noqa: E731
-    matrices = take([f"Mat[{i}][{j}]" for i in (1, 2, 3) for j in (1, 2, 3)]).reshape(-1, 3, 3)
-    quat = Rotation.from_matrix(matrices).as_quat(scalar_first=True)
-    return SensorLog(path.name, segment, np.arange(len(rows)) / 100, None, take([f"Acc_{k}" for k in "XYZ"]), quat)
 
 
 def knee(thigh: SensorLog, shank: SensorLog) -> tuple[float, float]:
@@ -71,14 +55,11 @@ def foot(folder: Path, side: str) -> tuple[float, float]:
     even = np.arange(time[0], time[-1], SAMPLE_S)
     ours = rate_of(Slerp(time, turns)(even).as_quat(scalar_first=True))
     at = np.arange(len(imu)) / GAITMAP_HZ
-    log = SensorLog(
-        side,
-        f"foot_{side[0]}",
-        at,
-        np.deg2rad(imu[[f"gyr_{k}" for k in "xyz"]].to_numpy()),
-        imu[[f"acc_{k}" for k in "xyz"]].to_numpy(),
-        None,
-    )
+    own = pd.DataFrame({"time_s": at, **{f"gyr_{k}": np.deg2rad(imu[f"gyr_{k}"]) for k in "xyz"}})
+    own = own.join(imu[[f"acc_{k}" for k in "xyz"]])
+    with tempfile.TemporaryDirectory() as written:
+        own.to_csv(path := Path(written) / f"{side}.csv", index=False)
+        (log,) = read_given([Given(path, f"foot_{side[0]}")])
     sensor, best = oriented(log), (np.inf, 0.0)
     low = lambda x: filtfilt(*butter(4, 10 / 50), x, axis=0)  # noqa: E731
     for lag in np.arange(-0.15, 0.151, 0.005):
@@ -93,12 +74,9 @@ def foot(folder: Path, side: str) -> tuple[float, float]:
 @click.command(help=__doc__.split("\n")[0])
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 def main(folder: Path) -> None:
+    logs = {log.segment: log for log in read_given(given_sensors(str(folder / "opensense-walk" / "myIMUMappings.xml")))}
     for side in "rl":
-        logs = [
-            xsens(next((folder / "opensense-walk").glob(f"*_{XSENS[f'{k}_{side}']}.txt.gz")), f"{k}_{side}")
-            for k in ("thigh", "shank")
-        ]
-        most, stride = knee(*logs)
+        most, stride = knee(logs[f"thigh_{side}"], logs[f"shank_{side}"])
         click.echo(f"knee {side}: largest {most:.1f} deg, stride {stride:.2f} s")
     for side in ("left", "right"):
         error, all_ = foot(folder / "gaitmap-foot-mocap", side)

@@ -377,7 +377,7 @@ def method(sessions: int, worked: int) -> None:
         made = len(fit.SessionFit()) - sessions
         click.echo(f"{made} new fits; pending: { {name: n for name, n in _pending(tables).items() if n} }")
         assert made == worked
-        new = plan.add[0]["fit_method"]
+        new = plan.chosen["fit_method"]
         for table in tables:
             assert _contents(table, new) == old[table.__name__], table.__name__
         click.echo(f"old rows of {len(tables)} tables unchanged (number and sum over every column of every row)")

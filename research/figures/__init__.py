@@ -1,4 +1,4 @@
-"""Figures of README and docs: the command that printed each, what it printed, and whether the page says the same.
+"""Figures of README, docs and reports: the command that printed each, what it printed, and whether the text agrees.
 
 A table or paragraph of figures is followed by `<!-- printed by NAME -->`. `commands.toml` has the command of each NAME,
 `printed.json` what it printed, at which commit, on which day and machine. Constants of the code that a page states are
@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
+
+import docs_site
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
@@ -52,6 +54,12 @@ def commands() -> dict[str, str]:
 def printed() -> dict[str, dict[str, str]]:
     """Return what each command printed: `commit`, `day`, `machine`, `text`."""
     return json.loads(PRINTED.read_text("utf-8"))
+
+
+def pages() -> list[str]:
+    """Return the pages and reports whose passages may be marked."""
+    reports = (str(path.relative_to(ROOT)) for path in (ROOT / "research" / "reports").glob("*.md"))
+    return [*(page for page in docs_site.pages() if page.endswith(".md")), *sorted(reports)]
 
 
 def passages(page: str) -> Iterator[Passage]:

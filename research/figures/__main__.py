@@ -8,8 +8,7 @@ import sys
 
 import click
 
-import docs_site
-from research.figures import commands, passages, printed, record
+from research.figures import commands, pages, passages, printed, record
 
 if sys.argv[1:2] == ["record"]:
     for name in sys.argv[2:] or commands():
@@ -17,7 +16,7 @@ if sys.argv[1:2] == ["record"]:
         click.echo(f"{name}: recorded")
 else:
     kept = printed()
-    for page in (p for p in docs_site.pages() if p.endswith(".md")):
+    for page in pages():
         for passage in passages(page):
             if passage.name or passage.is_table_of_figures:
                 entry = kept.get(passage.name, {})

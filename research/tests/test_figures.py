@@ -5,7 +5,7 @@ import subprocess
 import pytest
 
 import docs_site
-from research.figures import ROOT, Passage, commands, passages, printed, unprinted, wrong_constants
+from research.figures import ROOT, Passage, commands, pages, passages, printed, unprinted, wrong_constants
 
 PAGES = [page for page in docs_site.pages() if page.endswith(".md") and page != "CHANGELOG.md"]
 #: Pages whose tables have versions and limits, no measurements.
@@ -17,7 +17,7 @@ def test_constants_that_pages_state_are_those_of_the_code():
 
 
 def test_marked_passages_state_what_their_command_printed():
-    marked = [passage for page in PAGES for passage in passages(page) if passage.name]
+    marked = [passage for page in pages() for passage in passages(page) if passage.name]
     assert {p.name for p in marked} == set(commands()) == set(printed())
     wrong = {(p.page, p.name): unprinted(p.numbers, printed()[p.name]["text"]) for p in marked}
     assert {where: numbers for where, numbers in wrong.items() if numbers} == {}
@@ -39,5 +39,5 @@ def test_a_number_that_was_not_printed_is_seen():
 @pytest.mark.parametrize("name", commands())
 def test_the_command_prints_the_same_today(name: str):
     done = subprocess.run(commands()[name], shell=True, cwd=ROOT, check=True, text=True, capture_output=True)
-    for passage in (p for page in PAGES for p in passages(page) if p.name == name):
+    for passage in (p for page in pages() for p in passages(page) if p.name == name):
         assert unprinted(passage.numbers, done.stdout) == []

@@ -20,7 +20,7 @@ class ProtocolStep:
 
     number: int = column("step_no", "from 1, in the order of filming", "int16", key=True)
     activity: str = column("step_activity", "as in Video", "varchar(32)")
-    pace: str = column("step_pace", "as in Pace; empty for any", "varchar(32)", empty=True)
+    pace: str = column("step_pace", "as in Pace; empty for any", "varchar(32)", old="")
     view: str = column(
         "step_view",
         "side from which the person is filmed; front: or back",

@@ -6,6 +6,7 @@ the private names below and fails where a version of DataJoint has other ones.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import warnings
@@ -77,8 +78,12 @@ REPEAT = (1020, 1205, 1213)
 #: Those that say that the server cannot be reached, and that it is full or read-only.
 AWAY = (0, 1040, 1053, 1927, 2002, 2003, 2006, 2013, 2055, 4031)
 FULL = (3, 1021, 1026, 1030, 1114, 1290, 1836)
+#: That of a text that is longer than its column.
+LONGER = (1406,)
 #: That which says that it ended a query after `LIMIT_S`.
 TOO_LONG = (1969, 3024)
+#: Most rows of a statement that inserts.
+ROWS = 500
 #: Time after which the server ends a query (s), also of a process that was killed meanwhile.
 LIMIT_S = 600
 #: Rights that accounts of workers have (`pbl_schemas.operations.roles`), as the server names them when it refuses.
@@ -170,6 +175,20 @@ def backend_of(name: str) -> StorageBackend:
 def full_path(backend: Any, path: str) -> str:
     """Return the location of an object in a store: a path of the file system, or `bucket/key`."""
     return str(backend._full_path(path))
+
+
+_insert = datajoint_table.Table.insert
+
+
+@functools.wraps(_insert)
+def _insert_in_parts(self: Any, rows: Any, *args: Any, **options: Any) -> None:
+    """DataJoint's own, which sends any number of rows in one statement, with `ROWS` in each."""
+    if not isinstance(rows, datajoint_table.QueryExpression) and not isinstance(rows, type):
+        options.setdefault("chunk_size", ROWS)
+    _insert(self, rows, *args, **options)
+
+
+datajoint_table.Table.insert = _insert_in_parts
 
 
 @contextmanager

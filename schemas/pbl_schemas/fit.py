@@ -16,7 +16,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import distinct
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.fits import Solution
+from pbl_pipeline.results.fits import Residuals, SensorFit, Solution
 from pbl_pipeline.temporary import new_folder
 
 from . import keypoints, lab, session, video
@@ -37,6 +37,7 @@ from .fit_sets import (  # noqa: F401  one schema: `fit.FitSet` and the others
     TrialInput,
     current,
     load_input,
+    of_session,
     rig_of,
     schema,
     session_of_set,
@@ -66,8 +67,7 @@ class SessionFit(dj.Computed):
     -> session.Session
     -> BodyModel
     {definition(Solution, only=("solver", "loss"))}
-    fit_residual_2d=null : float64             # (px) median distance of body and keypoints in the picture
-    fit_residual_3d=null : float64             # (cm) median distance of body and 3D keypoints
+    {definition(Residuals, "fit")}
     fit_outcome          : enum('PASS', 'WARN', 'EMPTY', 'NEEDS_CHOICE', 'FAIL')  # worst check
     {definition(Solution, only=("iterations", "converged", "scale"))}
     fit_height=null      : float64             # (m) body height of the person that the fit was told, null: not known
@@ -78,21 +78,23 @@ class SessionFit(dj.Computed):
 
     class Trial(dj.Part):
         # trial_orientation is no enum: DataJoint 2.3.5 cannot read one back whose values hold a colon.
-        definition = """
+        definition = f"""
         # the fitted movement of one video, or of several cameras' trial, which has the number of one of them
         -> master
         -> FitSet.Video
         ---
         trial_name        : varchar(255)
         trial_n_fitted    : int32              # frames with joint angles
-        trial_residual_2d=null : float64       # (px) median distance of body and keypoints in the picture
-        trial_residual_3d=null : float64       # (cm) median distance of body and 3D keypoints
+        {definition(Residuals, "trial")}
         trial_orientation=null : varchar(32)   # where the vertical comes from, such as 'measured: phone', null where it was not recorded
         trial_clock_offset=null : float64      # (s) the phone sensor's clock minus the video's, null where not estimated
         trial_file        : <object@arrays>    # fit.npz: time_s (T) s, qpos and qpos_sd (T,40) m and rad, markers_world_m (T,J,3) m, residual_2d_px (T,J) px, residual_3d_m (T,J) m; docs/files.md
         """  # noqa: E501
 
     Check = part_of("Check", Quality, "fit", "quality checks of the fit")
+    Sensor = part_of(
+        "Sensor", SensorFit, comment="what was found of a wearable sensor in a trial", of=("master", "FitSet.Video")
+    )
 
     @property
     def key_source(self) -> Any:
@@ -190,6 +192,7 @@ class SessionFit(dj.Computed):
         the logs of wearable sensors. Raises `PblError` SENSOR_LOG."""
         from pbl_pipeline.body import load_marker_set
         from pbl_pipeline.fit import SessionInput
+        from pbl_pipeline.sensors import places
 
         _, names, motions, refs, rigs = (list(column) for column in zip(*trials, strict=True))
         own, more = None, {}
@@ -199,7 +202,8 @@ class SessionFit(dj.Computed):
             if table is not None:
                 own = load_marker_set(stack.enter_context(stored_file(table[1])), name=table[0])
             if worn is not None:
-                more = {"sensors": _read_worn(*worn[:2])[0], "sensor_clock_s": [None] * len(trials)}
+                logs, recorded = _read_worn(*worn[:2])[0], [worn[1].get(name) for name in names]
+                more = {"sensors": logs, "sensor_clock_s": places(logs, recorded, loaded)}
         # The library knows one moving camera; "one of several" on stands is a static one for it.
         motions = ["handheld" if m == "handheld" else "static" for m in motions]
         return SessionInput(loaded, names, motions, own, height_m, **more)
@@ -213,23 +217,16 @@ class SessionFit(dj.Computed):
         if _sensors_now(key, "LOCK IN SHARE MODE") != worn:
             raise InputChanged("other wearable sensors than were fitted", key)
         body_sha = result.trials[0].body_sha256
-        residual_2d = np.concatenate([t.residual_2d_px.ravel() for t in result.trials])
-        residual_3d = np.concatenate([t.residual_3d_m.ravel() for t in result.trials])
         with new_folder() as folder:
-            np.savez(
-                folder / "session.npz",
-                scale=np.asarray(result.scale, np.float32),
-                site_offset_m=np.asarray(result.site_offset_m, np.float32),
-                loss_trace=np.asarray(result.loss_trace, np.float32),
-            )
+            arrays = {n: np.asarray(getattr(result, n), np.float32) for n in ("scale", "site_offset_m", "loss_trace")}
+            np.savez(folder / "session.npz", allow_pickle=False, **arrays)
             self.insert1(
                 {
                     **key,
                     "session_id": session_id,
                     "body_model": one(BodyModel & {"body_sha256": body_sha}, "body_model"),
                     **to_row(result),
-                    "fit_residual_2d": median(residual_2d),
-                    "fit_residual_3d": median(100 * residual_3d),
+                    **to_row(Residuals.of(result.trials), "fit"),
                     "fit_outcome": worst(result.qc),
                     "fit_height": number(result.trials[0].height_m),
                     "session_file": folder / "session.npz",
@@ -245,13 +242,13 @@ class SessionFit(dj.Computed):
                         "video_id": video_id,
                         "trial_name": trial.name,
                         "trial_n_fitted": int(np.isfinite(trial.qpos).all(axis=1).sum()),
-                        "trial_residual_2d": median(trial.residual_2d_px),
-                        "trial_residual_3d": median(100 * trial.residual_3d_m),
+                        **to_row(Residuals.of([trial]), "trial"),
                         "trial_orientation": trial.orientation_source,
                         "trial_clock_offset": number(trial.phone_clock_offset_s),
                         "trial_file": path,
                     }
                 )
+                self.Sensor.insert_records({**key, "video_id": video_id}, trial.sensors)
         self.Check.insert_records(key, result.qc)
 
 
@@ -352,12 +349,6 @@ def fit_checks(key: Mapping[str, Any]) -> list[tuple]:
     """The checks of one session fit as arguments of the library's `Check`: what `make_fetch` may hand on."""
     found = SessionFit.Check.records({k: key[k] for k in SessionFit.primary_key})
     return [dataclasses.astuple(check) for check in found]
-
-
-def median(values: np.ndarray) -> float | None:
-    """Return the median of the finite values; None without any."""
-    there = values[np.isfinite(values)]
-    return float(np.median(there)) if len(there) else None
 
 
 def float32_trial(trial: lib.TrialFit) -> lib.TrialFit:

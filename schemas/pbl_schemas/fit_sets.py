@@ -203,6 +203,11 @@ def session_of_set(key: Mapping[str, Any]) -> int:
     return number
 
 
+def of_session(key: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a key with `fit_set` and the `session_of_set`, which a row below a set begins with."""
+    return {**key, "session_id": session_of_set(key)}
+
+
 def views_of(trials: Sequence[int]) -> dict[int, list[dict[str, Any]]]:
     """The views of trials that several cameras film, by the trial's number: rows of RigView and Rig, the video that has
     the number first. Empty for other videos."""

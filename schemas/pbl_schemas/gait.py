@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
@@ -11,22 +11,22 @@ from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.qc import in_order
 from pbl_pipeline.records import definition, from_row, number, to_row
 from pbl_pipeline.results.cycles import GaitCycle as Cycle
-from pbl_pipeline.results.events import GaitEvent
+from pbl_pipeline.results.events import GaitEvent, SetEvent
 from pbl_pipeline.results.events import GaitEvents as Events
-from pbl_pipeline.results.measures import OF_VISIT, Measure
+from pbl_pipeline.results.measures import COUNTS, Measure
+from pbl_pipeline.results.measures import Spatiotemporal as Measures
 from pbl_pipeline.temporary import new_folder
 
 from . import fit, keypoints, session, video  # noqa: F401  definitions refer to session
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .record_parts import part_of
+from .record_parts import measures_of, part_of
 from .review import Decision
 from .rows import Rows, one, row_of, stored_rows
 from .stored_files import file_ref, stored_file
 
 if TYPE_CHECKING:
-    from pbl_pipeline import gait as lib
     from pbl_pipeline.gait.metrics_file import Curves
 
 schema = dj.Schema()
@@ -56,17 +56,6 @@ def mean_columns(names: Iterable[str], prefix: str = "") -> str:
 def mean_row(measures: Mapping[str, Measure | None], names: Iterable[str], prefix: str = "") -> dict[str, float | None]:
     """Values of `mean_columns(names, prefix)`."""
     return {f"{prefix}{MEASURE_COLUMNS[n][0]}": None if (m := measures[n]) is None else number(m.mean) for n in names}
-
-
-def measure_columns(prefix: str) -> str:
-    """Definition lines of a part table of measures; `measure_rows` returns its rows."""
-    return f"""
-    -> master
-    {prefix}             : varchar(32)         # name, with its unit
-    ---
-    {definition(Measure, prefix, OF_VISIT)}
-    {prefix}_missing     : varchar(255)        # why it is null
-    """
 
 
 @schema
@@ -103,16 +92,7 @@ class EventCorrection(dj.Manual):
     correction_at            : datetime        # when, UTC
     """  # noqa: E501
 
-    class Event(dj.Part):
-        definition = """
-        -> master
-        corrected_no       : int16             # in order of time, from 1
-        ---
-        corrected_time     : float64           # (s) time of the trial
-        corrected_side     : enum('left', 'right')
-        corrected_kind     : enum('foot_down', 'foot_up')
-        corrected_probability=null : float64   # (0..1) of the detection, which found it there; null: set by hand
-        """
+    Event = part_of("Event", SetEvent, key="corrected_no : int16  # in order of time, from 1")
 
 
 def correction_of(key: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -176,13 +156,7 @@ class GaitEvents(dj.Computed):
     index (events_status)
     """
 
-    class Event(dj.Part):
-        definition = f"""
-        -> master
-        event_no          : int16              # in order of time, from 1
-        ---
-        {definition(GaitEvent)}
-        """
+    Event = part_of("Event", GaitEvent, key="event_no : int16  # in order of time, from 1")
 
     Check = part_of("Check", Quality, "events", "quality checks of the events")
 
@@ -201,15 +175,8 @@ class GaitEvents(dj.Computed):
         return detect_events(feet_from_fit(fit.load_trial(ref)), methods.stored(**method)), method["sha"]
 
     def make_insert(self, key: dict, found: Events, sha: str, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                **to_row(found),
-                **origin.row("events", method_hash=sha),
-            }
-        )
-        self.Event.insert({**key, "event_no": i, **to_row(e)} for i, e in enumerate(found.events, 1))
+        self.insert1({**fit.of_session(key), **to_row(found), **origin.row("events", method_hash=sha)})
+        self.Event.insert_records(key, found.events)
         self.Check.insert_records(key, found.qc)
 
 
@@ -221,8 +188,7 @@ class GaitCycle(dj.Computed):
     ---
     -> session.Session
     -> [nullable] EventCorrection
-    n_cycles        : int16                    # all complete cycles
-    n_cycles_used   : int16                    # without first and last steps, odd lengths and odd curves
+    {definition(Measures, only=COUNTS)}
     curves          : <object@arrays>          # npz: cycle_no (N), names (A), percent (P) of the cycle, curve and curve_sd (N,A,P) deg
     {origin_columns("cycles")}
     """  # noqa: E501
@@ -258,17 +224,9 @@ class GaitCycle(dj.Computed):
 
         with new_folder() as folder:
             save_curves(cycles, folder / "curves.npz")
-            self.insert1(
-                {
-                    **key,
-                    "session_id": fit.session_of_set(key),
-                    "correction_no": correction,
-                    "n_cycles": len(cycles),
-                    "n_cycles_used": sum(c.used for c in cycles),
-                    "curves": folder / "curves.npz",
-                    **origin.row("cycles"),
-                }
-            )
+            counts = {"n_cycles": len(cycles), "n_cycles_used": sum(c.used for c in cycles)}
+            row = {"correction_no": correction, **counts, "curves": folder / "curves.npz", **origin.row("cycles")}
+            self.insert1({**fit.of_session(key), **row})
         self.Cycle.insert({**key, **row_of_cycle(c)} for c in cycles)
 
 
@@ -279,19 +237,13 @@ class Spatiotemporal(dj.Computed):
     -> GaitCycle
     ---
     -> session.Session
-    measures_status          : enum('PASS', 'EMPTY')
-    measures_reason          : varchar(1000)   # why EMPTY
-    n_steps_used             : int16
+    {definition(Measures, without=COUNTS)}
     {mean_columns(MEASURE_COLUMNS)}
     {origin_columns("measures")}
     index (measures_status)
     """
 
-    class Measure(dj.Part):
-        definition = f"""
-        # every measure with both sides and its spread
-        {measure_columns("measure")}
-        """
+    Measure = measures_of(Measure, "measure", "every measure with both sides and its spread", "measure : varchar(32)")
 
     def make_fetch(self, key: dict) -> tuple:
         name = one(fit.SessionFit.Trial & key, "trial_name")
@@ -309,7 +261,7 @@ class Spatiotemporal(dj.Computed):
         activity: str,
         ref: dict,
         checks: Sequence[tuple],
-    ) -> tuple[lib.Spatiotemporal]:
+    ) -> tuple[Measures]:
         from pbl_pipeline.gait import TASK_MEASURES, spatiotemporal, task_measures, task_motion
         from pbl_pipeline.qc import Check
 
@@ -319,38 +271,10 @@ class Spatiotemporal(dj.Computed):
             found = found.with_task(*task_measures(motion, activity, [Check(*check) for check in checks]))
         return (found,)
 
-    def make_insert(self, key: dict, result: lib.Spatiotemporal, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                "measures_status": result.status,
-                "measures_reason": result.reason[:1000],
-                "n_steps_used": result.n_steps_used,
-                **mean_row(result.measures, MEASURE_COLUMNS),
-                **origin.row("measures"),
-            }
-        )
-        self.Measure.insert({**key, **row} for row in measure_rows(result.measures, result.reasons))
-
-
-def measure_of_row(row: Mapping[str, Any], prefix: str) -> Measure | None:
-    """Return the measure of a row of `measure_columns(prefix)`, None if it is not known."""
-    return None if row[f"{prefix}_mean"] is None else from_row(Measure, row, prefix)
-
-
-def measure_rows(
-    measures: Mapping[str, Measure | None],
-    reasons: Mapping[str, str],
-    prefix: str = "measure",
-    without: Collection[str] = OF_VISIT,
-) -> list[dict]:
-    """Rows of a part table with `measure_columns(prefix)`; `without`: fields of `Measure` that it does not have."""
-    unknown = Measure(None, None, math.nan, None, 0)
-    return [
-        {prefix: name, f"{prefix}_missing": reasons.get(name, "")[:255], **to_row(m or unknown, prefix, without)}
-        for name, m in measures.items()
-    ]
+    def make_insert(self, key: dict, result: Measures, origin: Origin) -> None:
+        row = {**to_row(result, without=COUNTS), **mean_row(result.measures, MEASURE_COLUMNS)}
+        self.insert1({**fit.of_session(key), **row, **origin.row("measures")})
+        self.Measure.insert_measures(key, result.measures, result.reasons)
 
 
 def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = None, rows: Rows = stored_rows) -> Events:
@@ -360,7 +284,7 @@ def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = Non
     detected = from_row(
         Events,
         row,
-        events=tuple(from_row(GaitEvent, e) for e in rows(GaitEvents.Event, key)),
+        events=tuple(GaitEvents.Event.records(key, rows)),
         params_hash=row["events_method_hash"],
         qc=in_order(GaitEvents.Check.records(key, rows)),
     )
@@ -369,9 +293,8 @@ def events_of(row: Mapping[str, Any], correction: Mapping[str, Any] | None = Non
     from pbl_pipeline import gait as lib
 
     changed = row_of(EventCorrection, correction, rows)["correction_changed"]
-    names = ("corrected_time", "corrected_side", "corrected_kind", "corrected_probability")
-    found = [[e[name] for name in names] for e in rows(EventCorrection.Event, correction)]
-    events = [GaitEvent(float(t), side, kind, 1.0 if p is None else float(p)) for t, side, kind, p in found]
+    found = map(dataclasses.astuple, EventCorrection.Event.records(correction, rows))
+    events = [GaitEvent(t, side, kind, 1.0 if p is None else p) for t, side, kind, p in found]
     return lib.apply_correction(detected, events, int(changed))
 
 

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError, said
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import definition, from_row, to_row
-from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, VariableScore
-from pbl_pipeline.results.measures import OF_VISIT, Measure
+from pbl_pipeline.records import definition, to_row
+from pbl_pipeline.results.index import Gdi, GdiCycle, MovementProfile, NormFacts, SessionMetrics, VariableScore
+from pbl_pipeline.results.measures import Measure
 
 from . import fit, gait, session, video  # noqa: F401  a definition refers to session
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row, one_of, resolve_method
 from .origin import Origin, computes, origin_columns
-from .record_parts import part_of
+from .record_parts import measures_of, part_of
 from .rows import InputChanged, Rows, one, row_of, stored_rows, utc_now
 from .stored_files import file_ref, stored_file
 
@@ -28,19 +28,11 @@ schema = dj.Schema()
 
 @schema
 class NormativeSet(dj.Lookup):
-    definition = """
+    definition = f"""
     # healthy gait that an index compares with
     norm                : varchar(48)          # name and version
     ---
-    norm_name           : varchar(40)
-    norm_version        : int16
-    norm_sha256         : char(64)             # of its numbers
-    norm_n              : int32                # normative vectors
-    norm_variables      : json                 # angles of the index, in order
-    norm_source         : varchar(1000)        # who measured whom, and where it is published
-    norm_convention     : varchar(1000)        # how its angles are defined
-    norm_licence        : varchar(500)
-    norm_angle_model='plug_in_gait' : varchar(32)  # how pelvis and hip are defined: plug_in_gait or pbl_body
+    {definition(NormFacts)}
     norm_components=null : int16               # components of the index
     norm_file=null      : <object@arrays>      # JSON of the whole set; null for one that ships with the code
     norm_query=null     : json                 # whose cycles it was built from; null for one that ships
@@ -83,13 +75,7 @@ class GDI(dj.Computed):
     index (gdi_status)
     """
 
-    class Cycle(dj.Part):
-        definition = f"""
-        -> master
-        -> gait.GaitCycle.Cycle
-        ---
-        {definition(GdiCycle)}
-        """
+    Cycle = part_of("Cycle", GdiCycle, key="-> gait.GaitCycle.Cycle")
 
     Profile = part_of(
         "Profile", VariableScore, "gdi", "Movement Analysis Profile: how far each angle of the norm is from it"
@@ -122,17 +108,11 @@ class GDI(dj.Computed):
         return result, index.hash, norm[1]
 
     def make_insert(self, key: dict, result: Gdi, sha: str, norm_sha: str, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                **to_row(result, "gdi"),
-                **to_row(result.profile or _NO_PROFILE, "gdi"),
-                **origin.row("gdi", method_hash=sha, model_sha256=norm_sha),
-            }
-        )
-        self.Cycle.insert({**key, "cycle_no": c.number, **to_row(c)} for c in result.cycles)
-        self.Profile.insert_records(key, (result.profile or _NO_PROFILE).scores)
+        row = {**to_row(result, "gdi"), **to_row(result.profile or MovementProfile, "gdi")}
+        of_model = origin.row("gdi", method_hash=sha, model_sha256=norm_sha)
+        self.insert1({**fit.of_session(key), **row, **of_model})
+        self.Cycle.insert_records(key, result.cycles)
+        self.Profile.insert_records(key, result.profile.scores if result.profile else ())
         self.Check.insert_records(key, result.qc)
 
 
@@ -150,13 +130,12 @@ class SessionGdi(dj.Computed):
     -> NormativeSet
     ---
     -> session.Session
-    session_status              : enum('PASS', 'EMPTY')
-    session_reason              : varchar(2000)  # why EMPTY
+    {definition(SessionMetrics, only=("status", "reason"))}
     {definition(Gdi, "session_gdi", without=("status",))}
     {definition(MovementProfile, "session")}
     session_cycles              : int16        # used cycles
     session_corrected           : int16        # trials of the set whose events a person corrected
-    session_params_hash         : char(16)     # hash over the parameters of events and index together
+    {definition(SessionMetrics, only=("params_hash",))}
     {gait.mean_columns(_MEANS, "session_")}
     {origin_columns("session_gdi")}
     index (session_status)
@@ -170,12 +149,13 @@ class SessionGdi(dj.Computed):
         -> gait.Spatiotemporal
         """
 
-    class Measure(dj.Part):
-        definition = f"""
-        # every measure with both sides and its spread
-        {gait.measure_columns("session_measure")}
-        {definition(Measure, "session_measure", only=OF_VISIT)}
-        """
+    Measure = measures_of(
+        Measure,
+        "session_measure",
+        "every measure with both sides and its spread",
+        "session_measure : varchar(32)",
+        of_visit=True,
+    )
 
     Profile = part_of(
         "Profile", VariableScore, "session", "Movement Analysis Profile: how far each angle of the norm is from it"
@@ -224,7 +204,7 @@ class SessionGdi(dj.Computed):
         norm: tuple,
         events: Mapping[str, Any],
         index: Mapping[str, Any],
-    ) -> tuple[lib.SessionMetrics, Sequence[Mapping[str, Any]], str, str]:
+    ) -> tuple[SessionMetrics, Sequence[Mapping[str, Any]], str, str]:
         from pbl_pipeline import gait as lib
 
         model = methods.stored(**index)
@@ -241,7 +221,7 @@ class SessionGdi(dj.Computed):
     def make_insert(
         self,
         key: dict,
-        result: lib.SessionMetrics,
+        result: SessionMetrics,
         trials: Sequence[Mapping[str, Any]],
         sha: str,
         norm_sha: str,
@@ -250,38 +230,20 @@ class SessionGdi(dj.Computed):
         measures, index = result.spatiotemporal, result.gdi
         self.insert1(
             {
-                **key,
-                "session_id": fit.session_of_set(key),
-                "session_status": result.status,
-                "session_reason": result.reason[:2000],
+                **fit.of_session(key),
+                **to_row(result, without=("spatiotemporal", "gdi")),
                 **to_row(index, "session_gdi", without=("status",)),
-                **to_row(index.profile or _NO_PROFILE, "session"),
+                **to_row(index.profile or MovementProfile, "session"),
                 "session_cycles": measures.n_cycles_used,
                 "session_corrected": sum(r["correction_no"] is not None for r in trials),
-                "session_params_hash": result.params_hash,
                 **gait.mean_row(measures.measures, _MEANS, "session_"),
                 **origin.row("session_gdi", method_hash=sha, model_sha256=norm_sha),
             }
         )
         self.Trial.insert({**key, "video_id": r["video_id"]} for r in trials)
-        rows = gait.measure_rows(measures.measures, measures.reasons, "session_measure", without=())
-        self.Measure.insert({**key, **row} for row in rows)
-        self.Profile.insert_records(key, (index.profile or _NO_PROFILE).scores)
+        self.Measure.insert_measures(key, measures.measures, measures.reasons)
+        self.Profile.insert_records(key, index.profile.scores if index.profile else ())
         self.Check.insert_records(key, result.qc)
-
-
-#: The profile of a trial or a visit without an index.
-_NO_PROFILE = MovementProfile({}, {}, None, None, None)
-
-
-def load_profile(part: Any, key: Any, row: Mapping[str, Any], rows: Rows) -> MovementProfile | None:
-    """Return the library's `MovementProfile` of a row with its part table; None without rows there."""
-    from pbl_pipeline.gait import NINE_ANGLES
-
-    order = {angle: i for i, angle in enumerate(NINE_ANGLES)}
-    scores = sorted(part.records(key, rows), key=lambda s: order.get(s.angle, len(order)))
-    left, right = ({s.angle: v for s in scores if (v := getattr(s, side)) is not None} for side in ("left", "right"))
-    return from_row(MovementProfile, row, part.prefix, left=left, right=right) if scores else None
 
 
 def pace_of(gdi_method: str, rows: Rows = stored_rows) -> str:
@@ -293,20 +255,8 @@ def pace_of(gdi_method: str, rows: Rows = stored_rows) -> str:
 
 def norm_row(norm: lib.NormativeSet) -> dict[str, Any]:
     """A normative set of the library as a row, without file and query."""
-    return {
-        "norm": f"{norm.name}-v{norm.version}",
-        "norm_name": norm.name,
-        "norm_version": norm.version,
-        "norm_sha256": norm.sha256,
-        "norm_n": norm.n,
-        "norm_variables": list(norm.variables),
-        "norm_source": norm.source[:1000],
-        "norm_convention": norm.convention[:1000],
-        "norm_licence": norm.licence[:500],
-        "norm_angle_model": norm.angle_model,
-        "norm_components": len(norm.components),
-        "norm_created": utc_now(),
-    }
+    own = {"norm": f"{norm.name}-v{norm.version}", "norm_components": len(norm.components), "norm_created": utc_now()}
+    return {**own, **to_row(norm)}
 
 
 def norm_keys(name: str) -> list[str]:

@@ -42,6 +42,6 @@ def disagreement(scores: Mapping[str, float]) -> tuple[tuple[str, ...], str, str
     if set(names) <= set(scores):
         time_s, speed = (scores[n] for n in names)
         if not any(abs(time_s * speed / distance - 1.0) <= 0.05 for distance in _TIMED_M):
-            found = f"10MWT_s {time_s:g} and 10MWT_m_per_s {speed:g}"
+            found = f"10MWT: seconds {time_s:g}, m/s {speed:g}"
             return names, found, f"a speed of {10 / time_s:.2f} m/s, or {6 / time_s:.2f} where 6 m of the 10 are timed"
     return None

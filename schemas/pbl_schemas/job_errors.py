@@ -12,7 +12,7 @@ import pymysql
 
 from pbl_pipeline.errors import CODERS, CODES, PblError, causes, said, said_of
 
-from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, REPEAT, TOO_LONG, LostConnectionError
+from .datajoint_setup import AWAY, ERROR_MESSAGE_LENGTH, FULL, LIMIT_S, LONGER, REPEAT, TOO_LONG, LostConnectionError
 
 #: Words of object stores for "full": MinIO, quotas.
 _BUCKET_FULL = re.compile(r"StorageFull|QuotaExceeded|minimum free drive threshold")
@@ -63,6 +63,7 @@ def of_server(error: Exception) -> PblError:
     steps = {
         REPEAT: "try again: another one held what this needed for too long",
         TOO_LONG: f"the server ends a query after {LIMIT_S} s: ask for less, such as one person (--subject)",
+        LONGER: "write a shorter text for the column that is named above",
         FULL: "free space on the server's disk, or end its read-only mode; nothing was written",
     }
     return PblError(

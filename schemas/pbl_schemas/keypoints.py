@@ -10,7 +10,8 @@ import numpy as np
 
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
-from pbl_pipeline.records import number
+from pbl_pipeline.records import from_row, number
+from pbl_pipeline.results.video_facts import Intrinsics
 from pbl_pipeline.temporary import new_folder
 
 from . import tracking, video
@@ -171,13 +172,8 @@ def camera_of_row(row: Mapping[str, Any]) -> Camera:
     """The library's `Camera` from a row of CameraCalibration with `turn_deg` (`video.camera_of`)."""
     from pbl_pipeline.video import Camera, turned_camera
 
-    matrix = np.array(
-        [[row["camera_fx"], 0.0, row["camera_cx"]], [0.0, row["camera_fy"], row["camera_cy"]], [0.0, 0.0, 1.0]]
-    )
-    distortion = np.asarray(row["camera_distortion"], np.float64)
-    sd = row["camera_focal_sd"]
-    rel_sd = float("nan") if sd is None else float(sd) / float(matrix[0, 0] + matrix[1, 1]) * 2
-    source = f"{row['camera_origin']}: {row['camera_note']}"[:255]
-    camera = Camera(matrix, distortion, source, rel_sd)
-    size = (int(row["camera_width"]), int(row["camera_height"]))
-    return turned_camera(camera, size, row["turn_deg"])
+    c = from_row(Intrinsics, row)
+    matrix = np.array([[c.fx_px, 0.0, c.cx_px], [0.0, c.fy_px, c.cy_px], [0.0, 0.0, 1.0]])
+    rel_sd = np.nan if c.focal_sd_px is None else 2 * c.focal_sd_px / (c.fx_px + c.fy_px)
+    camera = Camera(matrix, np.asarray(c.distortion, float), f"{c.origin}: {c.note}"[:255], rel_sd)
+    return turned_camera(camera, (c.width_px, c.height_px), row["turn_deg"])

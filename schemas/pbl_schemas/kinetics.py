@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.qc import Check as Quality
 from pbl_pipeline.records import definition, number, to_row
-from pbl_pipeline.results.forces import KineticMeasure, TrialKinetics
+from pbl_pipeline.results.forces import CycleKinetics, KineticMeasure, TrialKinetics
 from pbl_pipeline.results.forces import Kinetics as Result
 from pbl_pipeline.temporary import new_folder
 
@@ -18,7 +17,7 @@ from . import capture, fit, gait, gdi, session, study, video
 from .datajoint_setup import dj
 from .method_rows import method_columns, method_row
 from .origin import Origin, computes, origin_columns
-from .record_parts import part_of
+from .record_parts import measures_of, part_of
 from .rows import InputChanged
 from .stored_files import file_ref
 
@@ -61,15 +60,12 @@ class Kinetics(dj.Computed):
     index (forces_status)
     """  # noqa: E501
 
-    class Measure(dj.Part):
-        definition = f"""
-        # every measure of the visit with both sides and the standard deviation of its error
-        -> master
-        force_measure            : varchar(64) # name, with its unit
-        ---
-        {definition(KineticMeasure, "force")}
-        force_missing            : varchar(255)  # why it is null
-        """
+    Measure = measures_of(
+        KineticMeasure,
+        "force",
+        "every measure of the visit with both sides and the standard deviation of its error",
+        "force_measure : varchar(64)",
+    )
 
     class Trial(dj.Part):
         definition = f"""
@@ -82,7 +78,7 @@ class Kinetics(dj.Computed):
         """  # noqa: E501
 
     class Cycle(dj.Part):
-        definition = """
+        definition = f"""
         # measures of each cycle; null where contact or motion is not known over the whole stance
         -> master
         -> gait.GaitCycle.Cycle
@@ -99,7 +95,7 @@ class Kinetics(dj.Computed):
         knee_work_j_per_kg=null                   : float64  # (J/kg)
         ankle_work_j_per_kg=null                  : float64  # (J/kg)
         centre_of_mass_excursion_m=null           : float64  # (m)
-        forces_missing                            : varchar(100)  # why they are null
+        {definition(CycleKinetics, without=("number",))}
         """
 
     Check = part_of("Check", Quality, "forces", "quality checks of the forces")
@@ -152,43 +148,17 @@ class Kinetics(dj.Computed):
     def make_insert(self, key: dict, found: Result, ids: list[int], aid: str, origin: Origin) -> None:
         from pbl_pipeline.kinetics.kinetics_file import save_arrays
 
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                **to_row(found),
-                "forces_aid": aid[:64],
-                **origin.row("forces", method_hash=found.params_hash),
-            }
-        )
-        unknown = KineticMeasure(None, None, math.nan, None, None, None, 0)
-        self.Measure.insert(
-            {
-                **key,
-                "force_measure": name,
-                **to_row(found.measures.get(name, unknown), "force"),
-                "force_missing": found.reasons.get(name, "")[:255],
-            }
-            for name in (*found.measures, *found.reasons)
-        )
+        row = {**to_row(found), "forces_aid": aid, **origin.row("forces", method_hash=found.params_hash)}
+        self.insert1({**fit.of_session(key), **row})
+        self.Measure.insert_measures(key, {**dict.fromkeys(found.reasons), **found.measures}, found.reasons)
         with new_folder() as folder:
             for number_of, trial in zip(ids, found.trials, strict=True):
                 path = folder / f"{number_of}.kinetics.npz"
                 if trial.series is not None:
                     save_arrays(trial, path)
-                self.Trial.insert1(
-                    {
-                        **key,
-                        "video_id": number_of,
-                        **to_row(trial),
-                        "trial_forces": None if trial.series is None else path,
-                    }
-                )
-        self.Cycle.insert(
-            {**key, "video_id": v, "cycle_no": c.number, **c.measures, "forces_missing": c.missing[:100]}
-            for v, trial in zip(ids, found.trials, strict=True)
-            for c in trial.cycles
-        )
+                of_trial, file = {**key, "video_id": number_of}, None if trial.series is None else path
+                self.Trial.insert1({**of_trial, **to_row(trial), "trial_forces": file})
+                self.Cycle.insert({**of_trial, **to_row(c), **c.measures} for c in trial.cycles)
         self.Check.insert_records(key, found.qc)
 
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pbl_pipeline.records import definition
+from pbl_pipeline.results.video_facts import Intrinsics
+
 from .datajoint_setup import dj
 
 schema = dj.Schema()
@@ -71,21 +74,12 @@ class Device(dj.Manual):
 
 @schema
 class CameraCalibration(dj.Manual):
-    definition = """
+    definition = f"""
     # intrinsics of an upright frame
     camera_id                : int32
     ---
     -> [nullable] Device
-    camera_origin            : enum('measured', 'exif', 'preset', 'estimated')  # how the figures were had
-    camera_width             : int32           # (px) width of the upright frame they hold for
-    camera_height            : int32           # (px) height of the upright frame they hold for
-    camera_fx                : float64         # (px) focal length, horizontal
-    camera_fy                : float64         # (px) focal length, vertical
-    camera_cx                : float64         # (px) principal point from the left edge
-    camera_cy                : float64         # (px) principal point from the upper edge
-    camera_distortion        : json            # k1 k2 p1 p2 k3 (-), OpenCV's order
-    camera_focal_sd=null     : float64         # (px) standard deviation of the focal length, null when unknown
-    camera_note              : varchar(255)    # file or rule they come from
+    {definition(Intrinsics)}
     camera_sha256            : char(64)        # over all of the above, so that one calibration is stored once
     unique index (camera_sha256)
     """

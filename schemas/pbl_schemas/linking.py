@@ -20,7 +20,7 @@ from pbl_pipeline.names import normalised_label
 
 from . import connection, lab, session
 from .datajoint_setup import MySQLOrMariaDB, dj
-from .rows import rows_inside
+from .rows import parts, rows_inside
 from .transactions import in_transaction
 
 _usage = functools.partial(PblError, "USAGE", next_step='see docs/add_table.md, "Link your laboratory\'s tables"')
@@ -64,9 +64,9 @@ class Linked:
     def visits(self, people: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return the key of each visit of these people by `code/label`. Raises `PblError` USAGE for a name of two."""
         codes = {tuple(key[name] for name in self.owner.values()): code for code, key in people.items()}
-        rows = self.session & [dict(zip(self.owner, values, strict=True)) for values in codes]
+        owners = (dict(zip(self.owner, values, strict=True)) for values in codes)
         found = []
-        for row in rows.proj(*self.owner).to_dicts():
+        for row in (r for some in parts(owners) for r in (self.session & some).proj(*self.owner).to_dicts()):
             key = {name: row[name] for name in self.session.primary_key}
             label = normalised_label(str(self.session_label(key)))
             found.append((f"{codes[tuple(row[name] for name in self.owner)]}/{label}", key))

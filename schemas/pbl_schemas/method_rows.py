@@ -10,20 +10,25 @@ from typing import Any
 
 from pbl_pipeline import methods
 from pbl_pipeline.errors import PblError
-from pbl_pipeline.records import plain
+from pbl_pipeline.records import column, definition, from_row, record, to_row
 
 from .rows import one
+
+
+@record
+class _Row:
+    name: str = column("{}_method_name", "name without the version", "varchar(40)")
+    version: int = column("{}_method_version", "counts up when parameters change", "int16")
+    params: dict = column("{}_params", "every parameter", "json")
+    sha: str = column("{}_method_sha", "hash over stage, name, version and parameters", "char(16)")
 
 
 def method_columns(prefix: str) -> str:
     """Definition of a method table: one frozen paramset per row, `<name>-v<version>` as its readable short key."""
     return f"""
-    {prefix}_method          : varchar(48)       # name and version, such as demo-v1
+    {prefix}_method : varchar(48)  # name and version, such as demo-v1
     ---
-    {prefix}_method_name     : varchar(40)       # name without the version
-    {prefix}_method_version  : int16             # counts up when parameters change
-    {prefix}_params          : json              # every parameter
-    {prefix}_method_sha      : char(16)          # hash over stage, name, version and parameters
+    {definition(_Row, prefix)}
     unique index ({prefix}_method_sha)
     """
 
@@ -33,13 +38,8 @@ def insert_methods(table: Any, found: Iterable[methods.Method[Any]]) -> None:
     other parameters under a name and version that the table already knows."""
     prefix = _prefix(table)
     for method in found:
-        row = {
-            f"{prefix}_method": method.key,
-            f"{prefix}_method_name": method.name,
-            f"{prefix}_method_version": method.version,
-            f"{prefix}_params": plain(method.paramset.params),
-            f"{prefix}_method_sha": method.hash,
-        }
+        own = _Row(method.name, method.version, dict(method.paramset.params), method.hash)
+        row = {f"{prefix}_method": method.key, **to_row(own, prefix)}
         known = (table & {f"{prefix}_method": method.key}).proj(f"{prefix}_method_sha").to_dicts()
         if not known:
             table.insert1(row, skip_duplicates=True)
@@ -110,13 +110,7 @@ def method_row(table: Any, key: Mapping[str, Any]) -> dict[str, Any]:
     """The method row of a key as the arguments of `methods.stored`: what `make_fetch` hands on."""
     prefix = _prefix(table)
     row = one(table & {f"{prefix}_method": key[f"{prefix}_method"]})
-    return {
-        "stage": table.stage,
-        "name": row[f"{prefix}_method_name"],
-        "version": row[f"{prefix}_method_version"],
-        "params": row[f"{prefix}_params"],
-        "sha": row[f"{prefix}_method_sha"],
-    }
+    return {"stage": table.stage, **vars(from_row(_Row, row, prefix))}
 
 
 def _prefix(table: Any) -> str:

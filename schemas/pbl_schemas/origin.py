@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVarTuple, cast
 
 from pbl_pipeline.code_version import code_version
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.records import column, definition, record, stored, to_row
 
 from .job_errors import fitted, internal
 from .rows import utc_now
@@ -25,42 +26,41 @@ def origin_columns(prefix: str) -> str:
 
     The names carry the table's prefix, because DataJoint refuses joins of tables that share a secondary attribute.
     """
-    return f"""
-    {prefix}_code_version      : varchar(64)     # version and commit of pbl-pipeline that computed the row
-    {prefix}_method_hash=null  : char(16)        # hash of the frozen parameters, null where the stage has none
-    {prefix}_model_sha256=null : char(64)        # SHA-256 of the model file, null where the stage has none
-    {prefix}_host              : varchar(64)     # computer
-    {prefix}_seconds           : float64         # (s) duration of the computation
-    {prefix}_computed          : datetime        # when it ended, UTC
-    index ({prefix}_computed)
-    """
+    return f"{definition(Origin, prefix)}\nindex ({prefix}_computed)"
 
 
-@dataclasses.dataclass(frozen=True)
+@record(kw_only=True)
 class Origin:
-    """Version, host, duration and end of one computation. ended: by `time.monotonic`."""
+    """Version, method, model, host, duration and end of one computation. ended: by `time.monotonic`."""
 
-    code_version: str
-    host: str
-    seconds: float
+    code_version: str = column(
+        "{}_code_version", "version and commit of pbl-pipeline that computed the row", "varchar(64)"
+    )
+    method_hash: str | None = column(
+        "{}_method_hash", "hash of the frozen parameters, null where the stage has none", "char(16)", default=None
+    )
+    model_sha256: str | None = column(
+        "{}_model_sha256", "SHA-256 of the model file, null where the stage has none", "char(64)", default=None
+    )
+    host: str = column("{}_host", "computer", "varchar(64)", cut=True)
+    seconds: float = column("{}_seconds", "(s) duration of the computation")
     ended: float
+
+    @property
+    @stored("{}_computed", "when it ended, UTC", "datetime")
+    def computed(self) -> datetime.datetime:
+        """Moment of the end by the server's clock."""
+        return utc_now() - datetime.timedelta(seconds=round(time.monotonic() - self.ended))
 
     @classmethod
     def now(cls, seconds: float) -> Origin:
         """Return the origin of a computation that ended here and now after `seconds`."""
-        return cls(code_version(), platform.node()[:64], round(seconds, 3), time.monotonic())
+        about = {"code_version": code_version(), "host": platform.node()}
+        return cls(**about, seconds=round(seconds, 3), ended=time.monotonic())
 
     def row(self, prefix: str, *, method_hash: str | None = None, model_sha256: str | None = None) -> dict[str, Any]:
-        """Values of `origin_columns(prefix)`, the time by the server's clock."""
-        computed = utc_now() - datetime.timedelta(seconds=round(time.monotonic() - self.ended))
-        return {
-            f"{prefix}_code_version": self.code_version,
-            f"{prefix}_method_hash": method_hash,
-            f"{prefix}_model_sha256": model_sha256,
-            f"{prefix}_host": self.host,
-            f"{prefix}_seconds": self.seconds,
-            f"{prefix}_computed": computed,
-        }
+        """Return the values of `origin_columns(prefix)`."""
+        return to_row(dataclasses.replace(self, method_hash=method_hash, model_sha256=model_sha256), prefix)
 
 
 def computes(make_compute: Callable[Arguments, tuple[*Results]]) -> Callable[Arguments, tuple[*Results, Origin]]:

@@ -80,31 +80,22 @@ class Deidentified(dj.Computed):
         return done, folder, sha256_of(done.path)
 
     def make_insert(
-        self,
-        key: dict,
-        done: lib.Deidentified,
-        folder: TemporaryFolder,
-        sha256: str,
-        origin: Origin,
+        self, key: dict, done: lib.Deidentified, folder: TemporaryFolder, sha256: str, origin: Origin
     ) -> None:
         # The folder goes with the object: an insert that meets a deadlock is tried again.
         assert folder.path.is_dir()
-        self.insert1(
-            {
-                **key,
-                "deidentified_how": done.how,
-                "deidentified_status": done.status,
-                "deidentified_reason": done.reason[:255],
-                "deidentified_heads": done.n_heads,
-                "deidentified_uncertain": done.n_uncertain,
-                "deidentified_ranges": [
-                    {"first": first, "last": last, "why": list(done.why(first, last))} for first, last in done.uncertain
-                ],
-                "deidentified_sha256": sha256,
-                "deidentified_file": done.path,
-                **origin.row("deidentified"),
-            }
-        )
+        row = {
+            "how": done.how,
+            "status": done.status,
+            "reason": done.reason[:255],
+            "heads": done.n_heads,
+            "uncertain": done.n_uncertain,
+            "ranges": [{"first": a, "last": b, "why": list(done.why(a, b))} for a, b in done.uncertain],
+            "sha256": sha256,
+            "file": done.path,
+        }
+        own = {f"deidentified_{name}": value for name, value in row.items()}
+        self.insert1({**key, **own, **origin.row("deidentified")})
 
 
 def copy_of(video_id: int) -> str:

@@ -65,13 +65,13 @@ class SessionQc(dj.Computed):
                 of_set = [{k: row[k] for k in names} for row in (fit.FitSet.Video & key).to_dicts()]
             rows = (table & of_set) - (corrected if table is gait.GaitEvents.Check else [])
             checks = [
-                (row.get("video_id"), dataclasses.astuple(from_row(Quality, row, table.prefix)))
-                for row in rows.to_dicts(order_by="KEY")
+                (row.get("video_id"), from_row(Quality, row, table.prefix)) for row in rows.to_dicts(order_by="KEY")
             ]
             if table is gait.GaitEvents.Check:
-                checks += [(k["video_id"], dataclasses.astuple(c)) for k in corrected for c in gait.load_events(k).qc]
+                checks += [(k["video_id"], c) for k in corrected for c in gait.load_events(k).qc]
             for video_id, check in checks:
-                found.append({"qc_stage": stage, "qc_video_id": video_id, **dict(zip(COLUMNS, check, strict=True))})
+                values = dict(zip(COLUMNS, dataclasses.astuple(check), strict=True))
+                found.append({"qc_stage": stage, "qc_video_id": video_id, **values})
         used = {int(v) for v in (gait.GaitCycle & key & "n_cycles_used > 0").to_arrays("video_id")}
         return found, one(gdi.SessionGdi & key, "session_status"), used
 
@@ -91,14 +91,6 @@ class SessionQc(dj.Computed):
     def make_insert(
         self, key: dict, outcome: str, named: Sequence[str], rows: Sequence[dict[str, Any]], origin: Origin
     ) -> None:
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                "qc_outcome": outcome,
-                "qc_n": len(rows),
-                "qc_worst": ", ".join(dict.fromkeys(named))[:1000],
-                **origin.row("qc"),
-            }
-        )
+        row = {"qc_outcome": outcome, "qc_n": len(rows), "qc_worst": ", ".join(dict.fromkeys(named))[:1000]}
+        self.insert1({**fit.of_session(key), **row, **origin.row("qc")})
         self.Check.insert({**key, "qc_no": i, **row} for i, row in enumerate(rows, 1))

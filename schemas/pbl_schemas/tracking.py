@@ -113,15 +113,9 @@ class Tracking(dj.Computed):
     def make_insert(self, key: dict, tracking: lib.Tracking, sha: str, origin: Origin) -> None:
         with new_folder() as folder:
             save_tracking(tracking, folder / "tracks.npz")
-            self.insert1(
-                {
-                    **key,
-                    "n_persons": len(tracking.persons),
-                    "detector": tracking.detector,
-                    "tracks": folder / "tracks.npz",
-                    **origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256),
-                }
-            )
+            row = {"n_persons": len(tracking.persons), "detector": tracking.detector, "tracks": folder / "tracks.npz"}
+            of_model = origin.row("tracking", method_hash=sha, model_sha256=tracking.model_sha256)
+            self.insert1({**key, **row, **of_model})
         self.Person.insert_records(key, (p.figures(tracking.time_s) for p in tracking.persons))
 
 
@@ -186,14 +180,8 @@ class SubjectChoice(dj.Computed):
             picture = folder / "persons.jpg"
             if sheet is not None:
                 picture.write_bytes(sheet)
-            self.insert1(
-                {
-                    **key,
-                    **to_row(choice),
-                    "contact_sheet": None if sheet is None else picture,
-                    **origin.row("choice", method_hash=sha),
-                }
-            )
+            row = {**to_row(choice), "contact_sheet": None if sheet is None else picture}
+            self.insert1({**key, **row, **origin.row("choice", method_hash=sha)})
 
 
 def chosen() -> Any:

@@ -22,6 +22,19 @@ _ATTEMPTS = 20
 _PAUSE_S = 0.1
 
 
+#: Calls that wait until the open transaction is committed.
+_waiting: list[Callable[[], object]] = []
+
+
+def _inside() -> bool:
+    return lab.schema.connection is not None and lab.schema.connection.in_transaction
+
+
+def after_commit(call: Callable[[], object]) -> None:
+    """Call once the open transaction, of a `repeated` function, is committed; immediately if none is open."""
+    _waiting.append(call) if _inside() else call()
+
+
 def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
     """Decorator of a function that is one transaction: begin it again where the server broke it off for another one's
     sake (deadlock, lock wait). Inside a transaction that is open the error propagates to whoever opened it."""
@@ -29,13 +42,18 @@ def repeated(work: Callable[Arguments, T]) -> Callable[Arguments, T]:
     @functools.wraps(work)
     def wrapper(*arguments: Arguments.args, **named: Arguments.kwargs) -> T:
         for attempt in range(_ATTEMPTS):
+            if not _inside():
+                _waiting.clear()
             try:
-                return work(*arguments, **named)
+                done = work(*arguments, **named)
             except pymysql.err.OperationalError as error:
-                inside = lab.schema.connection is not None and lab.schema.connection.in_transaction
-                if error.args[0] not in REPEAT or inside or attempt == _ATTEMPTS - 1:
+                if error.args[0] not in REPEAT or _inside() or attempt == _ATTEMPTS - 1:
                     raise
                 time.sleep(random.uniform(0.0, _PAUSE_S))  # noqa: S311
+                continue
+            while _waiting and not _inside():
+                _waiting.pop(0)()
+            return done
         raise AssertionError("unreachable")
 
     return wrapper

@@ -83,16 +83,8 @@ class KinematicError(dj.Computed):
         return (lib.compare(fit.load_trial(fitted), truth),)
 
     def make_insert(self, key: dict, errors: lib.KinematicErrors, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                "session_id": fit.session_of_set(key),
-                **to_row(errors),
-                "error_view_left": errors.view["left"],
-                "error_view_right": errors.view["right"],
-                **origin.row("error"),
-            }
-        )
+        view = {f"error_view_{side}": seen for side, seen in errors.view.items()}
+        self.insert1({**fit.of_session(key), **to_row(errors), **view, **origin.row("error")})
         self.Joint.insert_records(key, errors.joints)
 
 
@@ -107,10 +99,11 @@ def errors_of_rows(row: Mapping[str, Any], joints: Sequence[Mapping[str, Any]]) 
         lib.KinematicErrors,
         row,
         joints=tuple(from_row(JointError, joint) for joint in joints),
-        view={"left": row["error_view_left"], "right": row["error_view_right"]},
+        view={side: row[f"error_view_{side}"] for side in ("left", "right")},
         residual_2d_px=or_nan(row["trial_residual_2d"]),
         residual_3d_cm=or_nan(row["trial_residual_3d"]),
         trial=row["trial_name"],
-        **{name: row[f"reference_{name}"] for name in ("source", "convention")},
         reference=row["reference_name"],
+        source=row["reference_source"],
+        convention=row["reference_convention"],
     )

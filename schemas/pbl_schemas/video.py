@@ -195,14 +195,8 @@ class VideoInfo(dj.Computed):
         return (probe(registered_file(path, sha256, key)),)
 
     def make_insert(self, key: dict, info: Info, origin: Origin) -> None:
-        self.insert1(
-            {
-                **key,
-                **to_row(info, without=OF_FILE),
-                "frame_time": info.time_s,
-                **origin.row("video_info"),
-            }
-        )
+        row = {**to_row(info, without=OF_FILE), "frame_time": info.time_s}
+        self.insert1({**key, **row, **origin.row("video_info")})
 
 
 def info_of_row(row: Mapping[str, Any], time_s: np.ndarray) -> Info:

@@ -24,6 +24,7 @@ from pbl_pipeline.fit import TrialFit
 from pbl_pipeline.gait.events import load_events
 from pbl_pipeline.keypoints import Keypoints
 from pbl_pipeline.video import probe
+from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import APP_USER, HOST, Folder
 from tests import demo_block, without_posix
 from tests.database import new_home, remove_home
@@ -187,8 +188,7 @@ def test_the_report_is_one_file_with_curves_and_pictures(out):
 
 
 def test_a_second_populate_does_nothing(home, out):
-    started = pbl(home, "db", "start")
-    assert started.returncode == 0, started.stderr
+    embedded.start(folder=Folder(home / "db"))
     again = pbl(home, "populate")
     assert again.returncode == 0, again.stderr
     assert "nothing to do" in again.stdout
@@ -198,7 +198,6 @@ def test_a_second_populate_does_nothing(home, out):
     # The recording has three tracks: she, he on the wall, he on the lawn.
     assert {t["table"]: t["done"] for t in state["tables"]}["SessionQc"] == 1
     assert (state["errors"], state["waiting"]) == ([], [])
-    assert pbl(home, "db", "stop").returncode == 0
 
 
 @pytest.mark.long

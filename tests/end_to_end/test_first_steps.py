@@ -73,7 +73,6 @@ if __name__ != "__main__" or sys.argv[1] in ("run", "populate"):  # also in the 
     import pytest
     from tests.integration import chain
     chain.install(pytest.MonkeyPatch())
-    chain.install_on_files(pytest.MonkeyPatch())
 if __name__ == "__main__":
     from pbl_pipeline.cli import main
     main()

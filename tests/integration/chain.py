@@ -16,12 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pbl_pipeline.fit
-import pbl_pipeline.gait
-import pbl_pipeline.keypoints
-import pbl_pipeline.pipeline  # binds the real functions now, not the stand-ins at its first import later
-import pbl_pipeline.tracking
-import pbl_pipeline.video
+import pbl_pipeline.pipeline  # noqa: F401 - binds the real functions now, not the stand-ins at its first import later
 from pbl_pipeline.body import load_body, marker_set
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.fit import SessionFit, TrialFit, session_fit
@@ -38,17 +33,33 @@ from tests.walker import observe
 from tests.walking_fit import walking_fit
 
 N_FRAMES = 240
-#: The stages that a test may replace, by name, and where the library looks for them.
+_FILES = "pbl_pipeline.pipeline"
+#: The stages that a test may replace, by name, and where the library looks for them, over tables and on files.
 STAGES = {
-    "probe": pbl_pipeline.video,
-    "track_people": pbl_pipeline.tracking,
-    "detect_keypoints": pbl_pipeline.keypoints,
-    "fit_session": pbl_pipeline.fit,
-    "fit_sessions": pbl_pipeline.fit,
-    "detect_events": pbl_pipeline.gait,
+    "probe": ("pbl_pipeline.video",),
+    "track_people": ("pbl_pipeline.tracking", _FILES),
+    "detect_keypoints": ("pbl_pipeline.keypoints", _FILES),
+    "check_trial": (_FILES,),
+    "fit_session": ("pbl_pipeline.fit", _FILES),
+    "fit_sessions": ("pbl_pipeline.fit",),
+    "detect_events": ("pbl_pipeline.gait",),
+    "accepted_cadence": ("pbl_schemas.gait",),
+    "find_heads": ("pbl_pipeline.deidentify.video_copy",),
+    "deidentify": ("pbl_pipeline.deidentify.video_copy",),
+    "Framing": ("pbl_pipeline.keypoints.framing",),
+    "render_overlay": (_FILES,),
+    "overlay_frames": (_FILES,),
+    "report_indices": (_FILES,),
+    "write_report": (_FILES,),
+    "_pictures": (_FILES,),
+    "run_visit": (_FILES,),
+    "check_keypoints": ("pbl_pipeline.visit.types",),
+    "placed_poses": ("pbl_pipeline.fit.per_frame",),
+    "fetch": ("pbl_pipeline.assets",),
+    "share_of_memory": ("pbl_pipeline.video.kept",),
 }
-#: The fixture `stand_in`: functions that stand in for stages, by their names.
-StandIn = Callable[..., None]
+#: For `stand_in`: results on files without overlay and pictures.
+NO_PICTURES: dict[str, Callable[..., Any]] = {"render_overlay": lambda *_, **__: None, "_pictures": lambda *_: ()}
 
 
 def small_video(folder: Path, name: str, n: int = N_FRAMES, people: str = "walker and bystander") -> Path:
@@ -170,7 +181,7 @@ trial_kinetics = remembered(compute.trial_kinetics)
 
 
 def install(patch: pytest.MonkeyPatch) -> None:
-    """Put the stand-ins in place of the library's functions."""
+    """Put the stand-ins in place of the library's functions, over tables and on files."""
     patch.setattr(compute, "trial_kinetics", trial_kinetics)
     replace(patch, track_people=track_people, detect_keypoints=detect_keypoints, fit_session=fit_session)
 
@@ -178,7 +189,8 @@ def install(patch: pytest.MonkeyPatch) -> None:
 def replace(patch: pytest.MonkeyPatch, **functions: Any) -> None:
     """Put these functions instead of the stages of their names."""
     for name, function in functions.items():
-        patch.setattr(STAGES[name], name, function)
+        for module in STAGES[name]:
+            patch.setattr(f"{module}.{name}", function)
 
 
 def change_fits(patch: pytest.MonkeyPatch, change: Callable[[SessionFit], SessionFit]) -> None:
@@ -194,10 +206,3 @@ def computed_once(build: Callable[[Path], Any]) -> Any:
         return fill(build)
 
     return filled
-
-
-def install_on_files(patch: pytest.MonkeyPatch) -> None:
-    """Put the stand-ins in place of what the chain on files calls."""
-    patch.setattr(compute, "trial_kinetics", trial_kinetics)
-    for function in (track_people, detect_keypoints, fit_session):
-        patch.setattr(pbl_pipeline.pipeline, function.__name__, function)

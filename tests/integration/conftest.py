@@ -1,6 +1,7 @@
 """The tables as most tests of this folder want them."""
 
 import functools
+import threading
 from collections.abc import Callable, Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -9,10 +10,26 @@ from typing import Any
 import pytest
 
 import pbl_schemas
+from pbl_schemas.datajoint_setup import datajoint
 from tests import Environment
 from tests.rows import Saved, remove_all
 
 from . import chain
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tables_have_one_thread() -> Iterator[None]:
+    """Refuse a question that a page asks of the tables where it works on files, beside the thread of the tables: their
+    connection would answer one with the rows of the other."""
+    query = datajoint.Connection.query
+
+    def asked(self: Any, *args: Any, **options: Any) -> Any:
+        assert not threading.current_thread().name.startswith("asyncio_"), f"beside the thread of the tables: {args}"
+        return query(self, *args, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datajoint.Connection, "query", asked)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +42,6 @@ def declared(database: Path) -> None:
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stand-ins for the slow stages (`chain`)."""
     chain.install(monkeypatch)
-
-
-@pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> chain.StandIn:
-    """Replaces stages of the chain by their names (`chain.STAGES`)."""
-    return functools.partial(chain.replace, monkeypatch)
 
 
 @pytest.fixture

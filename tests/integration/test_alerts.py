@@ -19,7 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pbl_pipeline import settings
 from pbl_schemas import connection, video, worker
 from pbl_workers import heartbeat, metrics
-from tests import Environment
+from tests import Environment, Limits, Machine
 from tests.command import pbl
 
 from .jobs import beat, queued
@@ -47,9 +47,9 @@ class Sample(NamedTuple):
     value: float
 
 
-def samples() -> list[Sample]:
+def samples(figures: Any = None) -> list[Sample]:
     registry = CollectorRegistry()
-    registry.register(Printed())  # type: ignore[arg-type]
+    registry.register(figures or Printed())
     families = text_string_to_metric_families(generate_latest(registry).decode())
     return [Sample(s.name, s.labels, s.value) for family in families for s in family.samples]
 
@@ -70,8 +70,8 @@ def holds(expression: str, found: list[Sample]) -> bool:
     return by_us
 
 
-def firing() -> set[str]:
-    found = samples()
+def firing(figures: Any = None) -> set[str]:
+    found = samples(figures)
     rules = yaml.safe_load(RULES.read_text())["groups"][0]["rules"]
     out = {rule["alert"] for rule in rules if holds(rule["expr"], found)}
     if _PROMTOOL is not None:
@@ -119,8 +119,8 @@ def healthy(tables: None, tmp_path: Path, environment: Environment) -> Iterator[
     worker.Worker.delete_quick()
 
 
-def test_nothing_fires_where_all_is_well(healthy: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 0, 10**12))  # type: ignore[attr-defined]
+def test_nothing_fires_where_all_is_well(healthy: Path, machine: Machine):
+    machine(free_bytes=10**12)
     assert firing() == set()
 
 
@@ -156,8 +156,8 @@ def test_a_dead_cron_is_seen(healthy: Path):
     assert "PblCronStuck" in firing()
 
 
-def test_work_that_takes_long_is_not_dead(healthy: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(heartbeat, "PERIOD_S", 0.05)
+def test_work_that_takes_long_is_not_dead(healthy: Path, limits: Limits):
+    limits(heartbeat, PERIOD_S=0.05)
     later(1900.0)
     with heartbeat.cron_pass("backup", 75):
         until = time.monotonic() + 60.0
@@ -166,13 +166,11 @@ def test_work_that_takes_long_is_not_dead(healthy: Path, monkeypatch: pytest.Mon
         assert "PblCronDead" not in firing()
 
 
-def test_an_old_queue_a_full_disk_and_a_lost_worker_are_seen(
-    healthy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_old_queue_a_full_disk_and_a_lost_worker_are_seen(healthy: Path, tmp_path: Path, machine: Machine):
     assert queued(tmp_path, video.VideoInfo)
     jobs = video.VideoInfo.jobs.full_table_name
     connection.connect().query(f"UPDATE {jobs} SET created_time = created_time - INTERVAL 25 HOUR")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 10**12, 10**9))  # type: ignore[attr-defined]
+    machine(free_bytes=10**9)
     beat("killed", 300.0)
     beat("of yesterday", 90000.0)
     assert firing() == {"PblQueueOld", "PblDiskFull", "PblWorkerLost"}
@@ -181,18 +179,24 @@ def test_an_old_queue_a_full_disk_and_a_lost_worker_are_seen(
     assert "PblNoWorker" in firing()
 
 
+def test_a_database_that_is_away_is_seen(healthy: Path):
+    def away() -> Any:
+        raise OSError("no route to it")
+
+    with closing(metrics._Installation(away)) as figures:
+        assert "PblDatabaseDown" in firing(figures)
+
+
 def test_workers_count_regular_work_not_as_workers(healthy: Path):
     shown = pbl("status").out
     assert "worker alive:1" in shown
     assert shown.count("\nworker ") == 1
 
 
-def test_figures_of_the_installation_sum_up_over_workers(
-    healthy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_figures_of_the_installation_sum_up_over_workers(healthy: Path, tmp_path: Path, limits: Limits):
     queued(tmp_path, video.VideoInfo)
     jobs = video.VideoInfo.jobs
-    monkeypatch.setattr(metrics, "READ_EVERY_S", 0.2)
+    limits(metrics, READ_EVERY_S=0.2)
     with ExitStack() as stack:
         both = [stack.enter_context(closing(metrics._Installation(connection.another))) for _ in range(2)]
 

@@ -24,7 +24,7 @@ from pbl_schemas.operations.declare import declare_all
 from pbl_schemas.reading import frames
 from pbl_workers import backups
 from pbl_workers.populate import populate
-from tests import Environment
+from tests import Environment, Faults, Limits
 from tests.command import PBL, pbl
 from tests.database import installation
 from tests.rows import everything, everything_but_refreshes
@@ -55,8 +55,8 @@ def elsewhere(filled: None) -> Iterator[Any]:
     connection.connect()
 
 
-def test_there_and_back(elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(backup_files, "STATEMENT", 500)  # several inserts of a table
+def test_there_and_back(elsewhere: Any, tmp_path: Path, limits: Limits):
+    limits(backup_files, STATEMENT=500)  # several inserts of a table
     saved = tmp_path / "backup"
     before = everything()
     done = pbl("db", "backup", "--recordings", saved)
@@ -141,20 +141,18 @@ def test_a_restore_that_was_broken_off_is_repeated_on_demand(
     assert pbl("db", "restore", "--again", tmp_path / "backup").error_code == "DB_REFUSED"
 
 
-def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    create = backup_files.create_statement
+def test_it_is_of_one_moment_while_others_write(filled: None, tmp_path: Path, faults: Faults):
     late: list[str] = []
 
-    def slow(server: Any, schema: str, table: str) -> str:
+    def writes(*_: object) -> None:
         if not late:
             late.append("P999")
             writer = threading.Thread(target=_insert_subject)
             writer.start()
             writer.join(20)
             assert not writer.is_alive(), "the backup holds up who writes"
-        return create(server, schema, table)
 
-    monkeypatch.setattr(backup_files, "create_statement", slow)
+    faults(backup_files, "create_statement", before=writes)
     rows = backup.backup(tmp_path / "backup").rows
     assert len(lab.Subject()) == 2
     assert rows["pbl_lab.subject"] == 1
@@ -229,14 +227,14 @@ def test_a_row_that_names_a_file_outside_of_the_store_is_refused(filled: None, t
 
 
 def test_a_backup_of_another_prefix_and_other_bytes_in_the_store_are_refused(
-    elsewhere: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    elsewhere: Any, tmp_path: Path, environment: Environment
 ):
     saved = tmp_path / "backup"
     backup.backup(saved)
     elsewhere()
-    with monkeypatch.context() as patch:
-        patch.setenv("PBL_DB_PREFIX", "other")
-        assert pbl("db", "restore", saved).error_code == "DB_REFUSED"
+    environment(PBL_DB_PREFIX="other")
+    assert pbl("db", "restore", saved).error_code == "DB_REFUSED"
+    environment(PBL_DB_PREFIX=None)
     path = (saved / "store.sha256").read_text().split("  ", 1)[1].splitlines()[0]
     connection.connect()
     connection.store_backend().put_buffer(b"other bytes", path)
@@ -327,7 +325,7 @@ def test_paths_that_leave_the_store_are_refused(path: str):
 
 
 def test_regular_backups_hold_recordings_once_and_the_oldest_go(
-    filled: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment
+    filled: None, tmp_path: Path, environment: Environment, limits: Limits
 ):
     films, root = registered(), tmp_path / "backups"
     environment(PBL_BACKUP=root)
@@ -337,7 +335,7 @@ def test_regular_backups_hold_recordings_once_and_the_oldest_go(
     alone = subprocess.run([*PBL, "cron", "backup"], capture_output=True, text=True, check=False)
     assert alone.returncode == 0, alone.stderr
     for second in (1, 2):
-        monkeypatch.setattr(backups, "_NAME", f"2099-01-01T00000{second}Z")
+        limits(backups, _NAME=f"2099-01-01T00000{second}Z")
         done = pbl("cron", "backup", "--keep", "2")
         assert done.code == 0, done.err
         assert "2 recordings" in done.out

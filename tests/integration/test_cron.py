@@ -15,13 +15,13 @@ from pbl_pipeline.files import sha256_of
 from pbl_schemas import connection, lab, session, tracking, video
 from pbl_schemas.datajoint_setup import full_path
 from pbl_schemas.intake import VisitRecord, uploads
-from pbl_schemas.intake import register as register_all
 from pbl_schemas.operations.archive import PHONE, folder_of, note_placed
 from pbl_schemas.operations.orphans import orphans, remove
 from pbl_workers import incoming
 from pbl_workers.heartbeat import Silent
 from pbl_workers.loop import Worker
 from pbl_workers.populate import populate
+from tests import Faults
 from tests.command import pbl
 from tests.rows import register
 
@@ -121,18 +121,11 @@ def test_the_same_bytes_under_another_name_are_kept_once(drop: Path, archive: Pa
     assert files(drop) == []
 
 
-def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, archive: Path, monkeypatch):
+def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, archive: Path, faults: Faults):
     upload(drop, "P001/1/walk.mp4")
-    real = incoming.register
-
-    def dies(*args, **kwargs):
-        real(*args, **kwargs)
-        raise KeyboardInterrupt  # after the row was committed, before the upload is removed
-
-    with monkeypatch.context() as patch:
-        patch.setattr(incoming, "register", dies)
-        with pytest.raises(KeyboardInterrupt):
-            twice(drop, archive)
+    # After the row was committed, before the upload is removed.
+    with faults(incoming, "register", KeyboardInterrupt(), after=True), pytest.raises(KeyboardInterrupt):
+        twice(drop, archive)
     assert files(drop) == ["P001/1/walk.mp4"]
     assert len(video.Video()) == 1
     again = look(drop, archive, settled_s=0.05)
@@ -141,19 +134,12 @@ def test_breaking_off_anywhere_loses_nothing_and_registers_once(drop: Path, arch
 
 
 @pytest.mark.parametrize("n", [2, 3], ids=["at the video", "at its log"])  # the first is the list of what lies there
-def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path, archive: Path, monkeypatch, n: int):
+def test_an_archive_that_is_full_leaves_the_upload_and_keeps_no_half(drop: Path, archive: Path, n: int, faults: Faults):
     upload(drop, "P001/1/walk.mp4")
     (drop / "P001/1/walk.csv").write_text(LOG)
     look(drop, archive)
-    calls = []
-
-    def full(number: int) -> None:
-        calls.append(number)
-        if len(calls) == n:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with faults(os, "fsync", *[None] * (n - 1), full) as calls:
         taken = look(drop, archive)
     assert "No space left" in taken.left["P001/1/walk.mp4"].found
     assert len(calls) == n
@@ -185,7 +171,7 @@ def test_names_from_outside_do_not_leave_the_archive(drop: Path, tmp_path: Path,
     taken = twice(drop, archive)
     assert taken.registered == [str(hostile.relative_to(drop))]
     (kept,) = files(archive)
-    assert re.fullmatch(r"P001/[\w. -]+/[0-9a-f]{12}-[\w. -]+\.mp4", kept), kept
+    assert re.fullmatch(r"P001/[\w. -]+/[\w. -]+-[0-9a-f]{8}\.mp4", kept), kept
     assert sorted(p.name for p in tmp_path.iterdir()) == ["archive", "uploads"]
 
 
@@ -251,23 +237,21 @@ def test_a_file_that_a_killed_process_was_writing_is_removed(tables: None):
     assert len(orphans(young_s=0.0).orphans) == before
 
 
-def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(tables: None, tmp_path: Path, archive: Path):
+def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(
+    tables: None, tmp_path: Path, archive: Path, faults: Faults
+):
     """Killed between the move to its place and the row, by a sender that never returns."""
 
     class Killed(BaseException):
         pass
-
-    def die(*_: object) -> None:
-        raise Killed
 
     def take(name: str, *, killed: bool) -> None:
         came = [folder_of(archive, PHONE, "P001") / f"browser-{name}{end}" for end in (".mp4", ".csv")]
         came[0].write_bytes(chain.small_video(tmp_path, name).read_bytes())
         came[1].write_text(LOG)
         copies = [incoming.Copy(came[0], sha256_of(came[0])), incoming.Copy(came[1], "")]
-        with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed) if killed else contextlib.nullcontext():
-            if killed:
-                patch.setattr(incoming, "register", die)
+        die = [Killed()] if killed else []
+        with faults(incoming, "register", *die), pytest.raises(Killed) if killed else contextlib.nullcontext():
             incoming.register_copies(VisitRecord("P001", "1"), f"{name}.mp4", copies, archive)
 
     def age() -> None:
@@ -288,10 +272,8 @@ def test_a_recording_of_a_killed_page_is_said_and_its_room_given_back(tables: No
     take("lost", killed=True)
     take("lost", killed=False)  # it was sent again
     assert len(files(archive)) == len(whole) + 2
-    with pytest.MonkeyPatch.context() as patch:  # killed once the row was there
-        patch.setattr(incoming, "register", lambda given: register_all(given) and die())
-        with pytest.raises(Killed):
-            take("third", killed=False)
+    with faults(incoming, "register", Killed(), after=True), pytest.raises(Killed):  # once the row was there
+        take("third", killed=False)
     there = files(archive)
     age()
     pbl("cron", "release")

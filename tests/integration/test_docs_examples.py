@@ -60,10 +60,9 @@ def run(
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(in_empty_folder: Path) -> Path:
     """An empty folder, and the working directory."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return in_empty_folder
 
 
 @pytest.fixture

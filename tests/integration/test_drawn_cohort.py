@@ -136,7 +136,7 @@ def sheet(study: StudyData) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def from_tables(module_tables: Path, module_patch: pytest.MonkeyPatch, drawn: StudyData) -> StudyData:
     results = Drawn(drawn)
-    module_patch.setattr(pbl_pipeline.fit, "fit_session", lambda *a, markers=None, **k: chain.fit_session(*a, **k))
+    chain.replace(module_patch, fit_session=lambda *a, markers=None, **k: chain.fit_session(*a, **k))
     for name, function in {
         "detect_events": results.events,
         "find_cycles": results.cycles,

@@ -21,6 +21,7 @@ from pbl_schemas.intake import VisitRecord, ingest, uploads
 from pbl_schemas.operations import archive as layout
 from pbl_schemas.operations import backup, forget
 from pbl_workers import incoming
+from tests import Faults, Limits
 from tests.command import pbl
 
 from . import chain
@@ -188,21 +189,16 @@ def test_a_run_has_a_time_limit_and_the_next_one_goes_on(drop: Path, archive: Pa
     assert set(look(drop, archive).registered) == names
 
 
-def test_an_error_that_nobody_foresaw_leaves_one_upload_and_takes_the_others(
-    drop: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_error_that_nobody_foresaw_leaves_one_upload_and_takes_the_others(drop: Path, archive: Path, faults: Faults):
     """It is a fault of the program, not of the recording, which a later run takes."""
     bad, good = upload(drop, "P001/1/walk.mp4"), upload(drop, "P002/1/walk.mp4", "other")
     content = bad.read_bytes()
-    real = incoming.register
 
     def fails(recordings):
         if recordings[0].visit.subject == "P001":
             raise ZeroDivisionError("a defect")
-        return real(recordings)
 
-    with monkeypatch.context() as defect:
-        defect.setattr(incoming, "register", fails)
+    with faults(incoming, "register", before=fails):
         taken = twice(drop, archive)
     assert (taken.registered, codes(taken)) == ([str(good.relative_to(drop))], {})
     assert "a defect" in taken.left["P001/1/walk.mp4"].text()
@@ -211,13 +207,10 @@ def test_an_error_that_nobody_foresaw_leaves_one_upload_and_takes_the_others(
     assert look(drop, archive).registered == ["P001/1/walk.mp4"]
 
 
-def test_an_upload_whose_log_could_not_be_read_in_time_is_left(
-    drop: Path, archive: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_an_upload_whose_log_could_not_be_read_in_time_is_left(drop: Path, archive: Path, limits: Limits):
     video_file = upload(drop, "P001/1/walk.mp4")
     video_file.with_suffix(".csv").write_text("time_s,qw,qx,qy,qz\n")
-    with monkeypatch.context() as short:
-        short.setattr(incoming, "LOG_S", 0.0)
+    with limits(incoming, LOG_S=0.0):
         taken = twice(drop, archive)
         assert {name: error.code for name, error in taken.left.items()} == {"P001/1/walk.mp4": "MACHINE_SHORT"}
         assert video_file.exists()

@@ -9,7 +9,6 @@ import stat
 import subprocess
 import sys
 import time
-import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from pbl_schemas.cli.db import db
 from pbl_schemas.operations import embedded
 from pbl_schemas.operations.embedded import binaries, process, server
 from pbl_schemas.operations.embedded.folder import UNPRIVILEGED, server_account
-from tests import Environment, refused
+from tests import Environment, Machine, refused
 from tests.command import PBL, program
 from tests.database import new_home, remove_home
 
@@ -186,8 +185,8 @@ def test_a_server_that_cannot_start_says_why(fresh: Path):
     assert "server.log" in caught.value.next_step
 
 
-def test_too_little_space_is_said_before_anything_is_written(fresh: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(server.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=30_000_000))
+def test_too_little_space_is_said_before_anything_is_written(fresh: Path, machine: Machine):
+    machine(free_bytes=30_000_000)
     with pytest.raises(PblError, match="DB_UNAVAILABLE") as caught:
         embedded.start(folder=folder(fresh))
     assert caught.value.found.startswith("30 MB")
@@ -352,7 +351,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path):
 
 
 @pytest.fixture
-def without_server(monkeypatch: pytest.MonkeyPatch, environment: Environment) -> Callable[..., None]:
+def without_server(environment: Environment, machine: Machine) -> Callable[..., None]:
     """Makes this machine look like one without MariaDB, whose apt is the script `apt` ("": it has none)."""
 
     def take_away(home: Path, apt: str = "") -> None:
@@ -360,7 +359,7 @@ def without_server(monkeypatch: pytest.MonkeyPatch, environment: Environment) ->
         for name in ("apt-get", "dpkg", "env", "sudo") if apt else ():
             program(home / "bin", name, apt)
         environment(PBL_HOME=home, PATH=home / "bin")
-        monkeypatch.setattr(binaries, "PLACES", ())
+        machine(servers=False)
 
     return take_away
 

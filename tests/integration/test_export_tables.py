@@ -14,13 +14,14 @@ from pbl_schemas.intake import Methods, Sensors, VisitRecord, ingest
 from pbl_schemas.reading import fitted_visit, list_fitted, load_visits
 from pbl_schemas.reading import visits as reading_visits
 from pbl_workers.populate import populate
+from tests import Faults, Limits, StandIn
 from tests.command import pbl
 from tests.rows import register
 
 from . import chain
 
 
-def test_a_visit_of_the_tables(tables: None, tmp_path: Path, stand_in: chain.StandIn, change_fits: Callable[..., None]):
+def test_a_visit_of_the_tables(tables: None, tmp_path: Path, stand_in: StandIn, change_fits: Callable[..., None]):
     ezc3d = pytest.importorskip("ezc3d")
     change_fits(chain.with_all_markers)
     time = np.arange(-0.5, 9.0, 0.02)
@@ -61,16 +62,14 @@ def _files(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_many_visits_are_each_as_alone(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change_fits: Callable[..., None]
-):
+def test_many_visits_are_each_as_alone(tables: None, tmp_path: Path, change_fits: Callable[..., None], limits: Limits):
     change_fits(chain.with_all_markers)
     visits = [("P001", "2026-03-01"), ("P001", "nach OP é"), ("P002", "2026-03-01"), ("P003", "2026-03-01")]
     for i, (subject, label) in enumerate(visits):
         register(chain.small_video(tmp_path, f"walk{i}"), subject=subject, session_label=label)
     register(chain.small_video(tmp_path, "nobody", people="nobody"), subject="P004", session_label="1")
     populate()
-    monkeypatch.setattr(reading_visits, "_TOGETHER", 3)
+    limits(reading_visits, _TOGETHER=3)
     wanted = ("--to", "trc", "--to", "csv")
     done = pbl("export", "--all", *wanted, "--out", tmp_path / "all")
     assert done.code == 0, done.err
@@ -99,21 +98,15 @@ def test_many_visits_are_each_as_alone(
     assert len(list((tmp_path / "one").rglob("export.json"))) == 1
 
 
-def test_many_visits_take_as_many_questions_as_one(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_many_visits_take_as_many_questions_as_one(tables: None, tmp_path: Path, faults: Faults):
     for i in range(3):
         register(chain.small_video(tmp_path, f"walk{i}"), subject=f"P00{i}")
     populate()
-    asked: list[str] = []
-    query = fit.schema.connection.query
-
-    def counted(text: str, *args, **options):
-        asked.append(text)
-        return query(text, *args, **options)
-
     listed = list_fitted({})
-    monkeypatch.setattr(fit.schema.connection, "query", counted)
+    asked = faults(fit.schema.connection, "query")
     assert len([s for _, s in load_visits(listed) if not isinstance(s, PblError)]) == 3
-    three, asked[:] = len(asked), []
+    three = len(asked)
+    asked.clear()
     list(load_visits(listed[:1]))
     assert three == len(asked) > 10
 

@@ -14,6 +14,7 @@ from pbl_workers import loop, queue
 from pbl_workers.heartbeat import Silent
 from pbl_workers.loop import Worker
 from research.benchmarks import gpu_worker
+from tests import StandIn
 
 from . import chain
 
@@ -23,7 +24,7 @@ N = 7
 
 @pytest.fixture
 def sessions(
-    tables: None, database: Path, monkeypatch: pytest.MonkeyPatch, stand_in: chain.StandIn
+    tables: None, database: Path, monkeypatch: pytest.MonkeyPatch, stand_in: StandIn
 ) -> Callable[[Callable], Worker]:
     """Sessions that wait for their fit, and a worker on two threads, given what stands for `fit_sessions`."""
     gpu_worker.put_sessions(database, gpu_worker.plans(N, [5.0], alike=True))
@@ -109,16 +110,9 @@ def test_told_to_end_at_once_it_puts_all_back(sessions):
     assert len(fit.SessionFit()) == 0
 
 
-def test_a_database_that_is_away_between_two_batches_leaves_no_job_behind(sessions, monkeypatch):
-    worker, claim, asked = sessions(lambda n, **_: None), queue.claim, []
-
-    def away_once(table, n=1, only=None):
-        asked.append(n)
-        if len(asked) == 3:
-            raise pymysql.err.OperationalError(2006, "Server has gone away")
-        return claim(table, n, only)
-
-    monkeypatch.setattr(queue, "claim", away_once)
+def test_a_database_that_is_away_between_two_batches_leaves_no_job_behind(sessions, faults):
+    worker = sessions(lambda n, **_: None)
+    faults(queue, "claim", None, None, pymysql.err.OperationalError(2006, "Server has gone away"))
     worker.run(once=True)
     assert (worker.done, len(fit.SessionFit())) == (N, N)
     assert jobs() == {}

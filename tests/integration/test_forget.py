@@ -12,7 +12,7 @@ from pbl_schemas.intake import VisitRecord, ingest
 from pbl_schemas.operations import forget
 from pbl_schemas.operations.declare import declare_all
 from pbl_workers.populate import populate
-from tests import Environment
+from tests import Environment, Faults
 from tests.command import pbl
 from tests.rows import everything_but_refreshes, register, remove_all
 
@@ -118,24 +118,11 @@ def test_nothing_of_the_person_is_left_and_nothing_else_is_touched(
     assert stored() == their_files
 
 
-def test_broken_off_it_is_repeated_until_done(
-    two: tuple[dict, set[str], list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_broken_off_it_is_repeated_until_done(two: tuple[dict, set[str], list[Path]], tmp_path: Path, faults: Faults):
     rows, files, _ = two
-    removed = []
-
-    def remove(self: object, path: str) -> None:
-        if len(removed) == 3:
-            raise KeyboardInterrupt
-        removed.append(path)
-        original(self, path)
-
-    backend = type(connection.store_backend())
-    original = backend.remove
-    with monkeypatch.context() as patch:
-        patch.setattr(backend, "remove", remove)
-        with pytest.raises(KeyboardInterrupt):
-            forget.forget("P017")
+    broken_off = (None, None, None, KeyboardInterrupt())
+    with faults(type(connection.store_backend()), "remove", *broken_off), pytest.raises(KeyboardInterrupt):
+        forget.forget("P017")
     assert everything_but_refreshes() == rows
     assert stored() != files
     assert json.loads(forget.manifest_path("P017").read_text())["state"] == "begun"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pbl_schemas import computed_tables, connection, fit, rows, video
+from pbl_schemas import computed_tables, connection, datajoint_setup, fit, rows, video
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.datajoint_setup import LIMIT_S
 from pbl_schemas.jobs import jobs_of
@@ -18,10 +18,11 @@ from pbl_schemas.operations import catalog
 from pbl_schemas.plan import plan_fit_sets
 from pbl_schemas.reading import registered
 from pbl_schemas.reading.status import pipeline_status
+from pbl_schemas.studies import study_sheets
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
 from research.benchmarks import growth, many_recordings, worker_standins, workers
-from tests import Environment, mysql, not_none
+from tests import Environment, Limits, mysql, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.integration import chain
@@ -42,10 +43,12 @@ def test_statements_stay_as_short_as_they_are(
     monkeypatch: pytest.MonkeyPatch,
     environment: Environment,
     capsys: pytest.CaptureFixture,
+    limits: Limits,
 ):
-    monkeypatch.setattr(rows, "PART", PART)
-    monkeypatch.setattr(requeue, "CHUNK", PART)
-    monkeypatch.setattr(workers, "EACH", 1)  # a video a visit
+    limits(rows, PART=PART)
+    limits(datajoint_setup, ROWS=PART)
+    limits(requeue, CHUNK=PART)
+    limits(workers, EACH=1)  # a video a visit
     environment(**{worker_standins.RECORDED: chain.small_video(tmp_path, "recorded")})
     worker_standins.install(monkeypatch)
     first = [t.__name__ for t in computed_tables() if t.__name__ not in ON_REQUEST]
@@ -73,6 +76,24 @@ def test_statements_stay_as_short_as_they_are(
             found = [(row[1], row[2]) for row in cursor.fetchall()]
             assert not [table for kind, table in found if kind == "DEPENDENT SUBQUERY" and "fit_s" in str(table)], found
     assert planned
+
+
+def test_statements_of_sheets_do_not_grow_with_their_rows(
+    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(rows, "PART", PART)
+    monkeypatch.setattr(datajoint_setup, "ROWS", PART)
+    longest = []
+    for n in (FEW, MANY):
+        for score in ("11", "-"):  # stated, and removed again
+            lines = (f"P{i:03d},{2000 + n}-01-10,baseline,dcm,surgery,yes,{score}" for i in range(n))
+            sheet = tmp_path / "visits.csv"
+            sheet.write_text("\n".join(("subject,visit,role,cohort,group,included,mJOA", *lines)))
+            with growth.counted() as cost:
+                assert study_sheets.import_sheets([sheet]).done
+            longest.append((cost.longest, cost.text))
+    assert longest[2][0] <= longest[0][0] + 100, longest[2][1][:300]
+    assert longest[3][0] <= longest[1][0] + 100, longest[3][1][:300]
 
 
 def test_a_printed_list_ends_and_says_what_it_leaves_out(tables: None):

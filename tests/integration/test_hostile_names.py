@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.pipeline
 import pbl_schemas
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import load_npz
@@ -23,6 +22,7 @@ from pbl_schemas.job_errors import stored_error
 from pbl_schemas.reading.visits import write_visit
 from pbl_workers.populate import populate
 from research.benchmarks import mutated_files as files
+from tests import StandIn
 from tests.command import pbl
 from tests.html_page import Page
 from tests.rows import outcomes
@@ -55,10 +55,10 @@ REFUSED = (
 )
 
 
-def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path, stand_in: StandIn):
     folder = tmp_path / "in"
     folder.mkdir()
-    monkeypatch.chdir(folder)
+    os.chdir(folder)
     paths = [chain.small_video(folder, f"v{i}", n=60 + i) for i in range(len(NAMES))]
     paths = [p.rename(folder / f"{name}.mp4") for p, name in zip(paths, NAMES, strict=True)]
     bad = [folder / f"{name}.mp4" for name in REFUSED]
@@ -79,8 +79,7 @@ def test_names_go_through_tables_and_report_as_text(tables: None, tmp_path: Path
     status = pbl("status")
     assert status.code == 0
     # The report: pictures and overlays need minutes for eight videos and have their own tests; the names are the point.
-    monkeypatch.setattr(pbl_pipeline.pipeline, "render_overlay", lambda *a, **k: None)
-    monkeypatch.setattr(pbl_pipeline.pipeline, "_pictures", lambda *a: ())
+    stand_in(**chain.NO_PICTURES)
     out = tmp_path / "out"
     written = write_visit({"subject": "P001"}, out)
     assert all(p.resolve().parent == out.resolve() for p in written)

@@ -209,16 +209,8 @@ def test_other_columns_are_refused_whole(tables, recordings):
     assert everything() == before
 
 
-def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, monkeypatch):
-    real, calls = videos.OneCamera.insert, []
-
-    def fails(one, numbers):
-        calls.append(one)
-        if len(calls) == 3:
-            raise OSError("the connection is gone")
-        return real(one, numbers)
-
-    monkeypatch.setattr(videos.OneCamera, "insert", fails)
+def test_a_database_that_fails_in_the_middle_leaves_nothing(tables, recordings, faults):
+    faults(videos.OneCamera, "insert", None, None, OSError("the connection is gone"))
     with pytest.raises(OSError, match="gone"):
         ingest_sheet(sheet(recordings, *GOOD))
     assert (len(video.Video()), len(session.Session()), len(lab.Subject())) == (0, 0, 0)

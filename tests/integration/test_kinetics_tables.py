@@ -1,7 +1,6 @@
 """Forces and joint moments in the tables: what they are computed from, and what makes them pending again."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,7 +22,7 @@ from pbl_schemas.rows import delete_below, utc_now
 from pbl_schemas.studies import visit_forms
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import Run, populate
-from tests import not_none
+from tests import Faults, StandIn, not_none
 from tests.command import pbl
 from tests.integration import chain, web
 from tests.rows import register
@@ -32,7 +31,7 @@ VISIT = {"subject": "P001", "session_label": "2026-01-10"}
 
 
 @pytest.fixture
-def upright(tables: None, stand_in: chain.StandIn) -> None:
+def upright(tables: None, stand_in: StandIn) -> None:
     stand_in(fit_session=chain.fit_upright)
 
 
@@ -188,14 +187,11 @@ def test_an_aid_that_the_phone_states_counts_where_the_visit_states_none(walk: P
     assert kinetics.Kinetics.fetch1("forces_code", "forces_aid") == ("", "none")
 
 
-def test_a_job_that_fails_leaves_the_rest_of_the_visit(upright: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def fails(*_: Any, **__: Any) -> Kinetics:
-        raise PblError("FIT_INPUT", found="a broken motion", expected="another", next_step="fit again")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pbl_pipeline.kinetics, "visit_kinetics", fails)
-        register(chain.small_video(tmp_path, "walk"), session_label="2026-01-10")
-        run = populate()
+def test_a_job_that_fails_leaves_the_rest_of_the_visit(upright: None, tmp_path: Path, faults: Faults):
+    broken = PblError("FIT_INPUT", found="a broken motion", expected="another", next_step="fit again")
+    faults(pbl_pipeline.kinetics, "visit_kinetics", broken)
+    register(chain.small_video(tmp_path, "walk"), session_label="2026-01-10")
+    run = populate()
     assert {t.table: dict(t.errors) for t in run.tables if t.errors} == {"Kinetics": {"FIT_INPUT": 1}}
     (row,) = pipeline_status().errors
     assert (row.table, row.code, row.next_step) == ("Kinetics", "FIT_INPUT", "fit again")

@@ -140,16 +140,17 @@ def test_all_cameras_of_a_trial_move_together(tables, tmp_path):
     assert {int(v) for v in moved.to_arrays("video_id")} == numbers
 
 
-def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, archive, monkeypatch):
+def test_a_recording_of_the_archive_goes_to_the_folder_of_its_new_person(drop, archive, faults):
     content = upload(drop, "P001/1/walk.mp4").read_bytes()
     twice(drop, archive)
     number, old = video.Video.fetch1("video_id", "video_path")
     assert Path(old).is_relative_to(archive / "P001")
     plan = plan_move(int(number), "P002", "2")
-    with monkeypatch.context() as patch:
-        patch.setattr("pbl_schemas.intake.move.session_ids", lambda visits: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            carry_out(plan)
+    with (
+        faults("pbl_schemas.intake.move", "session_ids", ZeroDivisionError()),
+        pytest.raises(ZeroDivisionError),
+    ):
+        carry_out(plan)
     assert (video.Video.fetch1("video_path"), len(list(archive.rglob("*.mp4")))) == (old, 1)
     carry_out(plan)
     (now,) = archive.rglob("*.mp4")

@@ -21,6 +21,7 @@ from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
 from research.walker.views import observe_markers
+from tests import StandIn
 from tests.command import pbl
 from tests.inputs import ROWS, trc_text
 from tests.rows import outcomes
@@ -50,7 +51,7 @@ def ingest_markers(path: Path, visit: VisitRecord, table: Path | None = None) ->
 
 
 @pytest.fixture
-def fitted(tables: None, stand_in: chain.StandIn) -> None:
+def fitted(tables: None, stand_in: StandIn) -> None:
     stand_in(fit_session=chain.fit_either)
 
 
@@ -113,7 +114,7 @@ def test_a_phone_and_a_laboratory_measure_the_same_walk(fitted: None, tmp_path: 
         assert slices.changes(name) == []
 
 
-def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, stand_in: chain.StandIn):
+def test_recordings_of_a_table_of_ones_own(tables: None, tmp_path: Path, stand_in: StandIn):
     seen: list[tuple] = []
 
     def fit_markers(trials, names, paramset=None, camera_motion="static", markers=None):

@@ -39,7 +39,7 @@ from pbl_schemas.reading import frames
 from pbl_schemas.studies import slices
 from pbl_workers import heartbeat, loop
 from pbl_workers.populate import populate
-from tests import mysql, not_none
+from tests import Limits, mysql, not_none
 from tests.command import pbl
 from tests.database import keep, new_home, put_back, remove_home, server
 from tests.rows import everything, register
@@ -225,6 +225,17 @@ def tracked_without_video_info(folder: Path) -> dict[str, list[tuple]]:
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         older_tables.undo_0005(cursor, 1)
         cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 5")
+    return rows
+
+
+def stated_in_words(folder: Path) -> dict[str, list[tuple]]:
+    """Freeze three visits, about two of which something was stated in words, and take migration 0011 back."""
+    rows = _visits(folder, "2026-03-01", "2026-06-01", "2026-09-01")
+    for number, aid in enumerate(("Keine", "Gehstock", "my own"), 1):
+        study.Visit.insert1({"session_id": number, "visit_role": "pre", "assistive_device": aid})
+    slices.freeze("of words")
+    with closing(connection.plain_connection()) as server, server.cursor() as cursor:
+        cursor.execute("DELETE FROM pbl_lab.`~migrations` WHERE number = 11")
     return rows
 
 
@@ -447,6 +458,15 @@ def test_corrections_by_a_method_become_rows(put: Put):
     assert {t.table: t.done for t in populate(_chain()).tables if t.done}["SessionGdi"] == 1
 
 
+def test_slices_of_visits_whose_words_become_codes_are_named(put: Put):
+    put(stated_in_words)
+    said = "changes: 2 visits of the slice of words; a backup of before has its numbers"
+    assert migrations.migrate(dry_run=True).touched == [said]
+    migrations.migrate()
+    assert study.Visit.to_arrays("assistive_device", order_by="session_id").tolist() == ["none", "cane", "my own"]
+    assert slices.changes("of words") == [f"visit 2026-0{n}-01 of P001 has other rows" for n in (3, 6)]
+
+
 def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
     rows = put(tracked_without_video_info)
     dry = migrations.migrate(dry_run=True)
@@ -468,9 +488,11 @@ def test_tracking_without_the_video_info_that_it_read_goes(put: Put):
 
 def test_commands_over_tables_of_an_older_version_name_the_migration(older: None, forget: Callable[[], None]):
     before = everything()
-    for command in (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init")):
+    commands = (("populate",), ("list", "videos"), ("worker", "--once"), ("db", "init"), ("web", "--port", "0"))
+    for command in commands:
         refused = pbl(*command)
         assert (refused.code, refused.err.split(":")[0]) == (1, "DB_MIGRATION"), command
+        assert "http" not in refused.out  # no address of a page that does not come
         for part in ("0003 height_of_fits", "video.video_size", "pbl db migrate --dry-run"):
             assert part in refused.err, refused.err
         assert everything() == before
@@ -552,9 +574,8 @@ STARTS = (
 
 @pytest.mark.parametrize(("number", "name"), [(999, "x"), (1, "another_of_this_number")])
 def test_a_database_of_a_newer_version_is_left_alone(
-    put: Put, forget: Callable[[], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, name: str
+    put: Put, forget: Callable[[], None], in_empty_folder: Path, number: int, name: str
 ):
-    monkeypatch.chdir(tmp_path)
     put(new)
     assert [(a.number, a.name) for a in migrations.applied()] == [(m.number, m.name) for m in migrations.available()]
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
@@ -571,7 +592,7 @@ def test_a_database_of_a_newer_version_is_left_alone(
         for part in (f"{number:04} {name}", "9.9+gabc", code_version()):
             assert part in refused.err, command
     assert everything() == before
-    assert not list(tmp_path.iterdir())
+    assert not list(in_empty_folder.iterdir())
     # Also a worker that runs while the tables are migrated stops at its next look.
     forget()
     pbl_schemas.stages.modules()
@@ -597,8 +618,8 @@ def test_a_database_that_lacks_a_migration_is_refused_although_no_column_is_miss
     assert pbl("status").code == 0
 
 
-def test_one_process_migrates_at_a_time(database: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("pbl_schemas.migrations._run.LOCK_S", 1)
+def test_one_process_migrates_at_a_time(database: Path, limits: Limits):
+    limits("pbl_schemas.migrations._run", LOCK_S=1)
     with closing(connection.plain_connection()) as server, server.cursor() as cursor:
         cursor.execute("SELECT GET_LOCK(%s, 0)", (f"{connection.prefix()}_migrate",))
         assert cursor.fetchone() == (1,)

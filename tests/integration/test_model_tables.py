@@ -23,7 +23,7 @@ from pbl_schemas.method_rows import insert_methods, resolve_method
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers import queue, requeue
 from pbl_workers.populate import populate
-from tests import Environment, dot_models
+from tests import Environment, StandIn, dot_models
 from tests.rows import remove_all
 from tests.videos import constant_rate, write_video
 
@@ -47,7 +47,7 @@ def track_people(video_path, params=None, info=None) -> Tracking:
 
 
 @pytest.fixture
-def tables(database: Path, stand_in: chain.StandIn, environment: Environment, tmp_path: Path) -> Iterator[None]:
+def tables(database: Path, stand_in: StandIn, environment: Environment, tmp_path: Path) -> Iterator[None]:
     """Empty tables, a registry of its own, the people where they are."""
     pbl_schemas.activate()
     environment(PBL_MODELS=tmp_path / "models")

@@ -124,8 +124,8 @@ def test_parameters_that_are_none(folder, tmp_path, option, value, code):
     check(pbl("run", folder / "a video.mp4", "--out", tmp_path / "o", option, value), code)
 
 
-def test_names_that_are_none_are_said_before_the_work(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("pbl_pipeline.pipeline.track_people", lambda *a, **k: pytest.fail("work was begun"))
+def test_names_that_are_none_are_said_before_the_work(folder, tmp_path, stand_in):
+    stand_in(track_people=lambda *a, **k: pytest.fail("work was begun"))
     check(pbl("run", folder / "a video.mp4", "--out", tmp_path, "--norm", "nobody's"), "NORM_UNKNOWN")
     gait = ("gait", folder / "walk.fit.npz", "--out", tmp_path / "m.json")
     check(pbl(*gait, "--norm", "nobody's"), "NORM_UNKNOWN")
@@ -143,9 +143,8 @@ CALLS = {
 
 
 @pytest.mark.parametrize("command", CALLS)
-def test_places_that_cannot_be_written_are_said_before_the_work(folder, tmp_path, monkeypatch, command):
-    monkeypatch.setattr("pbl_pipeline.pipeline.track_people", lambda *a, **k: pytest.fail("work was begun"))
-    monkeypatch.setattr("pbl_pipeline.tracking.track_people", lambda *a, **k: pytest.fail("work was begun"))
+def test_places_that_cannot_be_written_are_said_before_the_work(folder, tmp_path, monkeypatch, command, stand_in):
+    stand_in(track_people=lambda *a, **k: pytest.fail("work was begun"))
     files = [folder / f for f in CALLS[command]]
     check(pbl(command, *files, "--out", folder / "file" / "x.npz"), "FILE_UNWRITABLE")
     (tmp_path / "x.npz").mkdir()
@@ -180,8 +179,7 @@ def test_files_that_may_not_be_read(folder, tmp_path):
     ],
     ids=lambda words: " ".join(words),
 )
-def test_without_a_database(monkeypatch, environment, tmp_path, words):
-    monkeypatch.chdir(tmp_path)
+def test_without_a_database(environment, in_empty_folder, tmp_path, words):
     environment(PBL_HOME=tmp_path / "home")
     done = pbl(*words)
     check(done, "DB_NOT_RUNNING")

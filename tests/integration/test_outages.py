@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,8 @@ from pbl_schemas.operations.orphans import orphans
 from pbl_schemas.reading.status import pipeline_status
 from pbl_schemas.store import store_error
 from pbl_schemas.stored_files import remove_left_over
-from pbl_workers import queue, recover, refresh, run_job
-from pbl_workers.heartbeat import Heartbeat
+from pbl_workers import heartbeat, queue, recover, refresh, run_job
+from tests import Faults, Limits
 from tests.command import pbl
 from tests.rows import register
 
@@ -37,37 +36,18 @@ from .jobs import at_once, first_job, jobs_left, queued, work
 FULL = pymysql.err.OperationalError(1114, "The table '__video_info' is full")
 
 
-@pytest.fixture
-def failing(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list]:
-    """Lets a function raise errors before it does what it does; returns its calls."""
-
-    def let(where: Any, name: str, *errors: Exception) -> list[Any]:
-        real, left, calls = getattr(where, name), list(errors), []
-
-        def fails(*args, **options):
-            calls.append(args)
-            if left:
-                raise left.pop(0)
-            return real(*args, **options)
-
-        monkeypatch.setattr(where, name, fails)
-        return calls
-
-    return let
-
-
 @pytest.fixture(autouse=True)
-def quick(tables: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(tables: None, limits: Limits) -> None:
     """Short pauses, and a store that is as empty as the tables."""
-    monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.01)
+    limits(run_job, DATABASE_PAUSE_S=0.01)
     shutil.rmtree(Path(connection.store_backend().spec["location"]) / connection.store_root(), ignore_errors=True)
 
 
 # ------------------------------------------------------------------------------------------------------------- database
-def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path, failing):
+def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path, faults):
     job = first_job(tmp_path)
-    probed = failing(pbl_pipeline.video, "probe")
-    inserted = failing(video.VideoInfo, "make_insert", FULL, FULL, FULL)
+    probed = faults(pbl_pipeline.video, "probe")
+    inserted = faults(video.VideoInfo, "make_insert", FULL, FULL, FULL)
     announced: list[int] = []
     assert run_job.run(job, waiting=lambda: announced.append(1)).what == run_job.DONE
     assert (len(probed), len(inserted), len(announced)) == (1, 4, 3)
@@ -75,46 +55,46 @@ def test_a_result_is_kept_while_the_disk_of_the_database_is_full(tmp_path: Path,
     assert orphans(young_s=0.0).orphans == []
 
 
-def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, monkeypatch, failing):
+def test_a_database_that_stays_full_makes_no_error_row(tmp_path: Path, faults, limits: Limits):
     job = first_job(tmp_path)
-    monkeypatch.setattr(run_job, "DATABASE_WAIT_S", 0.05)
-    failing(video.VideoInfo, "make_insert", *[FULL] * 1000)
+    limits(run_job, DATABASE_WAIT_S=0.05)
+    faults(video.VideoInfo, "make_insert", *[FULL] * 1000)
     assert run_job.run(job).what == run_job.LATER
     assert recover.free_dead(video.VideoInfo) == 1  # what it let go
     assert video.VideoInfo.jobs.fetch1("status", "deaths") == ("pending", 0)
 
 
-def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, failing):
+def test_a_deadlock_that_does_not_end_puts_the_job_back(tmp_path: Path, faults):
     job = first_job(tmp_path)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
-    failing(video.VideoInfo, "make_insert", *[deadlock] * 1000)
+    faults(video.VideoInfo, "make_insert", *[deadlock] * 1000)
     assert run_job.run(job).what == run_job.LATER
     assert video.VideoInfo.jobs.fetch1("status") == "pending"
     assert "Deadlock" in video.VideoInfo.jobs.fetch1("error_message")
 
 
 @pytest.mark.parametrize("number", [1205, 1213])
-def test_a_decision_that_meets_a_deadlock_is_made_once(tmp_path: Path, failing, number: int):
+def test_a_decision_that_meets_a_deadlock_is_made_once(tmp_path: Path, faults, number: int):
     (one,) = register(chain.small_video(tmp_path, "walk"))
     broken_off = pymysql.err.OperationalError(number, "try restarting transaction")
-    tried = failing(review_decisions, "record", broken_off, broken_off)
+    tried = faults(review_decisions, "record", broken_off, broken_off)
     review_decisions.mark_not_usable(one, "other", "dark", by="A. First")
     assert len(tried) == 3
     assert (len(video.NotUsable()), len(review.Decision())) == (1, 1)
-    failing(review_decisions, "record", pymysql.err.OperationalError(1366, "Incorrect value"))
+    faults(review_decisions, "record", pymysql.err.OperationalError(1366, "Incorrect value"))
     with pytest.raises(pymysql.err.OperationalError):  # another error is not tried again
         review_decisions.take_back(one, by="A. First")
     assert len(video.NotUsable()) == 1
 
 
-def test_two_decisions_that_lock_each_other_out_are_both_made(tmp_path: Path, monkeypatch):
+def test_two_decisions_that_lock_each_other_out_are_both_made(tmp_path: Path, faults: Faults):
     """A deadlock of the server's own: another connection holds the row that the decision locks second, and asks for the
     one that it locked first."""
     one, two = register(chain.small_video(tmp_path, "a"), chain.small_video(tmp_path, "b"))
-    other, real, waiting = connection.plain_connection(), review_decisions.record, []
+    other, waiting = connection.plain_connection(), []
     videos, sessions = video.Video.full_table_name, session.Session.full_table_name
 
-    def record(*args, **options):
+    def locks(*_, **__):
         if not waiting:
             cursor = other.cursor()
             other.begin()
@@ -132,9 +112,8 @@ def test_two_decisions_that_lock_each_other_out_are_both_made(tmp_path: Path, mo
             finally:
                 waiting[0].join()
                 other.rollback()
-        return real(*args, **options)
 
-    monkeypatch.setattr(review_decisions, "record", record)
+    faults(review_decisions, "record", before=locks)
     review_decisions.mark_not_usable(one, "other", "dark", by="A. First")
     assert len(waiting) == 1
     assert (len(video.NotUsable()), len(review.Decision())) == (1, 1)
@@ -156,35 +135,33 @@ def test_only_a_database_that_is_away_is_an_outage(error: Exception, code: str):
     assert code == "DB_NOT_RUNNING" or str(error.args[0]) in said.found
 
 
-def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, failing):
+def test_a_deadlock_while_jobs_are_swept_is_tried_again(tmp_path: Path, faults):
     queued(tmp_path, video.VideoInfo)
     deadlock = pymysql.err.OperationalError(1213, "Deadlock found when trying to get lock")
-    tried = failing(type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
+    tried = faults(type(jobs_of(video.VideoInfo)), "delete_quick", deadlock, deadlock)
     assert queue.sweep(video.VideoInfo) == 0  # the one job is still wanted
     assert len(tried) == 4  # two refused, then one for each of the two kinds that nobody needs
 
 
 @pytest.mark.parametrize("place", [(refresh, "refresh"), (queue, "most_urgent"), (queue, "finish"), (refresh, "after")])
-def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, failing, place):
+def test_no_statement_beside_a_job_ends_the_worker(tmp_path: Path, faults, place):
     register(chain.small_video(tmp_path, "walk"))
     locked = pymysql.err.OperationalError(1205, "Lock wait timeout exceeded")
     write = pymysql.err.InternalError(3, "Error writing file (Errcode: 28 No space left on device)")
-    failing(*place, FULL, locked, write)
+    faults(*place, FULL, locked, write)
     assert work(video.VideoInfo).failed == 0
     assert (len(video.VideoInfo()), len(jobs_of(video.VideoInfo))) == (1, 0)
 
 
-def test_a_worker_starts_while_the_database_takes_nothing(
-    monkeypatch: pytest.MonkeyPatch, failing: Callable[..., list]
-):
-    monkeypatch.setattr("pbl_workers.heartbeat.PERIOD_S", 0.02)
-    failing(connection, "another", FULL)
-    with Heartbeat("cpu") as beats:
+def test_a_worker_starts_while_the_database_takes_nothing(faults: Faults, limits: Limits):
+    limits(heartbeat, PERIOD_S=0.02)
+    faults(connection, "another", FULL)
+    with heartbeat.Heartbeat("cpu") as beats:
         beats.count("VideoInfo", 1, 0, 0.1)
     assert worker.Worker.fetch1("worker") == beats.worker
 
 
-def test_tables_are_bound_after_a_database_that_went_away_while_they_were(failing):
+def test_tables_are_bound_after_a_database_that_went_away_while_they_were(faults):
     schema, stage = connection.dj.Schema(), "outage"
 
     class Thing(connection.dj.Manual):
@@ -193,7 +170,7 @@ def test_tables_are_bound_after_a_database_that_went_away_while_they_were(failin
     schema(Thing)
     server = connection.connect()
     try:
-        failing(server, "register", FULL)  # after the schema has its name, before its tables
+        faults(server, "register", FULL)  # after the schema has its name, before its tables
         with pytest.raises(pymysql.err.OperationalError):
             connection.bind(stage, schema)
         connection.bind(stage, schema)
@@ -204,25 +181,23 @@ def test_tables_are_bound_after_a_database_that_went_away_while_they_were(failin
 
 
 # ---------------------------------------------------------------------------------------------------------------- store
-def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, monkeypatch):
+def test_a_full_store_keeps_no_half_a_file(tmp_path: Path, faults: Faults):
     job = first_job(tmp_path)
     write = Path.write_bytes
 
-    def full(self: Path, content: bytes) -> int:
-        write(self, content[: len(content) // 2])
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def half(path: Path, content: bytes) -> None:
+        write(path, content[: len(content) // 2])
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
+    with faults(Path, "write_bytes", OSError(errno.ENOSPC, "No space left on device"), before=half):
         outcome = run_job.run(job)
     assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
     assert left_in_the_store(video.VideoInfo) == []
 
 
 @pytest.mark.parametrize("where", [(video.VideoInfo, "make_insert"), (pbl_pipeline.video, "probe")])
-def test_a_full_store_delays_the_job_and_says_why(tmp_path: Path, failing, where: tuple[Any, str]):
+def test_a_full_store_delays_the_job_and_says_why(tmp_path: Path, faults, where: tuple[Any, str]):
     job = first_job(tmp_path)
-    failing(*where, OSError(errno.ENOSPC, "No space left on device"))
+    faults(*where, OSError(errno.ENOSPC, "No space left on device"))
     outcome = run_job.run(job)
     assert (outcome.what, outcome.code) == (run_job.LATER, "STORE_FULL")
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
@@ -254,27 +229,19 @@ class Killed(BaseException):
     """In place of SIGKILL."""
 
 
-def run_and_die(job: queue.Claim, monkeypatch: pytest.MonkeyPatch) -> None:
+def run_and_die(job: queue.Claim, faults: Faults) -> None:
     """Leave what a process leaves that is killed after its insert's last statement: a reservation and files, no row."""
-    real = job.table.make_insert
-
-    def insert(self: Any, *args: Any) -> None:
-        real(self, *args)
-        raise Killed
-
-    with monkeypatch.context() as patch:
-        patch.setattr(job.table, "make_insert", insert)
-        patch.setattr(run_job, "remove_left_over", lambda *_: None)
-        with pytest.raises(Killed):
-            run_job.run(job)
+    faults(run_job, "remove_left_over", None, Killed())
+    with faults(job.table, "make_insert", Killed(), after=True), pytest.raises(Killed):
+        run_job.run(job)
     queue.release_all()
 
 
 @pytest.mark.parametrize("table", [tracking.Tracking, fit.SessionFit])
-def test_who_does_the_job_of_a_dead_process_removes_its_files(tmp_path: Path, monkeypatch, table: Any):
+def test_who_does_the_job_of_a_dead_process_removes_its_files(tmp_path: Path, table: Any, faults: Faults):
     """Also those of its parts."""
     queued(tmp_path, table)
-    run_and_die(queue.claim(table, 1)[0], monkeypatch)
+    run_and_die(queue.claim(table, 1)[0], faults)
     left = left_in_the_store(table)
     assert left
     recover.free_dead(table)
@@ -397,8 +364,8 @@ def test_a_number_is_never_given_twice(tmp_path: Path):
     assert len(jobs_of(video.VideoInfo)) == 0
 
 
-def test_jobs_of_a_deleted_key_go_whatever_a_refresh_looks_at(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(refresh, "FEW", 0)  # as with very many videos
+def test_jobs_of_a_deleted_key_go_whatever_a_refresh_looks_at(tmp_path: Path, limits: Limits):
+    limits(refresh, FEW=0)  # as with very many videos
     job = first_job(tmp_path)
     queue.fail(job, "PblError: VIDEO_DAMAGED: x")
     refresh.refresh(everything=False)

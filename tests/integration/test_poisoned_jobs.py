@@ -14,6 +14,7 @@ from pbl_schemas.job_errors import error_message, stored_error
 from pbl_schemas.jobs import jobs_of
 from pbl_schemas.reading.why import why
 from pbl_workers import queue, requeue, run_job
+from tests import Faults
 from tests.rows import register
 
 from . import web
@@ -146,13 +147,10 @@ def test_a_damaged_file_of_the_store_is_an_error_that_names_it(tables, tmp_path:
         assert requeue.retry(table=reader.__name__) == {reader.__name__: 1}
 
 
-def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, monkeypatch):
+def test_an_unforeseen_error_outside_of_the_computation_has_a_code(tables: None, tmp_path: Path, faults: Faults):
     queued(tmp_path, video.VideoInfo)
 
-    def insert(self, key, info, origin):
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    monkeypatch.setattr(video.VideoInfo, "make_insert", insert)
+    faults(video.VideoInfo, "make_insert", np.linalg.LinAlgError("Singular matrix"))
     outcome = run_job.run(claimed(video.VideoInfo))
     assert (outcome.what, outcome.code) == (run_job.FAILED, "INTERNAL")
     assert error(video.VideoInfo) == ("INTERNAL", "LinAlgError: Singular matrix")
@@ -184,3 +182,15 @@ def test_an_error_of_a_job_is_german_and_whole_on_pages(tables: None, tmp_path: 
         assert "Aufnahme gang: Doppelschritte von 0,12 s" in browser.get(path).text, path
     assert "ie Zeiten der Bilder berichtigen" in browser.get("/visits/1").text
     assert why(1).verdict.startswith("reading of the video failed (FIT_INPUT: trial gang: strides of 0.12 s)")
+
+
+def test_an_error_without_german_words_has_no_english_ones_on_german_pages(tables: None, tmp_path: Path):
+    job = first_job(tmp_path, "gang")
+    broken = PblError("INTERNAL", "a value that no person foresaw", "another", "see what it was")
+    queue.fail(job, error_message(broken, "VideoInfo", job.key))
+    browser = web.client(role="reviewer,operator")
+    for path in ("/visits/1", "/recordings/1", "/operate"):
+        pages = {name: browser.get(path, headers={"accept-language": name}).text for name in ("en", "de")}
+        assert "foresaw" in pages["en"], path
+        assert "Einzelheiten stehen auf der englischen Seite" in pages["de"], path
+        assert "foresaw" not in pages["de"], path

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pbl_pipeline.deidentify.video_copy
 import pbl_schemas
 from pbl_pipeline.deidentify import Head, Heads
 from pbl_pipeline.errors import PblError
@@ -19,6 +18,7 @@ from pbl_schemas.reading.status import pipeline_status
 from pbl_schemas.reading.why import why
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
+from tests import Environment, StandIn
 from tests.rows import register, remove_all
 from tests.videos import constant_rate, numbered_frames, write_video
 
@@ -36,11 +36,11 @@ def find_heads(video: Path, params: object, info: VideoInfo) -> Heads:
 
 
 @pytest.fixture
-def tables(database: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+def tables(database: Path, stand_in: StandIn) -> Iterator[None]:
     pbl_schemas.activate()
-    monkeypatch.setattr(pbl_pipeline.deidentify.video_copy, "find_heads", find_heads)
+    stand_in(find_heads=find_heads)
     jobs.keys_of.made.pop(privacy.Deidentified, None)
-    yield monkeypatch
+    yield
     remove_all()
     jobs.keys_of.made.pop(privacy.Deidentified, None)  # made once for a process, whose setting does not change
 
@@ -65,8 +65,8 @@ def test_without_the_setting_there_are_no_copies_and_recordings_are_shown_as_the
     assert shown(video_id) is None
 
 
-def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Path):
-    tables.setenv("PBL_DEIDENTIFY", "pixelate")
+def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Path, environment: Environment):
+    environment(PBL_DEIDENTIFY="pixelate")
     paths = films(tmp_path, "walk", "nobody")
     walk, nobody = register(*paths)
     with pytest.raises(PblError, match="pbl populate") as missing:
@@ -92,7 +92,7 @@ def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Pa
     assert "no head was found" in str(empty)
     assert "Deidentified" in {s.table for s in why(walk).steps}
 
-    tables.setenv("PBL_DEIDENTIFY", "skeleton")
+    environment(PBL_DEIDENTIFY="skeleton")
     with pytest.raises(PblError, match="reprocess"):
         shown(walk)
 
@@ -101,20 +101,20 @@ def test_copies_lie_in_the_store_with_the_frames_to_look_at(tables, tmp_path: Pa
     assert not path.exists()
 
 
-def test_a_worker_without_the_setting_says_so(tables, tmp_path: Path):
+def test_a_worker_without_the_setting_says_so(tables, tmp_path: Path, monkeypatch, environment: Environment):
     """The machine that queued the job had it, the one that took it has not."""
-    tables.setenv("PBL_DEIDENTIFY", "blur")
+    environment(PBL_DEIDENTIFY="blur")
     register(*films(tmp_path, "walk"))
     populate(["VideoInfo"])
     jobs.keys_of.made.pop(privacy.Deidentified, None)
     source = privacy.Deidentified().key_source
-    tables.setattr(privacy.Deidentified, "key_source", property(lambda _: source))
-    tables.setenv("PBL_DEIDENTIFY", "")
+    monkeypatch.setattr(privacy.Deidentified, "key_source", property(lambda _: source))
+    environment(PBL_DEIDENTIFY="")
     run = populate(["Deidentified"])
     assert {t.table: t.errors for t in run.tables} == {"Deidentified": {"USAGE": 1}}
 
 
-def test_another_word_is_refused(tables):
-    tables.setenv("PBL_DEIDENTIFY", "mosaic")
+def test_another_word_is_refused(tables, environment):
+    environment(PBL_DEIDENTIFY="mosaic")
     with pytest.raises(PblError, match=r"^USAGE: "):
         _ = privacy.Deidentified().key_source

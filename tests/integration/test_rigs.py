@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import pbl_pipeline.fit
-import pbl_pipeline.keypoints
-import pbl_pipeline.tracking
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.keypoints import Keypoints, MultiView
 from pbl_pipeline.synthetic import NO_NOISE, plain_walk
@@ -27,10 +24,12 @@ from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
 from research.walker.views import observe_views
+from tests import StandIn, worn_sensor
 from tests.command import pbl
 from tests.rows import outcomes
 from tests.videos import constant_rate, numbered_frames, write_video
 from tests.walking_fit import CYCLE_S
+from tests.worn_sensor import Swing
 
 from . import chain
 
@@ -89,9 +88,8 @@ def fit_none(trials, names, paramset=None, camera_motion="static"):
 
 
 @pytest.fixture
-def rig(tables: None, monkeypatch: pytest.MonkeyPatch, stand_in: chain.StandIn) -> pytest.MonkeyPatch:
+def rig(tables: None, stand_in: StandIn) -> None:
     stand_in(detect_keypoints=detect_keypoints, fit_session=fit_none)
-    return monkeypatch
 
 
 def errors_of(table) -> list[tuple[int, str]]:
@@ -100,8 +98,8 @@ def errors_of(table) -> list[tuple[int, str]]:
 
 
 @pytest.mark.long
-def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch, tmp_path: Path):
-    rig.setattr(pbl_pipeline.fit, "fit_session", chain.fit_either)
+def test_a_phone_and_three_cameras_measure_the_same_walk(rig: None, tmp_path: Path, stand_in: StandIn):
+    stand_in(fit_session=chain.fit_either)
     visit = ("--subject", "P001", "--session", "2026-03-01")
     assert pbl("ingest", chain.small_video(tmp_path, "walk"), *visit).code == 0
     toml = calibration(tmp_path / "Calib.toml")
@@ -176,7 +174,7 @@ def test_a_phone_and_three_cameras_measure_the_same_walk(rig: pytest.MonkeyPatch
 
 
 @pytest.mark.long
-def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
+def test_people_of_the_cameras(rig: None, tmp_path: Path, stand_in: StandIn):
     """Somebody else in one camera, or nobody, takes a trial out with a reason; the other trials are fitted."""
 
     def track_people(video_path, params=None, info=None):
@@ -185,7 +183,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
             Path("x_nobody.mp4") if nobody else video_path, params, info or chain.probe(video_path)
         )
 
-    rig.setattr(pbl_pipeline.tracking, "track_people", track_people)
+    stand_in(track_people=track_people)
     toml = calibration(tmp_path / "Calib.toml")
     for trial in ("w1.", "w2."):
         made = register([SeveralCameras(rig_videos(tmp_path, trial), toml, VisitRecord("P001"))])
@@ -197,7 +195,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     assert fit.SessionFit.Trial().to_arrays("video_id").tolist() == [1]
     # A worker with a GPU hands a batch over.
     batch: list = []
-    rig.setattr(pbl_pipeline.fit, "fit_sessions", lambda given, *_, **__: batch.extend(given) or [REFUSED])
+    stand_in(fit_sessions=lambda given, *_, **__: batch.extend(given) or [REFUSED])
     (key,) = fit.FitSelection().keys()
     assert fit.SessionFit().make_computes([key], [fit.SessionFit().make_fetch(key)]) == [None]
     assert [t.cameras for t in batch[0].trials] == [CAMERAS]
@@ -232,7 +230,7 @@ def test_people_of_the_cameras(rig: pytest.MonkeyPatch, tmp_path: Path):
     assert not files & set(forgotten.files)
 
 
-def test_trials_that_cannot_be_are_refused(rig: pytest.MonkeyPatch, tmp_path: Path):
+def test_trials_that_cannot_be_are_refused(rig: None, tmp_path: Path):
     toml = calibration(tmp_path / "Calib.toml")
     one, two, three = rig_videos(tmp_path, n=30)
 
@@ -266,6 +264,9 @@ def test_trials_that_cannot_be_are_refused(rig: pytest.MonkeyPatch, tmp_path: Pa
     assert codes([one, two, three]) == {"USAGE"}
     made = register([SeveralCameras([one, two], toml, VisitRecord("P001"))])
     assert outcomes(made) == ["registered"] * 2
+    shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
+    said = pbl("ingest", one, two, "--rig", toml, "--subject", "P001", "--imu", f"shank_r={shank}")
+    assert (said.code, video.WearableImu.fetch1("imu_segments")) == (0, {"shank_r": "00B42D4B"})
     assert codes([two, one, *rig_videos(tmp_path / "more", n=30)[2:]]) == {"USAGE"}
     assert codes(rig_videos(tmp_path / "more", "w.", n=30)) == {"USAGE"}  # three cameras in a session with two
     assert outcomes(ingest([one], VisitRecord("P001", camera_file=toml))) == ["USAGE"]

@@ -1,5 +1,6 @@
 """Files that come with a video, in the tables: the phone's log reaches keypoints and fit, the others are kept."""
 
+import dataclasses
 from contextlib import closing
 from pathlib import Path
 
@@ -9,13 +10,15 @@ import pytest
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.keypoints import Keypoints
+from pbl_pipeline.records import from_row, plain
+from pbl_pipeline.results import SensorFit
 from pbl_pipeline.sensors import SensorLog
 from pbl_schemas import connection, fit, keypoints, lab, load_visit, qc, video
 from pbl_schemas.intake import Sensors, VisitRecord, ingest
 from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import file_ref, stored_file
 from pbl_workers.populate import populate
-from tests import worn_sensor
+from tests import StandIn, worn_sensor
 from tests.command import pbl
 from tests.integration import chain
 from tests.integration.test_tables import errors
@@ -44,7 +47,7 @@ def stored_keypoints() -> Keypoints:
         return Keypoints.load(path)
 
 
-def test_the_log_reaches_keypoints_and_fit(capture, stand_in: chain.StandIn):
+def test_the_log_reaches_keypoints_and_fit(capture, stand_in: StandIn):
     seen = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static"):
@@ -149,7 +152,7 @@ def test_depth_video_and_wearables_are_kept(capture, tmp_path: Path):
     assert pbl("ingest", path, "--subject", "P001", "--imu", tmp_path / "none").error_code == "FILE_MISSING"
 
 
-def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: chain.StandIn):
+def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: StandIn):
     given = []
 
     def fit_session(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
@@ -195,10 +198,42 @@ def test_sensors_of_a_visit_reach_its_fit(tmp_path: Path, stand_in: chain.StandI
 
 
 def with_sensors(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
-    return chain.fit_session(trials, names, paramset)
+    """A fit, and what would have been found of the sensors: the clock is the earliest that the wall clocks allow."""
+    result = chain.fit_session(trials, names, paramset)
+    if not sensors:
+        return result
+    made = [
+        dataclasses.replace(trial, sensors=tuple(found_of(log, clock) for log in sensors))
+        for trial, clock in zip(result.trials, sensor_clock_s or (), strict=True)
+    ]
+    return dataclasses.replace(result, trials=tuple(made))
 
 
-def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: chain.StandIn):
+def found_of(log: SensorLog, clock: tuple[float, float] | None) -> SensorFit:
+    turn, rest = np.array([0.6, 0.8, 0.0, 0.0]), dict.fromkeys(("heading_rad", "tilt_rad", "gain", "slip"), 0.1)
+    known = {"bias_rad_s": np.zeros(3), "dropped": 0.0, "z": 0.9, "rate_rad_s": 1.0, **rest}
+    start = np.nan if clock is None else clock[0]
+    return SensorFit(log.segment, log.name, log.segment, turn, clock_s=start, off_s=np.nan, **known)
+
+
+def test_what_a_fit_found_of_sensors_is_stored(tmp_path: Path, stand_in: StandIn):
+    stand_in(fit_session=with_sensors)
+    path = chain.small_video(tmp_path, "a")
+    insert(path, of_file=meta({"com.apple.quicktime.creationdate": "2026-03-01T09:16:10Z"}))
+    table = Swing().own().assign(start_utc="2026-03-01T09:15:30Z")
+    given = f"shank_r={Swing().write(tmp_path / 'shank.csv', table)}"
+    assert pbl("ingest", path, "--subject", "P001", "--imu", given).code == 0
+    assert not errors(populate())
+    row = fit.SessionFit.Sensor.fetch1()
+    assert (row["sensor_segment"], row["sensor_name"], row["sensor_z"]) == ("shank_r", "shank", 0.9)
+    assert (row["sensor_mounting"], row["sensor_clock_off"]) == ([0.6, 0.8, 0.0, 0.0], None)
+    # The video ended or began 40 s after the sensors, give or take 10.
+    assert 40 - 10 - 15 < row["sensor_clock"] < 40 - 10
+    (trial,) = load_visit({"subject": "P001"}).fitted
+    assert plain(trial.fit.sensors) == plain([from_row(SensorFit, row)])
+
+
+def test_a_fit_that_failed_by_its_sensors_is_tried_again(tmp_path: Path, stand_in: StandIn):
     def fails(trials, names, paramset=None, camera_motion="static", sensors=(), sensor_clock_s=None):
         if sensors:
             raise PblError("FIT_INPUT", found="a log of another walk", expected="this one", next_step="leave it out")
@@ -232,7 +267,7 @@ def test_sensors_of_one_file_are_named_one_by_one(tmp_path: Path):
     assert len(video.WearableImu()) == 1
 
 
-def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: chain.StandIn):
+def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, stand_in: StandIn):
     stand_in(fit_session=with_sensors)
     path, shank = chain.small_video(tmp_path, "a"), worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")
     assert pbl("ingest", path, "--subject", "P001", "--imu", f"shank_r={shank}").code == 0
@@ -252,7 +287,7 @@ def test_a_fit_without_the_sensors_is_not_inserted_after_them(tmp_path: Path, st
     assert len(table) == 1
 
 
-def test_sensors_stay_at_their_visit_when_their_video_moves(tmp_path: Path, stand_in: chain.StandIn):
+def test_sensors_stay_at_their_visit_when_their_video_moves(tmp_path: Path, stand_in: StandIn):
     stand_in(fit_session=with_sensors)
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b", "c")]
     shank = worn_sensor.xsens(Swing(), tmp_path / "MT_1-000_00B42D4B.txt")

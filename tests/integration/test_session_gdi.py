@@ -10,6 +10,7 @@ from pbl_schemas.reading.status import pipeline_status
 from pbl_schemas.rows import delete_below
 from pbl_workers import refresh
 from pbl_workers.populate import populate
+from tests import Faults
 from tests.integration import chain
 from tests.rows import register
 
@@ -28,7 +29,7 @@ def done(*tables: str) -> dict[str, int]:
     return {t.table: t.done for t in populate(tables or None).tables if t.done}
 
 
-def test_the_visit_pools_the_rows_of_its_trials(visit: None, monkeypatch: pytest.MonkeyPatch):
+def test_the_visit_pools_the_rows_of_its_trials(visit: None, faults: Faults):
     """Rows of another version of the code stand on the page: what is pooled is what stands there."""
     before = gdi.SessionGdi.fetch1()
     cycle = (gait.GaitCycle.Cycle & {"video_id": 1, "cycle_used": True}).to_dicts(order_by="cycle_no")[0]
@@ -36,12 +37,9 @@ def test_the_visit_pools_the_rows_of_its_trials(visit: None, monkeypatch: pytest
     gait.GaitCycle.Cycle.update1({**key, "cycle_foot_up": cycle["cycle_foot_up"] + 0.1})
     delete_below(gdi.SessionGdi, gdi.SessionGdi.keys())
 
-    def nothing(*_: object, **__: object) -> None:
-        raise AssertionError("the visit reads the rows of its trials, not the fit")
-
     from pbl_pipeline.fit import TrialFit
 
-    monkeypatch.setattr(TrialFit, "load", nothing)
+    faults(TrialFit, "load", AssertionError("the visit reads the rows of its trials, not the fit"))
     assert done("SessionGdi", "SessionQc") == {"SessionGdi": 1, "SessionQc": 1}
     after = gdi.SessionGdi.fetch1()
     stride = cycle["cycle_end"] - cycle["cycle_start"]

@@ -18,6 +18,7 @@ from pbl_schemas.studies import slices
 from pbl_schemas.studies.study_sheets import import_sheets
 from pbl_workers.populate import populate
 from tests.command import pbl
+from tests.rows import new_visit
 
 from . import chain
 
@@ -201,13 +202,16 @@ def test_a_slice_is_looked_at_before_it_is_frozen_and_can_be_withdrawn(cohort: P
     assert pbl(*asked).error_code == "DB_NOT_FOUND"  # a check of a name that is not there freezes nothing
     assert pbl(*asked, "--withdraw").error_code == "DB_NOT_FOUND"
     assert pbl(*asked, "--all", "--role", "pre").code == 2
+    new_visit("later")
     for more, n in ((("--cohort", "dcm"), 2), (("--all",), 3), ((), 3)):  # C001 is excluded from the cohort
         planned = pbl(*asked, *more, "--dry-run")
         assert planned.code == 0, planned.err
         lines = planned.out.splitlines()
         assert "P001 pre: counts" in lines
         assert "P002 pre: does not count: no measures" in lines
+        assert "P001 later: does not count: no role is stated" in lines
         assert f"would be frozen: 5 visits, {n} count" in lines[-1]
+    (session.Session & {"session_label": "later"}).delete_quick()
     assert sorted(study.StudySlice().to_arrays("study_slice")) == before
     made = pbl(*asked, "--all")
     assert made.code == 0, made.err

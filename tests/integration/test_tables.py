@@ -37,7 +37,7 @@ from pbl_schemas.plan import plan_fit_sets
 from pbl_schemas.reading import frames
 from pbl_schemas.reading.status import pipeline_status
 from pbl_workers.populate import populate
-from tests import Environment, not_none
+from tests import Environment, Faults, StandIn, not_none
 from tests.command import pbl
 from tests.database import embedded_only
 from tests.rows import register, remove_all
@@ -277,7 +277,7 @@ def test_labels_that_do_not_fit_are_refused(tables: None, tmp_path: Path, label:
         ingest([path], VisitRecord("P001", **label))
 
 
-def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, stand_in: chain.StandIn):
+def test_odd_tags_of_a_file_are_cut_not_an_error(tables: None, tmp_path: Path, stand_in: StandIn):
     original = pbl_pipeline.video.probe
 
     def odd(path):
@@ -486,7 +486,7 @@ def test_of_two_trackings_the_one_that_is_meant_is_named(select_tracking: Callab
 
 
 def test_a_decision_is_carried_to_a_tracking_that_comes_later(
-    select_tracking: Callable[..., None], tmp_path: Path, stand_in: chain.StandIn
+    select_tracking: Callable[..., None], tmp_path: Path, stand_in: StandIn
 ):
     """The other method numbers the people the other way round; then it does not find the one who was chosen."""
     (number,) = register(chain.small_video(tmp_path, "walk"))
@@ -542,9 +542,7 @@ def test_a_decision_given_with_the_video_is_checked_when_the_people_are_known(ta
         decide_person(12345, 1)
 
 
-def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(
-    tables: None, tmp_path: Path, stand_in: chain.StandIn
-):
+def test_a_trial_that_cannot_be_fitted_does_not_hold_up_its_session(tables: None, tmp_path: Path, stand_in: StandIn):
     def half_seen(video_path, tracking, person_id, camera, params=None):
         found = chain.detect_keypoints(video_path, tracking, person_id, camera)
         if "cut" not in Path(video_path).stem:
@@ -638,9 +636,7 @@ def test_a_missing_or_changed_file_is_an_error_until_it_is_back(tables: None, tm
     assert not pipeline_status().errors
 
 
-def test_an_error_row_keeps_code_and_next_step_however_long_the_text(
-    tables: None, tmp_path: Path, stand_in: chain.StandIn
-):
+def test_an_error_row_keeps_code_and_next_step_however_long_the_text(tables: None, tmp_path: Path, stand_in: StandIn):
     def fails(path):
         raise PblError(
             "VIDEO_DAMAGED", found="f" * 9000, expected="e" * 9000, next_step="do " + "n" * 9000, key="k" * 9000
@@ -654,7 +650,7 @@ def test_an_error_row_keeps_code_and_next_step_however_long_the_text(
     assert "f" * 9000 in row.stack
 
 
-def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, stand_in: chain.StandIn):
+def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, stand_in: StandIn):
     def fails(path):
         raise ZeroDivisionError("somewhere deep")
 
@@ -668,14 +664,10 @@ def test_an_unforeseen_error_gets_a_code_too(tables: None, tmp_path: Path, stand
 
 @pytest.mark.parametrize("signal", [KeyboardInterrupt, SystemExit])
 def test_an_interrupt_ends_the_loop_and_puts_the_job_back(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, signal: type[BaseException]
+    tables: None, tmp_path: Path, signal: type[BaseException], faults: Faults
 ):
-    def interrupted(path):
-        raise signal("now")
-
     register(chain.small_video(tmp_path, "walk1"), chain.small_video(tmp_path, "walk2"))
-    with monkeypatch.context() as patch:
-        patch.setattr(pbl_pipeline.video, "probe", interrupted)
+    with faults(pbl_pipeline.video, "probe", signal("now")):
         run = populate(["VideoInfo"])
     assert run.interrupted
     counts = video.VideoInfo.jobs.progress()

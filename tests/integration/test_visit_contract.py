@@ -17,10 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pbl_pipeline.fit
 import pbl_pipeline.gait.metrics as metrics
-import pbl_pipeline.keypoints
-import pbl_pipeline.tracking
 from pbl_pipeline import pipeline
 from pbl_pipeline.export import FORMATS
 from pbl_pipeline.fit import METHODS, SessionFit, default_fit, points_of
@@ -149,7 +146,7 @@ def several_cameras(folder: Path, patch: pytest.MonkeyPatch) -> Both:
     """On files fitted by the library: `pbl fit` names the trial after all cameras, the tables after the first."""
     videos = test_rigs.rig_videos(folder / "lab")
     toml = test_rigs.calibration(folder / "Calib.toml")
-    patch.setattr(pbl_pipeline.keypoints, "detect_keypoints", test_rigs.detect_keypoints)
+    chain.replace(patch, detect_keypoints=test_rigs.detect_keypoints)
     done = pbl("ingest", *videos, "--rig", toml, "--subject", "P001", "--session", "2026-03-01", *MASS)
     assert done.code == 0, done
     populate()
@@ -193,10 +190,7 @@ def both(request: pytest.FixtureRequest, declared: None, tmp_path_factory: pytes
     folder = tmp_path_factory.mktemp("contract")
     with pytest.MonkeyPatch.context() as patch:
         chain.install(patch)
-        chain.install_on_files(patch)
-        for name, stand_in in (("fit", fit_session), ("tracking", track_people)):
-            patch.setattr(getattr(pbl_pipeline, name), stand_in.__name__, stand_in)
-            patch.setattr(pipeline, stand_in.__name__, stand_in)
+        chain.replace(patch, fit_session=fit_session, track_people=track_people)
         yield CASES[request.param](folder, patch)
         remove_all()
 

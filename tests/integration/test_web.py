@@ -17,6 +17,7 @@ from pbl_schemas.reading.visit_list import Filter, visit_page
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, create_app, export
 from pbl_workers.web.access import HOURS, Sessions
+from tests import Faults, Limits
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import new_visit, register
@@ -64,7 +65,7 @@ def test_pages_of_the_list_hold_every_visit_once(four_visits: None):
     assert found == [2, 4, 1, 3]
 
 
-def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Path, limits: Limits):
     for day in ("2026-01-10", "2026-04-10"):
         register(small_video(tmp_path, f"walk {day}"), session_label=day)
     register(small_video(tmp_path, "none", people="nobody"), subject="P004", session_label="2026-02-03")
@@ -104,7 +105,7 @@ def test_a_visit_with_its_index_trend_and_worst_check(tables: None, tmp_path: Pa
     stopped = web.client().get(f"/visits/{rows['P0032026-02-02'].session_id}").text
     assert "VIDEO_MISSING" in html.unescape(stopped)
     assert "a fit without one marker" in web.client().get(f"/visits/{later.session_id}/export").text
-    monkeypatch.setattr(export, "FORMATS", ("csv", "mot"))  # the stand-in of the fit has no markers for a .trc
+    limits(export, FORMATS=("csv", "mot"))  # the stand-in of the fit has no markers for a .trc
     taken = web.client().get(f"/visits/{later.session_id}/export")
     assert taken.status_code == 200, taken.text
     assert taken.headers["content-disposition"] == f'attachment; filename="visit_{later.session_id}.zip"'
@@ -254,7 +255,7 @@ def test_filters_that_do_not_exist_are_left_out(four_visits: None, query: str):
     assert ("/visits/1" in answer.text) != query.startswith(("cohort", "role"))
 
 
-def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, monkeypatch: pytest.MonkeyPatch):
+def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None):
     from pbl_schemas.operations import embedded
 
     browser = web.client()
@@ -270,11 +271,8 @@ def test_the_database_away_is_a_page_that_says_what_to_do(four_visits: None, mon
     assert "/visits/1" in browser.get("/visits").text  # the same page finds the server again
 
 
-def test_an_error_nobody_foresaw_says_nothing_of_the_program(four_visits: None, monkeypatch: pytest.MonkeyPatch):
-    def fail(*_: object) -> None:
-        raise RuntimeError("secret path /home/x")
-
-    monkeypatch.setattr(visit_list, "choices", fail)
+def test_an_error_nobody_foresaw_says_nothing_of_the_program(four_visits: None, faults: Faults):
+    faults(visit_list, "choices", RuntimeError("secret path /home/x"))
     answer = web.client().get("/visits")
     assert answer.status_code == 500
     assert "secret" not in answer.text

@@ -23,18 +23,20 @@ from pbl_workers.web import Options, Where, accounts, certificates, connections,
 from pbl_workers.web.access import IDLE_HOURS, Sessions
 from pbl_workers.web.accounts import Accounts, Attempts
 from pbl_workers.web.serve import config
-from tests import Environment
+from tests import Environment, Faults, Limits
 from tests.integration.web import post, running
 from tests.rows import new_visit
 
 BASE = "https://gait.example"
 WORDS = "correct horse battery staple"
+#: The module that counts connections; its package has a function of the same name.
+SERVER = sys.modules[config.__module__]
 
 
 @pytest.fixture
-def cheap(monkeypatch: pytest.MonkeyPatch) -> None:
+def cheap(limits: Limits) -> None:
     """Hashes that cost little; the tests that need it measure the real cost."""
-    monkeypatch.setattr(accounts, "LOG_N", 4)
+    limits(accounts, LOG_N=4)
 
 
 @pytest.fixture
@@ -257,21 +259,21 @@ def test_the_memory_of_failures_is_bounded():
     assert len(attempts._failures) <= Attempts.MOST
 
 
-def test_the_page_refuses_before_it_compares(known: Accounts, monkeypatch: pytest.MonkeyPatch):
+def test_the_page_refuses_before_it_compares(known: Accounts, faults: Faults):
     client = browser(known)
     for _ in range(3):
         assert sign_in(client, "A", "wrong password words").status_code == 401
-    monkeypatch.setattr(Accounts, "check", lambda *_: pytest.fail("it was compared"))
+    compared = faults(Accounts, "check")
     late = sign_in(client)
     assert late.status_code == 429
     assert int(late.headers["retry-after"]) >= 1
     assert "Try again in" in late.text
+    assert not compared
 
 
-def test_a_flood_of_wrong_passwords_does_not_keep_the_right_one_out(known: Accounts, monkeypatch: pytest.MonkeyPatch):
+def test_a_flood_of_wrong_passwords_does_not_keep_the_right_one_out(known: Accounts, faults: Faults):
     """Wrong passwords of many addresses for one account, at once and before; then the right one from another."""
-    check = Accounts.check
-    monkeypatch.setattr(Accounts, "check", lambda *a: time.sleep(0.05) or check(*a))
+    faults(Accounts, "check", before=lambda *_: time.sleep(0.05))
     where = Where("127.0.0.1", behind_proxy="127.0.0.1", hostnames=("gait.example",))
     app = create_app(Options(hosts=where.names, accounts=known, secure=True))
 
@@ -302,13 +304,11 @@ def test_the_language_is_chosen_over_tls_alone(known: Accounts, tables: None):
         assert all(part in cookie for part in ("secure", "httponly", "samesite=strict", "path=/"))
 
 
-def test_an_unknown_name_takes_as_long_as_a_known_one(known: Accounts, monkeypatch: pytest.MonkeyPatch):
-    asked = []
-    key = accounts._key
-    monkeypatch.setattr(accounts, "_key", lambda *a: asked.append(a[2:]) or key(*a))
+def test_an_unknown_name_takes_as_long_as_a_known_one(known: Accounts, faults: Faults):
+    asked = faults(accounts, "_key")
     known.check("A", "wrong password words")
     known.check("nobody", "wrong password words")
-    assert asked[0] == asked[1]
+    assert asked[0][2:] == asked[1][2:]
 
 
 # --------------------------------------------------------------------------------------------- where other machines are
@@ -442,10 +442,9 @@ def given_up() -> threading.Event:
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch, given_up: threading.Event) -> Iterator[int]:
+def impatient(given_up: threading.Event, limits: Limits) -> Iterator[int]:
     """A page that waits for half a second."""
-    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
-    monkeypatch.setattr(connections, "TAKE_S", 0.5)
+    limits(connections, REQUEST_S=0.5, TAKE_S=0.5)
 
     async def large(scope: Any, receive: Any, send: Any) -> None:
         assert scope["type"] != "websocket"
@@ -521,8 +520,8 @@ async def nothing(scope: Any, receive: Any, send: Any) -> None:
         await send({"type": "http.response.body", "body": b""})
 
 
-def test_one_address_does_not_take_all_connections(impatient: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 3)
+def test_one_address_does_not_take_all_connections(impatient: int, limits: Limits):
+    limits(SERVER, _OF_ONE=3)
 
     with running(nothing, Where()) as port, contextlib.ExitStack() as stack:
         held = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(4)]
@@ -535,10 +534,9 @@ def test_one_address_does_not_take_all_connections(impatient: int, monkeypatch: 
 
 
 @pytest.mark.parametrize("asks", [b"", b"GET /hang HTTP/1.1\r\nHost: x\r\n\r\n"])
-def test_a_few_addresses_keep_no_one_out(monkeypatch: pytest.MonkeyPatch, asks: bytes):
+def test_a_few_addresses_keep_no_one_out(asks: bytes, limits: Limits):
     """Two addresses that hold every connection, waiting or being answered, lose one to a third; a third loses none."""
-    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 4)
-    monkeypatch.setattr(sys.modules[config.__module__], "_CONNECTIONS", 8)
+    limits(SERVER, _OF_ONE=4, _CONNECTIONS=8)
 
     async def page(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
@@ -591,10 +589,9 @@ def test_a_handshake_that_never_ends_keeps_no_connection(impatient: int, by_tls:
                 continue
 
 
-def test_handshakes_count_as_connections(monkeypatch: pytest.MonkeyPatch, by_tls: Where):
-    monkeypatch.setattr(sys.modules[config.__module__], "_OF_ONE", 4)
-    monkeypatch.setattr(sys.modules[config.__module__], "_CONNECTIONS", 10)
-    monkeypatch.setattr(connections, "REQUEST_S", 60.0)
+def test_handshakes_count_as_connections(by_tls: Where, limits: Limits):
+    limits(SERVER, _OF_ONE=4, _CONNECTIONS=10)
+    limits(connections, REQUEST_S=60.0)
     with running(nothing, by_tls) as port, contextlib.ExitStack() as stack:
 
         def held(address: str) -> socket.socket:

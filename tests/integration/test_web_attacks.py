@@ -17,6 +17,7 @@ from pbl_schemas import lab, session, study, video
 from pbl_schemas.jobs import jobs_of
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, connections, create_app
+from tests import Limits
 from tests.integration import web
 from tests.integration.chain import small_video
 from tests.rows import everything, register
@@ -206,9 +207,9 @@ def dripped(slow: socket.socket, drip: bytes, longest_s: float = 8.0) -> tuple[b
 @pytest.mark.parametrize("drip", [b"a", b""])
 @pytest.mark.parametrize("size", ["Content-Length: 5000", "Transfer-Encoding: chunked"])
 def test_a_form_that_never_ends_keeps_no_connection(
-    one_visit: None, drip: bytes, size: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    one_visit: None, drip: bytes, size: str, caplog: pytest.LogCaptureFixture, limits: Limits
 ):
-    monkeypatch.setattr(connections, "REQUEST_S", 0.5)
+    limits(connections, REQUEST_S=0.5)
     app, cookie = web.app_with_cookie()
     with web.running(app, Where()) as port, head_sent(port, "POST /visits HTTP/1.1", cookie, size) as slow:
         _, seconds = dripped(slow, b"1\r\na\r\n" if drip and size.startswith("Transfer") else drip)

@@ -10,7 +10,7 @@ from pbl_pipeline.errors import PblError
 from pbl_schemas.operations import embedded, forget
 from pbl_schemas.review import Viewing
 from pbl_workers.web import Where, audit, serve
-from tests import Environment
+from tests import Environment, Limits
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import small_video
@@ -29,7 +29,7 @@ def rows() -> list[tuple[Any, ...]]:
     return [(r["viewing_by"], r["viewing_what"], r["video_id"], r["session_id"]) for r in found]
 
 
-def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: pytest.MonkeyPatch):
+def test_each_look_is_a_row_before_anything_is_shown(audited: int, limits: Limits):
     browser = web.client(name="A. First")
     assert browser.get("/visits").status_code == browser.get("/visits/1").status_code == 200
     assert rows() == []  # measures are no look at a recording
@@ -44,7 +44,7 @@ def test_each_look_is_a_row_before_anything_is_shown(audited: int, monkeypatch: 
     browser.get("/visits/1/export")
     browser.get("/visits/1/enter")
     assert rows()[4:] == [("A. First", "export", None, 1)]
-    monkeypatch.setattr(audit, "AGAIN_S", 0.0)  # later it is another look
+    limits(audit, AGAIN_S=0.0)  # later it is another look
     browser.get(f"/recordings/{audited}/video")
     assert len(rows()) == 6
     listed = json.loads(pbl("list", "looks", "--subject", "P001", "--json").out)
@@ -82,7 +82,7 @@ def test_no_row_for_what_there_is_not_or_nobody_saw(audited: int, environment: E
     assert rows() == []
 
 
-def test_what_cannot_be_written_down_is_not_shown(audited: int, monkeypatch: pytest.MonkeyPatch):
+def test_what_cannot_be_written_down_is_not_shown(audited: int):
     browser = web.client()
     browser.get(f"/recordings/{audited}/video")
     embedded.stop()

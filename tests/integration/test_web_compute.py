@@ -15,7 +15,7 @@ from pbl_schemas.reading.visit_progress import visit_progress
 from pbl_workers import queue, refresh, run_job
 from pbl_workers.populate import populate
 from pbl_workers.web.computing import told
-from tests import Environment, until
+from tests import Environment, Faults, until
 from tests.integration import compute_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
@@ -129,41 +129,29 @@ def test_a_job_in_other_hands_is_not_taken_twice(visits: None, browser: Any):
     assert len(jobs_of(fit.SessionFit)) == 0
 
 
-def test_a_job_that_ends_just_after_it_was_looked_for_is_followed(
-    visits: None, browser: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_job_that_ends_just_after_it_was_looked_for_is_followed(visits: None, browser: Any, faults: Faults):
     mark(browser, 2)
     (job,) = queue.claim(fit.SessionFit)
-    real, looks = refresh.refresh_scope, []
 
-    def look(scope: Any) -> Any:
-        found = real(scope)
-        looks.append(scope)
+    def look(_: Any) -> None:
         if len(looks) == 2:  # the first is before the worker
             assert run_job.run(job).what == run_job.DONE
-        return found
 
-    monkeypatch.setattr(refresh, "refresh_scope", look)
+    looks = faults(refresh, "refresh_scope", then=look)
     populate(visit=1)
     assert len(qc.SessionQc & job.key) == 1
 
 
-def test_a_job_that_another_has_queued_and_not_taken_is_done(
-    visits: None, browser: Any, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_job_that_another_has_queued_and_not_taken_is_done(visits: None, browser: Any, faults: Faults):
     mark(browser, 2)
     job = fit.SessionFit.jobs.pending.fetch1("KEY")
     fit.SessionFit.jobs.update1({**job, "status": "ignore"})
-    real, looks = refresh.refresh_scope, []
 
-    def look(scope: Any) -> Any:
-        found = real(scope)
-        looks.append(scope)
+    def look(_: Any) -> None:
         if len(looks) == 2:  # the first is before the worker
             fit.SessionFit.jobs.update1({**job, "status": "pending"})
-        return found
 
-    monkeypatch.setattr(refresh, "refresh_scope", look)
+    looks = faults(refresh, "refresh_scope", then=look)
     populate(visit=1)
     assert len(fit.SessionFit & job) == 1
 

@@ -23,7 +23,7 @@ from pbl_schemas.rows import delete_below
 from pbl_schemas.transactions import in_transaction
 from pbl_workers.populate import populate
 from pbl_workers.web.source import TablesSource
-from tests import Environment
+from tests import Environment, Faults, Limits, StandIn
 from tests.command import pbl
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
@@ -139,26 +139,19 @@ def test_the_picture_of_the_people(two_alike: int, environment: Environment):
     assert "/people?" not in browser.get(f"/recordings/{two_alike}").text
 
 
-def test_a_worker_that_inserts_below_what_is_deleted_stops_no_decision(two_alike: int, monkeypatch: pytest.MonkeyPatch):
+def test_a_worker_that_inserts_below_what_is_deleted_stops_no_decision(two_alike: int, faults: Faults):
     """DataJoint then says that its cascade was blocked; the second time the row is among those that go."""
     browser = web.client()
     assert send(browser, two_alike, form_of(browser, two_alike), 2).status_code == 303
     populate()
-    real, times = dj.Table.delete, []
-
-    def blocked(self: Any, **how: Any) -> int:
-        times.append(self.table_name)
-        if len(times) == 1:
-            raise dj.DataJointError("Delete blocked by table `pbl_gait`.`__spatiotemporal` in an unloaded schema.")
-        return real(self, **how)
-
-    monkeypatch.setattr(dj.Table, "delete", blocked)
+    blocked = "Delete blocked by table `pbl_gait`.`__spatiotemporal` in an unloaded schema."
+    times = faults(dj.Table, "delete", dj.DataJointError(blocked))
     assert send(browser, two_alike, form_of(browser, two_alike), 1).status_code == 303
     assert (len(times), len(fit.SessionFit()), len(tracking.SubjectChoice())) == (2, 0, 0)
 
 
 def test_a_worker_that_inserts_below_what_a_transaction_deletes_is_waited_for(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, faults: Faults
 ):
     """An open transaction does not see the new row however often it tries: it is begun again."""
     register(small_video(tmp_path, "walk"))
@@ -169,15 +162,12 @@ def test_a_worker_that_inserts_below_what_a_transaction_deletes_is_waited_for(
         query = worker.cursor().execute
         query(f"CREATE TABLE {events[:-1]}_kept` AS SELECT * FROM {events}")
         delete_below(gait.GaitEvents, gait.GaitEvents.keys())
-        real, begun = dj.Table.delete, []
 
-        def insert_first(self: Any, **how: Any) -> int:
-            if not begun:
+        def insert_first(*_: Any, **__: Any) -> None:
+            if len(begun) == 1:
                 query(f"INSERT INTO {events} SELECT * FROM {events[:-1]}_kept`")
-            begun.append(self.table_name)
-            return real(self, **how)
 
-        monkeypatch.setattr(dj.Table, "delete", insert_first)
+        begun = faults(dj.Table, "delete", before=insert_first)
         try:
             changes = in_transaction(lambda: set_height("P001", 1.7))
         finally:
@@ -254,10 +244,10 @@ def test_what_was_accepted_is_no_longer_open(warned: dict[str, Any]):
 
 
 def test_an_unusual_cadence_gives_no_number_until_somebody_accepts_it(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tables: None, tmp_path: Path, limits: Limits, stand_in: StandIn
 ):
     measures = sys.modules["pbl_pipeline.gait.cycle_measures"]  # a function of the package has its name
-    monkeypatch.setattr(measures, "CADENCE_PER_MIN", (20.0, 50.0))  # the walk's is higher
+    limits(measures, CADENCE_PER_MIN=(20.0, 50.0))  # the walk's is higher
     register(small_video(tmp_path, "walk"), session_label="2026-01-10")
     populate()
     numbers = ("session_gdi", "session_cadence", "session_gps")
@@ -281,7 +271,7 @@ def test_an_unusual_cadence_gives_no_number_until_somebody_accepts_it(
     (result,) = visit_list.results_of([1])[1]
     assert "cadence_plausible" not in result.worst
     key = gait.GaitCycle.fetch1("KEY")
-    monkeypatch.setattr(gait, "accepted_cadence", lambda _: 1.0)  # as if the events had changed since
+    stand_in(accepted_cadence=lambda _: 1.0)  # as if the events had changed since
     delete_below(gait.GaitCycle, [key])
     populate()
     assert gdi.SessionGdi.fetch1(*numbers[:2]) == (None, None)

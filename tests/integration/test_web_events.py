@@ -26,7 +26,7 @@ from pbl_schemas.studies import slices
 from pbl_workers.populate import populate
 from pbl_workers.web import export
 from pbl_workers.web.corrections import _events
-from tests import not_none
+from tests import Faults, Limits, not_none
 from tests.integration import decide_target, web
 from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
@@ -66,7 +66,7 @@ def pooled() -> dict[str, Any]:
     return {k: v for k, v in gdi.SessionGdi.fetch1().items() if not k.endswith(("_computed", "_seconds"))}
 
 
-def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeypatch: pytest.MonkeyPatch):
+def test_corrected_events_count_instead_of_the_detected_ones(visit: str, limits: Limits):
     detected = {k: v for k, v in everything_but_refreshes().items() if "gait_events" in k or "__session_fit" in k}
     before, stance = pooled(), dict(zip(*(gait.Spatiotemporal.to_arrays("video_id", "stance")), strict=True))
     browser = web.client(name="A. First")
@@ -122,7 +122,7 @@ def test_corrected_events_count_instead_of_the_detected_ones(visit: str, monkeyp
     counting = not_none(event_corrections.shown_events(1))
     assert [e.time_s for e in one.events] == [e[0] for e in (counting.hand or ())]
     assert [v["gait_method"] for v in list_fitted({})] == [visit]
-    monkeypatch.setattr(export, "FORMATS", ("csv",))  # the stand-in of the fit has no markers for a .trc
+    limits(export, FORMATS=("csv",))  # the stand-in of the fit has no markers for a .trc
     archive = zipfile.ZipFile(io.BytesIO(browser.get("/visits/1/export?result=0").content))
     (name,) = [n for n in archive.namelist() if n.endswith("export.json")]
     trials = json.loads(archive.read(name))["trials"].values()
@@ -229,19 +229,17 @@ def test_two_people_correct_at_the_same_moment(visit: str):
 
 
 @pytest.mark.parametrize("computing", ["find_cycles", "pool_trials"])
-def test_a_correction_while_its_visit_is_computed(visit: str, monkeypatch: pytest.MonkeyPatch, computing: str):
+def test_a_correction_while_its_visit_is_computed(visit: str, computing: str, faults: Faults):
     """What was computed from earlier corrections is not written: it is computed again from the later ones."""
     save(1, moved())
-    real, corrected_again = getattr(pbl_pipeline.gait, computing), []
+    corrected_again: list[bool] = []
 
-    def slow(*args: Any, **named: Any):
-        done = real(*args, **named)
+    def corrects(*_: Any, **__: Any) -> None:
         if not corrected_again:
             corrected_again.append(True)
             save(1, moved(by=0.1), "B. Second")
-        return done
 
-    monkeypatch.setattr(pbl_pipeline.gait, computing, slow)
+    faults(pbl_pipeline.gait, computing, then=corrects)
     run = populate()
     assert corrected_again
     # Cycles are tried again; the visit's job has no rows to pool then, until they are there.
@@ -328,6 +326,27 @@ def test_trend_slices_move_and_forget(visit: str, tmp_path: Path):
     assert (gait.GaitCycle & {"video_id": 3} & fit.current()).fetch1("correction_no") == 1
     assert not forget("P001").left
     assert len(gait.EventCorrection()) == len(gait.EventCorrection.Event()) == 0
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_body_marks_and_curves_are_in_one_view_where_there_is_no_picture(chromium: Any, visit: str, language: str):
+    """Of a laboratory's markers the 3D view is in the place of the video."""
+
+    def of_markers(route: Any) -> None:
+        movement = route.fetch().json()
+        movement["body"]["camera"] = None
+        route.fulfill(json=movement)
+
+    with web.shown(chromium, locale=language) as page:
+        page.route("**/movement", of_markers)
+        for width, height in ((1280, 900), (1024, 768), (390, 844)):
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto("/recordings/1")
+            page.wait_for_selector("[data-ready]")
+            page.locator("#correct").click()
+            for seen in (".space-view", ".line", "#curves figure >> nth=0"):
+                box = page.locator(seen).bounding_box()
+                assert 0 <= box["y"] < box["y"] + box["height"] <= height, (seen, width, box)
 
 
 def test_from_dragging_a_mark_to_the_row(chromium: Any, visit: str, axe: str):

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pbl_pipeline
-import pbl_pipeline.fit
 from pbl_pipeline import texts
 from pbl_pipeline.errors import CALL, CODES
 from pbl_pipeline.kinetics import REASONS
@@ -24,9 +22,9 @@ from pbl_workers.populate import populate
 from pbl_workers.web.remedies import AT_THE_MACHINE, IN_WORDS, WAYS, remedies
 from tests import not_none
 from tests.german import english_of, english_words
-from tests.html_page import commands_in
+from tests.html_page import Page, commands_in
 from tests.integration import web
-from tests.integration.chain import fit_upright, small_video
+from tests.integration.chain import fit_upright, replace, small_video
 from tests.rows import register
 from tests.source import ROOT, files, nodes
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -40,7 +38,7 @@ def english() -> set[str]:
 @pytest.fixture(scope="module")
 def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     """P001 at three visits, one not computed; a chair test, nobody, two people alike, a screen recording, a film."""
-    module_patch.setattr(pbl_pipeline.fit, "fit_session", fit_upright)
+    replace(module_patch, fit_session=fit_upright)
     for name, day in (("gang", "2026-01-10"), ("gang zwei", "2026-04-10")):
         register(small_video(module_tables, name), session_label=day, mass_kg=70.5)
     chair = register(small_video(module_tables, "stuhl"), subject="P002", session_label="2026-02-01")
@@ -52,7 +50,12 @@ def clinic(module_tables: Path, module_patch: pytest.MonkeyPatch) -> None:
     register(film, subject="P005", session_label="2026-02-04")
     populate()
     register(small_video(module_tables, "neu"))  # of a visit without a label
-    study.ClinicalScore.insert({"session_id": i, "instrument": "mJOA", "score_value": 12 + i} for i in (1, 2))
+    scores = {"mJOA": 12, "10MWT_m_per_s": 1.0}
+    study.ClinicalScore.insert(
+        {"session_id": i, "instrument": name, "score_value": value + i}
+        for name, value in scores.items()
+        for i in (1, 2)
+    )
 
 
 NAMES = (
@@ -104,6 +107,14 @@ def test_a_german_page_has_no_english_word_and_none_names_a_command(clinic: None
     assert not english_of(pages["de"], english, NAMES + r"|VIDEO_SCREEN|\S+/store" * (path == "/operate"))
     for page in pages.values():
         assert not commands_in(page)
+
+
+@pytest.mark.parametrize("path", [p for p in PAGES if p not in ("/operate", "/instruments")])
+def test_no_page_shows_the_name_of_a_value_in_tables(clinic: None, path: str):
+    for language in texts.LANGUAGES:
+        page = Page(web.client().get(path, headers={"accept-language": language}).text)
+        own = [re.sub(r"(leer|zwei)_\w+", "", text) for text in page.texts]  # the names of recordings
+        assert not [text for text in own if re.search(r"[a-z0-9]_[a-z]", text)]
 
 
 def test_what_an_error_or_a_check_asks_for_is_a_link_to_where_it_is_done(clinic: None):

@@ -64,6 +64,17 @@ def test_errors_with_code_words_and_next_step_are_tried_again(three_gone: list[i
     assert "There are no errors" in browser.get("/operate").text
 
 
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_each_error_of_a_kind_leads_to_its_own_recording(three_gone: list[int], tmp_path: Path, language: str):
+    for film in range(3):
+        (tmp_path / f"walk{film}.mp4").write_bytes(b"no longer this film")
+    browser = web.client("reviewer,operator")
+    again(browser, table="VideoInfo", code="VIDEO_MISSING")
+    populate()
+    page = browser.get("/operate", headers={"accept-language": language}).text
+    assert [page.count(f'<a href="/recordings/{number}#usable">') for number in three_gone] == [1, 1, 1]
+
+
 @pytest.mark.parametrize(
     ("fields", "code"),
     [

@@ -8,8 +8,9 @@ import pytest
 from pbl_schemas import reading, tracking
 from pbl_schemas.review import Decision
 from pbl_workers.populate import populate
+from tests import StandIn
 from tests.integration import web
-from tests.integration.chain import StandIn, small_video
+from tests.integration.chain import small_video
 from tests.integration.test_visit_contract import track_people
 from tests.rows import register
 

@@ -7,11 +7,12 @@ import json
 import os
 import random
 import re
-import shutil
 import socket
 import threading
 import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +36,7 @@ from pbl_schemas.intake import phone_recordings
 from pbl_schemas.intake.phone_recordings import MOST_PARTS, PART_BYTES, Sent, phone_of
 from pbl_schemas.intake.protocols import ProtocolStep, add_protocol, read_protocol, steps_of
 from pbl_schemas.jobs import jobs_of
+from pbl_schemas.operations.archive import note_placed
 from pbl_schemas.reading import usable as module_usable
 from pbl_schemas.reading.usable import Next, Usable, usable, usual_seconds
 from pbl_workers import browser_uploads, incoming, phone_uploads, queue
@@ -42,19 +44,21 @@ from pbl_workers.cli.cron import cron
 from pbl_workers.populate import populate
 from pbl_workers.web import Options, Where, create_app
 from pbl_workers.web.phone import next_words, usual_words, verdict
-from tests import Environment, not_none
+from tests import Environment, Faults, Limits, Machine, StandIn, not_none
 from tests.integration import web
 from tests.integration.chain import computed_once, small_video
 from tests.integration.compute_target import nothing
 from tests.rows import new_visit, register
 
+Killed = Callable[[], AbstractContextManager[None]]
+
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
+def visit(tables: None, tmp_path: Path, environment: Environment, limits: Limits) -> int:
     """A visit without recordings; the archive is a folder of the test, and its parts are small."""
     environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads):
-        monkeypatch.setattr(module, "PART_BYTES", 4096)
+        limits(module, PART_BYTES=4096)
     return new_visit("2026-01-10")
 
 
@@ -188,6 +192,15 @@ def test_a_link_opens_for_one_phone_until_it_is_ended(visit: int):
     ended = mine.get("/phone/state.json")
     assert (ended.status_code, ended.json()["error"]["code"]) == (403, "PHONE_LINK")
     assert "opened by a phone" not in reviewer.get(f"/visits/{visit}").text
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_the_link_as_text_can_be_tapped(visit: int, language: str):
+    browser = web.client(target=nothing)
+    browser.headers["accept-language"] = language
+    page = web.post(browser, f"/visits/{visit}/film", hours=2).text
+    tapped = not_none(re.search(r'<a href="(http[^"]*/phone/open\?key=[\w-]+)">(?:<code>)?\1', page))
+    assert stranger().get(tapped[1]).status_code == 200
 
 
 def test_a_link_ends_by_its_time(visit: int):
@@ -661,14 +674,26 @@ def test_what_is_no_video_or_comes_with_a_bad_log_is_refused_by_its_code(visit: 
     assert "cannot be used" in web.client(target=nothing).get(f"/visits/{visit}").text
 
 
+@pytest.fixture
+def killed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> Killed:
+    """A server that is killed before it removes the parts of what it registered or refused."""
+
+    @contextmanager
+    def killed() -> Iterator[None]:
+        with monkeypatch.context() as patch:
+            patch.setattr(phone_uploads, "discard", lambda *_: None)
+            yield
+
+    return killed
+
+
 @pytest.mark.parametrize("limit", ["_OPEN_S", "LOG_S"])
 def test_a_server_that_is_short_of_time_or_memory_says_try_again(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
+    visit: int, tmp_path: Path, limit: str, limits: Limits
 ):
     """The recording is not at fault: its parts stay, and the same bytes are taken later."""
     browser, whole, log = phone(visit), film(tmp_path), attitude_log()
-    with monkeypatch.context() as short:
-        short.setattr(incoming, limit, 0)
+    with limits(incoming, **{limit: 0}):
         for tried in (1, 2):
             answer = send_all(browser, whole, log)
             assert (answer.status_code, code(answer)) == (503, "MACHINE_SHORT")
@@ -681,21 +706,17 @@ def test_a_server_that_is_short_of_time_or_memory_says_try_again(
     assert PhoneRecording().fetch1("phone_error") == ""
 
 
-def test_the_recording_of_one_visit_does_not_wait_for_that_of_another(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_the_recording_of_one_visit_does_not_wait_for_that_of_another(visit: int, tmp_path: Path, faults: Faults):
     """One server: while a file of the first visit is being opened, that of the second is taken."""
     slow, quick = film(tmp_path, "slow"), film(tmp_path, "quick")
     other, opened, go_on = new_visit("2026-02-10"), threading.Event(), threading.Event()
-    check = incoming.check_opens
 
     def waits(path: Path) -> None:
         if path.read_bytes() == slow:
             opened.set()
             assert go_on.wait(60.0)
-        check(path)
 
-    monkeypatch.setattr(phone_uploads, "check_opens", waits)
+    faults(phone_uploads, "check_opens", before=waits)
     first = phone(visit)
     second = TestClient(first.app, base_url=web.BASE)
     take(second, link_of(other))
@@ -710,11 +731,10 @@ def test_the_recording_of_one_visit_does_not_wait_for_that_of_another(
 
 
 def test_a_part_that_comes_again_while_the_recording_is_registered_is_not_kept(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    visit: int, tmp_path: Path, faults: Faults
 ):
     browser, whole = phone(visit), film(tmp_path)
     told = begin(browser, whole)
-    keep = phone_uploads.keep_part
     for n, part in enumerate(parts_of(whole)):
         put(browser, told["number"], n * 4096, part, len(whole))
 
@@ -722,9 +742,8 @@ def test_a_part_that_comes_again_while_the_recording_is_registered_is_not_kept(
         owner = phone_of(browser.cookies["pbl_phone"])
         sent = phone_recordings.recording(owner, told["number"])
         phone_uploads.register(owner, sent, phone_uploads.put_together(owner, sent))
-        keep(*args)
 
-    monkeypatch.setattr(phone_uploads, "keep_part", registered_first)
+    faults(phone_uploads, "keep_part", before=registered_first)
     assert put(browser, told["number"], 0, parts_of(whole)[0], len(whole)).status_code == 204
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
@@ -739,8 +758,8 @@ def test_parts_that_were_changed_on_the_way_are_sent_again(visit: int, tmp_path:
     assert send(browser, whole)["state"] == "received"
 
 
-def test_a_link_takes_so_many_recordings(visit: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(phone_recordings, "MOST_RECORDINGS", 3)
+def test_a_link_takes_so_many_recordings(visit: int, limits: Limits):
+    limits(phone_recordings, MOST_RECORDINGS=3)
     browser = phone(visit)
     for n in range(3):
         begin(browser, bytes([n]))
@@ -763,35 +782,30 @@ def test_a_visit_that_was_removed_meanwhile_is_not_made_again(visit: int, tmp_pa
 
 
 def test_a_part_that_was_on_its_way_while_the_person_was_forgotten_is_not_kept(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    visit: int, tmp_path: Path, faults: Faults
 ):
     browser, whole = phone(visit), film(tmp_path)
     told = begin(browser, whole)
-    keep = phone_uploads.keep_part
 
     def forgotten_first(*args: Any) -> None:
         (session.Session & {"session_id": visit}).delete(prompt=False)
-        keep(*args)
 
-    monkeypatch.setattr(phone_uploads, "keep_part", forgotten_first)
+    faults(phone_uploads, "keep_part", before=forgotten_first)
     answer = put(browser, told["number"], 0, parts_of(whole)[0], len(whole))
     assert (answer.status_code, code(answer)) == (404, "DB_NOT_FOUND")
     assert not [p for p in (tmp_path / "archive").rglob("*") if "P001" in p.parts]
 
 
-def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(incoming, "KEPT_FREE", 10**18)
+def test_the_archive_has_to_have_room(visit: int, tmp_path: Path, limits: Limits):
+    limits(incoming, KEPT_FREE=10**18)
     answer = phone(visit).post("/phone/recordings.json", json=stated(film(tmp_path)))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
 
 
-def test_room_is_promised_to_all_recordings_that_were_begun(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_room_is_promised_to_all_recordings_that_were_begun(visit: int, tmp_path: Path, machine: Machine):
     """Twice its length for each: the parts, and the whole beside them."""
     one, two = film(tmp_path, "one"), film(tmp_path, "two")
-    disk = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + 3 * len(one)))
+    machine(free_bytes=incoming.KEPT_FREE + 3 * len(one))
     browser = phone(visit)
     first = begin(browser, one)
     answer = browser.post("/phone/recordings.json", json=stated(two))
@@ -801,50 +815,53 @@ def test_room_is_promised_to_all_recordings_that_were_begun(
     assert send(browser, two)["state"] == "received"
 
 
-def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_is_left_of_others_makes_no_room(visit: int, tmp_path: Path, killed_at_the_end: Killed, machine: Machine):
     """Neither the upload of a browser nor parts that a killed server left count as those of what was begun."""
     whole, sent = film(tmp_path), film(tmp_path, "sent")
     browser = phone(visit)
-    with monkeypatch.context() as killed:
-        killed.setattr(phone_uploads, "discard", lambda *_: None)
+    with killed_at_the_end():
         assert send(browser, sent)["state"] == "received"
     (tmp_path / "archive" / "_phone" / "P001" / "browser-1.mp4").write_bytes(bytes(9 * len(whole)))
-    disk = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: disk._replace(free=incoming.KEPT_FREE + len(whole)))
+    machine(free_bytes=incoming.KEPT_FREE + len(whole))
     answer = browser.post("/phone/recordings.json", json=stated(whole))
     assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
 
 
-def test_a_database_that_goes_away_before_the_question_is_not_running(visit: int, monkeypatch: pytest.MonkeyPatch):
+def test_room_is_promised_while_a_recording_without_its_row_is_in_the_archive(visit: int, tmp_path: Path):
+    """Its log beside it could be that of a registered one: the tables know, and no thread of files asks them."""
+    target = tmp_path / "archive" / "P001" / "2026-01-10" / "0123-walk.mp4"
+    note_placed(tmp_path / "archive", target)
+    target.parent.mkdir(parents=True)
+    for ending in (".mp4", ".mov", ".json"):
+        target.with_suffix(ending).touch()
+    assert send(phone(visit), film(tmp_path))["state"] == "received"
+
+
+def test_a_database_that_goes_away_before_the_question_is_not_running(visit: int, faults: Faults):
     browser = phone(visit)
-
-    def gone() -> None:
-        raise OperationalError(2003, "Can't connect to MySQL server on '127.0.0.1' ([Errno 111] Connection refused)")
-
-    monkeypatch.setattr(tables_version, "refuse_newer", gone)
+    refused = "Can't connect to MySQL server on '127.0.0.1' ([Errno 111] Connection refused)"
+    faults(tables_version, "refuse_newer", OperationalError(2003, refused))
     answer = browser.get("/phone/state.json")
     assert (answer.status_code, code(answer)) == (503, "DB_NOT_RUNNING")
 
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_server_that_is_killed_at_the_end_leaves_no_parts(
-    visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: bool
+    visit: int, tmp_path: Path, killed_at_the_end: Killed, whole: bool
 ):
     """The phone, which got no answer, asks again."""
     browser, sent = phone(visit), film(tmp_path) if whole else b"no video at all" * 1000
-    with monkeypatch.context() as killed:
-        killed.setattr(phone_uploads, "discard", lambda *_: None)
+    with killed_at_the_end():
         send(browser, sent)
     assert list((tmp_path / "archive" / "_phone").rglob("0"))
     assert begin(browser, sent)["state"] == ("received" if whole else "refused")
     assert not list((tmp_path / "archive" / "_phone").rglob("*"))
 
 
-def test_no_part_takes_the_room_that_is_kept_free(visit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_no_part_takes_the_room_that_is_kept_free(visit: int, tmp_path: Path, limits: Limits):
     browser, whole = phone(visit), film(tmp_path)
     told = begin(browser, whole)
-    with monkeypatch.context() as full:
-        full.setattr(incoming, "KEPT_FREE", 10**18)
+    with limits(incoming, KEPT_FREE=10**18):
         answer = put(browser, told["number"], 0, parts_of(whole)[0], len(whole))
         assert (answer.status_code, code(answer)) == (507, "FILE_UNWRITABLE")
         to = browser_uploads.place(visit)
@@ -875,11 +892,11 @@ def test_the_size_of_a_part_is_that_of_the_page(visit: int):
     assert f'data-part="{PART_BYTES}"' in page
 
 
-def test_a_picture_is_looked_at_while_filming(visit: int, monkeypatch: pytest.MonkeyPatch):
+def test_a_picture_is_looked_at_while_filming(visit: int, stand_in: StandIn):
     """The networks have their own test; here, who is answered, and what is refused."""
     seen = []
-    stand_in = SimpleNamespace(cut_off=lambda image: seen.append(image.shape) or framing.FEET)
-    monkeypatch.setattr(framing, "Framing", lambda: stand_in)
+    looks = SimpleNamespace(cut_off=lambda image: seen.append(image.shape) or framing.FEET)
+    stand_in(Framing=lambda: looks)
     picture = cv2.imencode(".jpg", np.zeros((90, 160, 3), np.uint8))[1].tobytes()
     jpeg, path = {"content-type": "image/jpeg"}, "/phone/look.json"
     browser = phone(visit)
@@ -901,7 +918,7 @@ def test_a_picture_is_looked_at_while_filming(visit: int, monkeypatch: pytest.Mo
         tried.append(1)
         raise PblError("ASSET_MISSING", "no network", "one", "connect")
 
-    monkeypatch.setattr(framing, "Framing", absent)
+    stand_in(Framing=absent)
     browser = phone(visit)
     for _ in range(2):  # a network that cannot be fetched is not fetched at each look
         assert browser.post(path, content=picture, headers=jpeg).json() == {"cut": None}

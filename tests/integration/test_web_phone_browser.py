@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from pbl_pipeline import assets
-from pbl_pipeline.keypoints import framing
 from pbl_pipeline.keypoints.framing import Framing
 from pbl_pipeline.video import VideoInfo, probe, read_frames, read_phone_log
 from pbl_schemas import connection, video
@@ -25,12 +24,13 @@ from pbl_schemas.intake.protocols import ProtocolStep, add_protocol
 from pbl_schemas.reading.usable import Usable
 from pbl_workers import phone_uploads
 from pbl_workers.web import Options, Where, certificates, create_app, phone
-from tests import Environment
+from tests import Environment, Limits, StandIn
 from tests.integration import web
 from tests.integration.compute_target import nothing
 from tests.integration.test_web_phone import link_of
 from tests.rows import new_visit
 from tests.videos import numbered_frames
+from tests.worn_sensor import Swing
 
 PHONE = {"viewport": {"width": 390, "height": 844}, "device_scale_factor": 2, "is_mobile": True, "has_touch": True}
 #: Quaternions (w, x, y, z) of a phone upright in portrait, and turned by 10 deg about the vertical.
@@ -92,10 +92,10 @@ def with_camera(chromium: Any, path: Path, frames: Iterable[np.ndarray]) -> Iter
 
 
 @pytest.fixture
-def visit(tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> int:
+def visit(tables: None, tmp_path: Path, environment: Environment, limits: Limits) -> int:
     environment(PBL_ARCHIVE=tmp_path / "archive")
     for module in (phone_recordings, phone_uploads, phone):
-        monkeypatch.setattr(module, "PART_BYTES", 65536)
+        limits(module, PART_BYTES=65536)
     return new_visit("2026-01-10")
 
 
@@ -105,14 +105,15 @@ def filming(
     visit: int,
     orientation: bool = True,
     torn: bool = False,
+    refused: bool = False,
     denied: bool = False,
     protocol: str = "",
     tls: bool = False,
     script: str = "",
     **context: Any,
 ) -> Iterator[Any]:
-    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network. script: a
-    function that runs before those of the page."""
+    """The phone's page, opened by the link of the visit. No error of a script; `torn`: but of the network;
+    `refused`: but of answers that refuse. script: a function that runs before those of the page."""
     where, scheme = Where(), "https" if tls else "http"
     if tls:
         cert, key = certificates.server_certificate(("127.0.0.1",))
@@ -136,7 +137,7 @@ def filming(
             page.wait_for_selector("main[data-ready]")
             yield page
             # A service worker needs a certificate that the browser trusts.
-            known = ("net::ERR",) if torn else ("fetching the script",) if tls else ()
+            known = ("net::ERR",) * torn + ("status of 4",) * refused + ("fetching the script",) * tls
             assert not [e for e in errors if not any(k in e for k in known)]
         finally:
             made.close()
@@ -247,7 +248,7 @@ def test_at_1080p_hardly_a_frame_is_lost(chromium: Any, tmp_path: Path, visit: i
     assert (info.width_px, info.height_px, info.n_frames) == (1920, 1080, about["frames"])
 
 
-def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: int, monkeypatch: pytest.MonkeyPatch):
+def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: int, stand_in: StandIn):
     """The woman of the demo, whole and then without feet, in turns of 5 s: within 2 s the page says which."""
     (frame,) = read_frames(assets.fetch("demo_video"), start=110, stop=111)
     x, pictures = 915, []
@@ -257,7 +258,7 @@ def test_cut_feet_are_said_while_filming(chromium: Any, tmp_path: Path, visit: i
     looked = Framing()
     assert [looked.cut_off(p) for p in pictures] == ["", "feet"]
     turns = [p for p in pictures for _ in range(150)]
-    monkeypatch.setattr(framing, "Framing", lambda: looked)
+    stand_in(Framing=lambda: looked)
     with with_camera(chromium, tmp_path / "camera.mjpeg", turns) as browser, filming(browser, visit) as page:
         start(page)
         said = page.evaluate(CUT_WHEN)
@@ -435,6 +436,28 @@ def test_the_page_leads_through_a_protocol(camera: Any, visit: int, monkeypatch:
         assert usual.is_hidden()
     assert list((video.Video & {"session_id": visit}).to_arrays("activity", order_by="video_id")) == ["walking", "tug"]
     assert list(video.Pace().to_arrays("pace")) == ["fast"]
+
+
+def test_sensors_on_takes_their_log_after_filming(camera: Any, visit: int, tmp_path: Path):
+    shank, none = Swing().write(tmp_path / "shank.csv"), tmp_path / "none.csv"
+    none.write_text("frame,x\n1,2\n")
+    with filming(camera, visit, refused=True) as page:
+        log = page.get_by_label("Log of the sensors")
+        assert log.is_hidden()
+        page.get_by_label("Sensors on").check()
+        for file, said in ((none, "no known format"), (shank, "which segment")):
+            log.set_input_files(file)
+            page.locator(".worn li", has_text=said).wait_for()
+        page.get_by_label("Worn on").select_option("shank_r")
+        log.set_input_files(shank)
+        page.locator(".worn li", has_text="without a recording").wait_for()
+        film(page, 1.0)
+        keep(page)
+        log.set_input_files(shank)
+        page.locator(".worn li", has_text="right shank").wait_for()
+    row = video.WearableImu.fetch1()
+    assert (row["imu_name"], row["imu_segments"]) == ("shank.csv", {"shank_r": "shank"})
+    assert about_the_recording()["worn"] == "on"
 
 
 def test_films_over_tls_with_cookies_of_this_host(camera: Any, visit: int):

@@ -93,6 +93,7 @@ def test_a_visit_is_registered_with_its_person(archive: Path):
         ({"height_m": "1,720"}, "height_m", "SHEET_FORMAT"),
         ({"height_m": "9" * 500}, "height_m", "FIT_INPUT"),
         ({"population": "x" * 33}, "population", "USAGE"),
+        *(({"visit": text}, "visit", "SHEET_FORMAT") for text in ("9/3/2026", "28.11.26", "31.2.2026")),
     ],
 )
 @pytest.mark.parametrize("language", ["en", "de"])
@@ -383,7 +384,10 @@ def test_recordings_are_taken_into_the_archive_and_queued(tmp_path: Path, archiv
         assert Path(row["video_path"]).read_bytes() == sent.read_bytes()
     assert {c.pace for c in video.conditions(video.Video().proj()).values()} == {"fast"}
     assert decided().count(("recording", None, None)) == 2
-    assert "Compute now" in browser.get("/visits/1").text
+    page = browser.get("/visits/1").text
+    assert "Compute now" in page
+    assert re.search(r">walk-[0-9a-f]{8}\.mp4</a>", page)
+    assert ">registered<" not in page  # the word of the row
     assert not list(archive.rglob("browser-*"))
     # The same again is not stored twice.
     again = upload(browser, first)

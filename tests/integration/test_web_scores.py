@@ -1,6 +1,7 @@
 """Entering in the review page: the role of a visit and clinical scores, from the click to the row."""
 
 import datetime
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from pbl_schemas import study
 from pbl_schemas.cli.study import instrument
 from pbl_schemas.review import Decision
 from pbl_schemas.studies.visit_forms import enter_scores, scores_form
+from tests import Environment
 from tests.integration import web
 from tests.rows import everything, new_visit
 
@@ -99,12 +101,13 @@ def test_a_role_that_does_not_fit_the_days_is_refused(two_visits: None):
 
 
 @pytest.fixture
-def tokyo(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def tokyo(environment: Environment) -> Iterator[str]:
     """The clock of a machine in Tokyo; what it shows now, to the hour."""
-    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    before = os.environ.get("TZ")
+    environment(TZ="Asia/Tokyo")
     time.tzset()
     yield f"{datetime.datetime.now():%Y-%m-%d %H:}"
-    monkeypatch.undo()
+    environment(TZ=before)
     time.tzset()
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from pbl_pipeline.errors import PblError
 from pbl_schemas import fit, gdi, intake, load_visit, qc, study, tracking, video
+from pbl_schemas.connection import dj
 from pbl_schemas.decisions import not_usable, review_decisions
 from pbl_schemas.intake import LaboratoryMarkers, SeveralCameras, VisitRecord
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.plan import plan_fit_sets
 from pbl_schemas.reading import registered, visit_list
 from pbl_schemas.reading.shown import shown_visit
@@ -16,10 +18,12 @@ from pbl_schemas.reading.visit_list import Filter, visit_page
 from pbl_schemas.reading.why import why
 from pbl_schemas.review import Decision
 from pbl_schemas.studies import slices
+from pbl_schemas.transactions import after_commit, in_transaction
 from pbl_workers.populate import populate
+from tests import StandIn
 from tests.command import pbl
 from tests.integration import decide_target, test_markers, test_rigs, web
-from tests.integration.chain import StandIn, computed_once, small_video
+from tests.integration.chain import computed_once, small_video
 from tests.rows import everything_but_refreshes, register
 
 
@@ -92,6 +96,27 @@ def test_a_marked_recording_leaves_its_visit_and_comes_back(visit: tuple[int, in
         {"usable": "yes"},
         {"usable": "no", "why": "interrupted"},
     ]
+
+
+def test_a_decision_queues_what_it_made_computable(visit: tuple[int, int]):
+    review_decisions.mark_not_usable(2, "too_dark")
+    (planned,) = fit.current().keys()
+    assert jobs_of(fit.SessionFit).pending.proj().to_dicts() == [dict(planned)]
+
+
+def test_what_waits_for_a_commit_is_forgotten_with_the_transaction(tables: None):
+    called: list[str] = []
+
+    def broken() -> None:
+        after_commit(lambda: called.append("never"))
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        in_transaction(broken)
+    in_transaction(lambda: after_commit(lambda: called.append(str(dj.conn().in_transaction))))
+    assert called == ["False"]
+    after_commit(lambda: called.append("immediately"))
+    assert called[1:] == ["immediately"]
 
 
 def test_a_visit_without_a_usable_recording_has_no_set(visit: tuple[int, int]):
@@ -204,6 +229,8 @@ def test_the_command(visit: tuple[int, int]):
     assert len(video.NotUsable()) == 0
     assert len(Decision()) == 2
     assert pbl("choose", 1, "--not-usable", "other").error_code == "USAGE"
+    assert pbl("choose", 1, "--not-usable", "other", "--note", "x" * 501).error_code == "USAGE"  # not cut
+    assert len(Decision()) == 2
     assert pbl("choose", 99, "--not-usable", "helped").error_code == "DB_NOT_FOUND"
     assert pbl("choose", 1, 2, "--usable").code == pbl("choose", 1, "--note", "x").code == 2
     with pytest.raises(PblError, match="no video_id 99"):

@@ -23,23 +23,24 @@ from click.testing import CliRunner
 import pbl_pipeline.fit
 import pbl_pipeline.video
 import pbl_schemas
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.fit import METHODS
 from pbl_schemas import connection, fit, gait, gdi, keypoints, lab, qc, tracking, video, worker
 from pbl_schemas.chain import ON_REQUEST
 from pbl_schemas.cli.why import why as why_command
+from pbl_schemas.jobs import jobs_of
 from pbl_schemas.operations import embedded
 from pbl_schemas.reading.status import live_workers, pipeline_status
 from pbl_schemas.reading.why import why
 from pbl_schemas.rows import utc_now
-from pbl_workers import queue, recover, refresh, registry, requeue, run_job
+from pbl_workers import heartbeat, loop, queue, recover, refresh, registry, requeue, run_job, supervisor
 from pbl_workers.heartbeat import Heartbeat, Silent
 from pbl_workers.loop import LEAVE_S, Worker, takes
 from pbl_workers.process import Options
 from pbl_workers.recover import CRASHES
 from pbl_workers.supervisor import BATCH_NICE, Supervisor
 from research.benchmarks import worker_replay
-from tests import until
+from tests import Faults, Limits, until
 from tests.rows import register
 
 from . import chain, worker_target
@@ -51,10 +52,10 @@ def videos(folder: Path, *names: str) -> list[Path]:
 
 
 # ------------------------------------------------------------------------------------------------------ the whole chain
-def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: None, tmp_path: Path, monkeypatch):
+def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: None, tmp_path: Path, limits: Limits):
     register(*videos(tmp_path, "walk1", "walk2"), session_label="1")
     register(*videos(tmp_path, "walk3"), session_label="2")
-    monkeypatch.setattr("pbl_workers.loop.REFRESH_EVERY_S", 1e9)  # one look at all tables, at the beginning
+    limits(loop, REFRESH_EVERY_S=1e9)  # one look at all tables, at the beginning
     done = work()
     expected = {t.__name__: 3 for t in pbl_schemas.computed_tables()}
     of_visits = ("SessionFit", "SessionGdi", "SessionQc", "Kinetics")
@@ -69,7 +70,7 @@ def test_what_follows_a_job_is_queued_at_once_and_nothing_is_forgotten(tables: N
     assert set(qc.SessionQc.Check.to_arrays("qc_stage")) >= {"keypoints", "fit", "gait", "gdi"}
 
 
-def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkeypatch, stand_in):
+def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, stand_in, limits: Limits):
     batches = []
 
     def fit_sessions(sessions, paramset=None, **_):
@@ -79,7 +80,7 @@ def test_fits_in_batches_are_the_fits_alone(tables: None, tmp_path: Path, monkey
     stand_in(fit_sessions=fit_sessions)
     for i in range(5):
         register(*videos(tmp_path, f"walk{i}"), session_label=str(i))
-    monkeypatch.setattr("pbl_workers.loop.REFRESH_EVERY_S", 1e9)
+    limits(loop, REFRESH_EVERY_S=1e9)
     work(*(t for t in pbl_schemas.computed_tables() if t is not fit.SessionFit))
     assert jobs_left() == {"SessionFit": {"pending": 5}}
     work(batch=2)
@@ -228,9 +229,9 @@ def run_until(boss: Supervisor, done: Callable[[], None]) -> int:
 
 
 @pytest.fixture
-def of_lengths(tables: None, tmp_path: Path, monkeypatch) -> dict[str, int]:
+def of_lengths(tables: None, tmp_path: Path, limits: Limits) -> dict[str, int]:
     """Recordings by name, the long ones first; all wait to be read."""
-    monkeypatch.setattr(queue, "LONG_FRAMES", chain.N_FRAMES)
+    limits(queue, LONG_FRAMES=chain.N_FRAMES)
     hours = [chain.small_video(tmp_path, name, chain.N_FRAMES + 1) for name in ("hour", "hour_filmed")]
     ids = register(*hours, *videos(tmp_path, "walk", "again", "filmed"))
     named: dict[str, int] = dict(zip(("hour", "hour_filmed", "walk", "again", "filmed"), ids, strict=True))
@@ -311,10 +312,10 @@ def test_one_process_takes_recordings_of_phones_alone_and_the_others_leave_them_
 
 @pytest.mark.parametrize("when", ["while it is computed", "before its insert", "after its insert"])
 def test_the_result_survives_a_database_that_goes_away(
-    tables: None, tmp_path: Path, monkeypatch, stand_in, database: Path, when: str
+    tables: None, tmp_path: Path, stand_in, database: Path, when: str, limits: Limits, faults: Faults
 ):
     job = first_job(tmp_path)
-    real, insert, computed, inserted, ends = pbl_pipeline.video.probe, video.VideoInfo.make_insert, [], [], [when]
+    ends = [when]
     server = embedded.Folder(database / "db")
 
     def reached(moment: str) -> None:
@@ -323,20 +324,14 @@ def test_the_result_survives_a_database_that_goes_away(
             os.kill(server.state()["pid"], signal.SIGKILL)
             threading.Timer(1.5, lambda: embedded.start(folder=server)).start()
 
-    def probe(path):
-        computed.append(path)
-        reached("while it is computed")
-        return real(path)
-
-    def make_insert(self, *args):
-        inserted.append(args)
-        reached("before its insert")
-        insert(self, *args)
-        reached("after its insert")
-
-    stand_in(probe=probe)
-    monkeypatch.setattr(video.VideoInfo, "make_insert", make_insert)
-    monkeypatch.setattr(run_job, "DATABASE_PAUSE_S", 0.2)
+    computed = faults(pbl_pipeline.video, "probe", before=lambda _: reached("while it is computed"))
+    inserted = faults(
+        video.VideoInfo,
+        "make_insert",
+        before=lambda *_: reached("before its insert"),
+        then=lambda *_: reached("after its insert"),
+    )
+    limits(run_job, DATABASE_PAUSE_S=0.2)
     outcome = run_job.run(job)
     assert outcome.what == run_job.DONE
     assert outcome.seconds > 1.0
@@ -345,16 +340,10 @@ def test_the_result_survives_a_database_that_goes_away(
     assert (len(video.VideoInfo()), jobs_left()) == (1, {})
 
 
-def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Path, monkeypatch):
+def test_inputs_that_changed_meanwhile_are_read_again(tables: None, tmp_path: Path, faults: Faults):
     job = first_job(tmp_path)
-    real = pbl_pipeline.video.probe
-
-    def probe(path):
-        video.Video.update1({**job.key, "video_path": str(tmp_path / "elsewhere.mp4")})
-        return real(path)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pbl_pipeline.video, "probe", probe)
+    moves = {**job.key, "video_path": str(tmp_path / "elsewhere.mp4")}
+    with faults(pbl_pipeline.video, "probe", before=lambda _: video.Video.update1(moves)):
         assert run_job.run(job).what == run_job.LATER
     assert jobs_left() == {"VideoInfo": {"pending": 1}}
     assert len(video.VideoInfo()) == 0
@@ -370,7 +359,7 @@ def test_a_result_of_other_inputs_is_not_used(tables: None, tmp_path: Path):
 # ----------------------------------------------------------------------------------------------- processes that go away
 @pytest.mark.parametrize("table", [tracking.SubjectChoice, fit.SessionFit])
 def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(
-    tables, tmp_path: Path, monkeypatch, stand_in, table
+    tables, tmp_path: Path, stand_in, table, faults: Faults
 ):
     """The job in hand and those that were taken with it, one after the other or in batches."""
     for i in range(3):
@@ -381,9 +370,8 @@ def test_a_worker_that_is_told_to_end_at_once_puts_back_all_it_holds(
 
     def ends(*_: object) -> None:
         assert len(table.jobs.reserved) == 3
-        raise SystemExit(0)
 
-    monkeypatch.setattr(table, "make_insert", ends)
+    faults(table, "make_insert", SystemExit(0), before=ends)
     with pytest.raises(SystemExit):
         Worker([table], Silent(), batch=3).run()
     assert jobs_left()[table.__name__] == {"pending": 3}
@@ -401,8 +389,8 @@ def supervise(**options) -> int:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pbl_workers.supervisor.RESTART_S", (0.05, 0.1))
+def quick(limits: Limits) -> None:
+    limits(supervisor, RESTART_S=(0.05, 0.1))
 
 
 def test_a_job_that_kills_its_process_becomes_an_error_and_the_others_are_done(tables, tmp_path: Path, quick: None):
@@ -509,8 +497,8 @@ def test_jobs_of_dead_workers_elsewhere_are_freed(tables: None, tmp_path: Path):
     assert recover.free_dead(video.VideoInfo) == 1
 
 
-def test_the_heartbeat_says_what_is_done(tables: None, monkeypatch):
-    monkeypatch.setattr("pbl_workers.heartbeat.PERIOD_S", 0.05)
+def test_the_heartbeat_says_what_is_done(tables: None, limits: Limits):
+    limits(heartbeat, PERIOD_S=0.05)
     with Heartbeat("cpu") as beats:
         beats.doing("VideoInfo video_id=3")
         beats.count("VideoInfo", 2, 1, 0.5)
@@ -553,7 +541,7 @@ def test_why_says_where_a_video_stands(tables: None, tmp_path: Path):
         why(999)
 
 
-def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, monkeypatch):
+def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, limits: Limits):
     (tmp_path / "bad.mp4").write_text("not a video")
     register(*videos(tmp_path, "walk"), tmp_path / "bad.mp4", session_label="1")
     register(chain.small_video(tmp_path, "two", people="two alike"), session_label="2")
@@ -566,7 +554,7 @@ def test_few_and_many_videos_are_counted_alike(tables: None, tmp_path: Path, mon
     found = {t.table: (t.empty, t.waiting) for t in few.tables if t.empty or t.waiting}
     assert found == {"SubjectChoice": (1, 1), "Kinetics": (1, 0)}
     assert few.cameras == {"guess": done["Keypoints"]}
-    monkeypatch.setattr("pbl_schemas.reading.status.SMALL", 0)  # through connections side by side
+    limits("pbl_schemas.reading.status", SMALL=0)  # through connections side by side
     many = pipeline_status(exact=False)
     assert [(t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in many.tables] == [
         (t.table, t.done, t.empty, t.pending, t.error, t.waiting) for t in few.tables
@@ -590,6 +578,16 @@ def test_errors_are_tried_again_by_code_table_and_video(tables: None, tmp_path: 
         requeue.retry(table="Tables")
 
 
+def test_the_cause_of_a_code_decides_what_is_tried_again_every_night(tables: None):
+    own = {"status": "error", "priority": 5}
+    failed = [{"video_id": i, "error_message": f"{code}: why", **own} for i, code in enumerate(CODES)]
+    jobs_of(video.VideoInfo).insert(failed)
+    again = {code for code, one in CODES.items() if one.cause == MACHINE} - {"INTERNAL", "TIME_LIMIT"}
+    assert {"FILE_UNWRITABLE", "STORE_FULL", "PACKAGE_MISSING", "WORKER_CRASH"} < again
+    assert requeue.retry_outside() == dict.fromkeys(again, 1)
+    assert len(video.VideoInfo.jobs.pending) == len(again)
+
+
 def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: Path):
     register(*videos(tmp_path, "walk1", "walk2"))
     work()
@@ -598,7 +596,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
         for t in (video.VideoInfo, tracking.Tracking, fit.SessionFit, gait.GaitEvents)
     }
     plan = requeue.plan_new_method("SessionFit", "paper-2025")
-    assert (len(plan.add), plan.outdated) == (1, [])
+    assert (len(plan.add), len(plan.outdated)) == (1, 0)
     list(requeue.carry_out(plan))
     pending = {t: c["pending"] for t, c in jobs_left().items()}
     assert pending == {"TrialInput": 2}  # nothing above the fit
@@ -613,7 +611,7 @@ def test_a_new_method_adds_rows_and_touches_no_old_one(tables: None, tmp_path: P
     assert [r["fit_computed"] for r in (fit.SessionFit & key).to_dicts(order_by="KEY")] == [
         r["fit_computed"] for r in before["SessionFit"]
     ]
-    assert requeue.plan_new_method("SessionFit", "paper-2025").add == []
+    assert not requeue.plan_new_method("SessionFit", "paper-2025").add
     assert METHODS["paper-2025"].name == "paper-2025"
     with pytest.raises(PblError, match="USAGE"):
         requeue.plan_new_method("VideoInfo", "paper-2025")
@@ -623,7 +621,7 @@ def test_results_are_computed_again_behind_new_work(tables: None, tmp_path: Path
     register(*videos(tmp_path, "walk1"), session_label="1")
     work()
     plan = requeue.plan_again("GaitEvents", before=datetime.datetime(2000, 1, 1))
-    assert plan.outdated == []
+    assert not plan.outdated
     plan = requeue.plan_again("GaitEvents", since=datetime.datetime(2000, 1, 1))
     assert len(plan.outdated) == 1
     assert any("gait_cycle" in name for name in plan.below)

@@ -17,7 +17,7 @@ import pytest
 
 from pbl_pipeline import assets, npm_by_pip, packages
 from pbl_pipeline.packages import NpmPackage, Wheel
-from tests import refused
+from tests import Limits, refused
 
 CONTENT = {"carrier/models/one.bin": b"one" * 5000, "carrier/demo/two.txt": b"two\n"}
 NAME = "carrier-1.0-py3-none-any.whl"
@@ -44,7 +44,7 @@ class Index:
 
 
 @pytest.fixture
-def index(tmp_path, monkeypatch, environment) -> Index:
+def index(tmp_path, monkeypatch, environment, limits: Limits) -> Index:
     path = tmp_path / "made.whl"
     with zipfile.ZipFile(path, "w") as archive:
         for member, data in {**CONTENT, "carrier/__init__.py": b"raise SystemExit('never run')"}.items():
@@ -57,7 +57,7 @@ def index(tmp_path, monkeypatch, environment) -> Index:
         )
         for name, member in zip(("one", "two"), CONTENT, strict=True)
     }
-    monkeypatch.setattr(assets, "ASSETS", pinned)
+    limits(assets, ASSETS=pinned)
     environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE=None)
     served = Index(made)
     monkeypatch.setattr(assets.subprocess, "run", served.run)
@@ -95,9 +95,9 @@ def test_a_wheel_with_other_bytes_is_refused(index):
     assert names_in_folder() == set()
 
 
-def test_a_member_with_other_bytes_is_refused(index, monkeypatch):
+def test_a_member_with_other_bytes_is_refused(index, limits):
     asset = dataclasses.replace(assets.ASSETS["one"], sha256="0" * 64)
-    monkeypatch.setitem(assets.ASSETS, "one", asset)
+    limits(assets, ASSETS={**assets.ASSETS, "one": asset})
     refused("ASSET_CHECKSUM", assets.fetch, "one")
     assert not asset.path.exists()
 
@@ -175,26 +175,38 @@ def test_a_cache_that_cannot_be_written(index, environment, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX")
-def test_two_at_once_fetch_once(index, monkeypatch):
+def test_two_at_once_fetch_once(index, faults):
     """The second waits for the first and finds the file there."""
     entered, go_on = threading.Event(), threading.Event()
-    run = index.run
 
-    def slow(command: list[str], **kwargs: object):
+    def slow(*_: object, **__: object) -> None:
         entered.set()
-        assert go_on.wait(10)
-        return run(command, **kwargs)
+        assert go_on.wait(60)
 
-    monkeypatch.setattr(assets.subprocess, "run", slow)
+    faults(assets.subprocess, "run", before=slow)
     threads = [threading.Thread(target=assets.fetch, args=("one",)) for _ in range(3)]
     for thread in threads:
         thread.start()
-    assert entered.wait(10)
+    assert entered.wait(60)
     go_on.set()
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
     assert index.calls == 1
     assert assets.status()["one"] == "ok"
+
+
+def test_files_that_go_while_they_are_counted_end_no_thread(tmp_path, monkeypatch):
+    looked, ended = threading.Event(), []
+
+    def gone(*_):
+        looked.set()
+        raise FileNotFoundError("pip removed it")
+
+    monkeypatch.setattr(Path, "rglob", gone)
+    monkeypatch.setattr(threading, "excepthook", ended.append)
+    with assets._watch(tmp_path, "models", 10**6):
+        assert looked.wait(60)
+    assert ended == []
 
 
 def test_leftovers_of_a_killed_process_are_removed(index):
@@ -238,7 +250,7 @@ def test_pip_is_asked_for_one_wheel_and_no_index():
 
 
 @pytest.fixture
-def npm(tmp_path, monkeypatch, environment) -> Index:
+def npm(tmp_path, monkeypatch, environment, limits: Limits) -> Index:
     """A registry that serves one tarball, and a machine with npm."""
     data, file = b"heavy" * 999, "carrier-1.0.tgz"
     with tarfile.open(tmp_path / file, "w:gz") as archive:
@@ -250,7 +262,7 @@ def npm(tmp_path, monkeypatch, environment) -> Index:
     asset = assets.Asset(
         "heavy", "asset", package, "package/heavy.bin", sha256(data), len(data), "MIT", "here", True, "own-name.bin"
     )
-    monkeypatch.setattr(assets, "ASSETS", {"heavy": asset})
+    limits(assets, ASSETS={"heavy": asset})
     environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE=None)
     monkeypatch.setattr(packages.shutil, "which", lambda name: f"/usr/bin/{name}")
     served = Index(made)

@@ -199,6 +199,17 @@ def test_the_parts_say_which_table_takes_the_time():
     assert "0.278 a second, 7.2 s of processor time each" in lines[0]
 
 
+def test_the_profile_adds_stages_and_kinds_of_all_processes():
+    rows = [("Tracking", "networks", 20.0), ("Tracking", "crops", 4.0), ("Kinetics", "forces", 5.0)] * 2
+    lines = text(dataclasses.replace(FOUND, profile=rows), 16, 8.0, 1).split("\n\n")[2].splitlines()
+    assert [line.split() for line in (lines[0], *lines[2:])] == [
+        ["s", "a", "recording", "networks", "forces", "crops", "all"],
+        ["Tracking", "4.00", "0.80", "4.80"],
+        ["Kinetics", "1.00", "1.00"],
+        ["all", "4.00", "1.00", "0.80", "5.80"],
+    ]
+
+
 def test_without_a_gpu_there_are_no_gpu_hours():
     assert costs(dataclasses.replace(FOUND, gpus=0))[0][3] == "-"
 

@@ -1,5 +1,6 @@
 """Small files that ask for much: refused with a code, within the memory that is stated."""
 
+import errno
 import gzip
 import io
 import json
@@ -282,6 +283,48 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path):
     refused("CAMERA_INVALID", load_camera, tmp_path / "a.json", (100, 100))
     refused("FILE_FORMAT", load_events, tmp_path / "a.csv")
     refused("FILE_MISSING", read_phone_log, tmp_path / "a.csv")
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="a regular file that cannot be read, of Linux")
+def test_a_disk_that_fails_is_no_fault_of_a_file(tmp_path: Path):
+    """Nothing at the first address: reading it is an error of input and output (EIO)."""
+    for name in ("a.json", "a.zip", "k.npz", "a.trc", "a.csv", "a.xml"):
+        (tmp_path / name).symlink_to("/proc/self/mem")
+    for read, name in (
+        *((read, "a.json") for _, read in every_json_reader(tmp_path / "a.json")),
+        *((read_phone_log, name) for name in ("a.zip", "a.csv")),
+        (Keypoints.load, "k.npz"),
+        (load_events, "a.csv"),
+        (load_marker_set, "a.xml"),
+        (read_trc, "a.trc"),
+    ):
+        arguments = () if name == "a.json" else (tmp_path / name,)
+        with pytest.raises(PblError) as caught:
+            read(*arguments)
+        assert (caught.value.code, caught.value.final) == ("FILE_MISSING", False), name
+
+
+@pytest.mark.parametrize("kind", ["archive", "directory"])
+def test_a_disk_that_fails_within_an_archive_is_no_fault_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+):
+    path = zeros(tmp_path / "log.zip", "Orientation.csv", 2)
+    read, n_read = io.BufferedReader.read, 0
+
+    def fails(file: io.BufferedReader, *n: int) -> bytes:
+        nonlocal n_read
+        n_read += 1
+        if n_read > (3 if kind == "archive" else 0):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return read(file, *n)
+
+    class Failing(io.BufferedReader):
+        read = fails
+
+    monkeypatch.setattr(bounded, "open", lambda p, *_, **__: Failing(io.FileIO(p)), raising=False)
+    with pytest.raises(PblError) as caught:
+        read_phone_log(path)
+    assert (caught.value.code, n_read > 0) == ("FILE_MISSING", True)
 
 
 def test_a_file_that_grows_while_it_is_read(tmp_path: Path):

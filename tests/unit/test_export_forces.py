@@ -92,8 +92,8 @@ def test_without_mass_or_forces_nothing_is_written(visit: Visit, tmp_path: Path)
 
 
 @pytest.mark.needs_extra
-def test_opensim_finds_the_same_moments(visit: Visit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # OpenSim writes a log where it starts
+@pytest.mark.usefixtures("in_empty_folder")  # OpenSim writes a log where it starts
+def test_opensim_finds_the_same_moments(visit: Visit, tmp_path: Path) -> None:
     opensim: Any = pytest.importorskip("opensim")
     walk = dataclasses.replace(visit.recordings[0], markers=_one_marker())
     write_export(dataclasses.replace(visit, recordings=(walk,)), ["osim", "mot", "forces"], tmp_path, _BARE)

@@ -8,7 +8,8 @@ import dataclasses
 import operator
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +27,6 @@ from pbl_pipeline.fit import (
     fit_sessions,
     lanes,
     many_sessions,
-    per_frame,
-    problem,
     session_fit,
 )
 from pbl_pipeline.fit.initial_pose import placed_poses
@@ -41,6 +40,7 @@ from pbl_pipeline.synthetic import CORRELATED_NOISE, Noise, Seen, SynthSpec, syn
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import person, walk_qpos
+from tests import compiled
 
 PARAMSET = METHODS["gauss-newton"]
 pytestmark = pytest.mark.slow
@@ -54,9 +54,14 @@ UNSOLVED = PblError("FIT_DIVERGED", found="-", expected="-", next_step="-")
 @pytest.fixture(scope="module", autouse=True)
 def one_size() -> Iterator[None]:
     """One trial is packed like two."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(problem, "pad_trials", lambda n, coarse=False: max(2, 1 << (n - 1).bit_length()))
+    with compiled.packed_in(least_trials=2):
         yield
+
+
+def solved_by(function: Callable[..., Any]) -> Method[Any]:
+    """The method with another function, as a laboratory adds one (docs/extending.md)."""
+    method = METHODS.find(PARAMSET)
+    return dataclasses.replace(method, family=dataclasses.replace(method.family, function=function))
 
 
 def changed(**changes) -> Paramset:
@@ -299,19 +304,15 @@ def assert_same(a: SessionFit, b: SessionFit) -> None:
         assert check.value is None or check.value == pytest.approx(other.value, rel=1e-2)
 
 
-def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monkeypatch):
+def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, limits):
     """Five people and one whose points no one saw, packed with more frames, markers and trials than needed, in three
     lanes: who ended makes room, the last ones move to a program of two, the last of all has an empty lane beside it."""
     trial = walkers[0].trials[0]
     assert isinstance(trial, Keypoints)
     bad = SessionInput([dataclasses.replace(trial, confidence=np.zeros_like(trial.confidence))], ["bad"])
-    monkeypatch.setattr(problem, "pad_frames", lambda n, coarse=False: 192)
-    monkeypatch.setattr(problem, "pad_markers", lambda n: 128)
-    monkeypatch.setattr(problem, "pad_trials", lambda n, coarse=False: 4)
-    monkeypatch.setattr(lanes, "MOST_FRAMES", 3 * 192)
-    monkeypatch.setattr(lanes, "FEW", 2)
-    monkeypatch.setattr(lanes, "MOVED", 2)
-    together = fit_sessions([walkers[0], bad, *walkers[1:], *walkers[:2]], PARAMSET, batch=5)
+    limits(lanes, MOST_FRAMES=3 * 192, FEW=2, MOVED=2)
+    with compiled.packed_in(frames=192, markers=128, trials=4):
+        together = fit_sessions([walkers[0], bad, *walkers[1:], *walkers[:2]], PARAMSET, batch=5)
     error = together.pop(1)
     assert isinstance(error, PblError)
     assert error.code == "FIT_INPUT"
@@ -320,7 +321,7 @@ def test_neither_company_nor_padding_changes_a_result(walkers, one_by_one, monke
         assert_same(alone, fit)
 
 
-def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch):
+def test_sessions_with_other_terms_are_not_solved_together(walkers):
     """One without 3D points has arrays of the same sizes, and must not decide for the others what counts."""
     trial = walkers[0].trials[0]
     pixels = SessionInput([dataclasses.replace(trial, xyz_cam_m=np.full_like(trial.xyz_cam_m, np.nan))], ["pixels"])
@@ -330,12 +331,11 @@ def test_sessions_with_other_terms_are_not_solved_together(walkers, monkeypatch)
         asked.append([session.names[0] for session, _ in zip(sessions, starts, strict=True)])
         return [UNSOLVED] * len(asked[-1])
 
-    monkeypatch.setattr(Method, "function", property(lambda _: refuse))
-    assert fit_sessions([pixels, *walkers], PARAMSET, batch=8) == [UNSOLVED] * 4
+    assert fit_sessions([pixels, *walkers], solved_by(refuse), batch=8) == [UNSOLVED] * 4
     assert sorted(asked) == sorted([["pixels"], [w.names[0] for w in walkers]])
 
 
-def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, monkeypatch):
+def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, monkeypatch, limits):
     made, asked = threading.Event(), list[int]()
 
     def solve(sessions, params, starts) -> Iterator[None]:
@@ -351,14 +351,13 @@ def test_results_are_made_and_others_packed_while_a_solver_is_at_work(walkers, m
         made.set()
         return UNSOLVED
 
-    monkeypatch.setattr(Method, "function", property(lambda _: solve))
     monkeypatch.setattr(session_fit, "_session_fit", result)
-    monkeypatch.setattr(many_sessions, "FIRST", 1)
-    assert fit_sessions([walkers[0]] * 8, PARAMSET, batch=8) == [UNSOLVED] * 8
+    limits(many_sessions, FIRST=1)
+    assert fit_sessions([walkers[0]] * 8, solved_by(solve), batch=8) == [UNSOLVED] * 8
     assert asked == [8]
 
 
-def test_two_solvers_share_the_sessions_of_a_gpu(walkers, monkeypatch):
+def test_two_solvers_share_the_sessions_of_a_gpu(walkers, monkeypatch, limits):
     """No session is lost or taken twice."""
     taken = list[int]()
 
@@ -370,20 +369,16 @@ def test_two_solvers_share_the_sessions_of_a_gpu(walkers, monkeypatch):
             yield UNSOLVED
 
     monkeypatch.setattr(session_fit.jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(Method, "function", property(lambda _: solve))
-    monkeypatch.setattr(many_sessions, "FIRST", 4)
+    limits(many_sessions, FIRST=4)
     given = [dataclasses.replace(walkers[0], names=[str(i)]) for i in range(30)]
-    assert fit_sessions(given, PARAMSET) == [UNSOLVED] * 30
+    assert fit_sessions(given, solved_by(solve)) == [UNSOLVED] * 30
     assert sorted(taken) == list(range(30))
 
 
-def test_a_solver_that_forgets_a_session_is_an_error(walkers, monkeypatch):
-    monkeypatch.setattr(Method, "function", property(lambda _: lambda sessions, *_: list(sessions)[1:]))
-    with pytest.raises(ValueError, match="a solution or an error for each"):
-        fit_sessions(walkers, PARAMSET, batch=3)
-    monkeypatch.setattr(Method, "function", property(lambda _: lambda sessions, *_: [*list(sessions), UNSOLVED]))
-    with pytest.raises(ValueError, match="a solution or an error for each"):
-        fit_sessions(walkers, PARAMSET, batch=3)
+def test_a_solver_that_forgets_a_session_is_an_error(walkers):
+    for solver in (lambda sessions, *_: list(sessions)[1:], lambda sessions, *_: [*list(sessions), UNSOLVED]):
+        with pytest.raises(ValueError, match="a solution or an error for each"):
+            fit_sessions(walkers, solved_by(solver), batch=3)
 
 
 # --- robustness ---
@@ -435,8 +430,8 @@ def test_a_second_without_sight_stays_unknown():
     assert np.median(trial.qpos_sd[edge] / trial.qpos_sd[inside]) > 1.1
 
 
-def test_a_start_that_faces_the_other_way_ends_the_right_way(one_by_one, monkeypatch):
-    monkeypatch.setattr(per_frame, "placed_poses", lambda session, i, flip=False: placed_poses(session, i, not flip))
+def test_a_start_that_faces_the_other_way_ends_the_right_way(one_by_one, stand_in):
+    stand_in(placed_poses=lambda session, i, flip=False: placed_poses(session, i, not flip))
     fit = fit_session([look(5).keypoints], ["a"], PARAMSET)
     assert_near(fit.trials[0], walk(5), deg=2.8, m=0.025)
     e = fit.trials[0].qpos - one_by_one[0].trials[0].qpos
@@ -460,7 +455,7 @@ def test_arms_that_do_not_hang_start_in_the_posture_nearest_to_their_points():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_start_far_off_reaches_the_same_fit_or_says_that_it_did_not(one_by_one, monkeypatch, seed):
+def test_a_start_far_off_reaches_the_same_fit_or_says_that_it_did_not(one_by_one, seed, stand_in):
     """Joints off by 60 deg in every frame: many steps are refused on the way, and none of them is an end."""
 
     def far(session, trial: int, flip: bool = False) -> np.ndarray:
@@ -468,7 +463,7 @@ def test_a_start_far_off_reaches_the_same_fit_or_says_that_it_did_not(one_by_one
         qpos[:, 3:] += np.random.default_rng(seed).normal(0, 1.0, 37)
         return qpos
 
-    monkeypatch.setattr(per_frame, "placed_poses", far)
+    stand_in(placed_poses=far)
     fit = fit_session([look(5).keypoints], ["a"], PARAMSET)
     best = one_by_one[0].loss_trace[-1, 1]
     assert fit.converged == (fit.loss_trace[-1, 1] < 1.01 * best)

@@ -11,10 +11,10 @@ import av
 import numpy as np
 import pytest
 
-from pbl_pipeline.models import gpu_address, nvdec
+from pbl_pipeline.models import nvdec
 from pbl_pipeline.models.gpu_server import Server
-from pbl_pipeline.video import decode, frames_kept, gpu_decoding, kept, probe, read_frames, release_frames
-from tests import Environment, refused
+from pbl_pipeline.video import decode, frames_kept, gpu_decoding, probe, read_frames, release_frames
+from tests import Environment, Machine, StandIn, refused
 from tests.videos import constant_rate, noise_frames, write_video
 
 
@@ -53,13 +53,12 @@ class FFmpegDecoder:
 
 
 @pytest.fixture
-def decoder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[FFmpegDecoder]:
+def decoder(tmp_path: Path, machine: Machine) -> Iterator[FFmpegDecoder]:
     found = FFmpegDecoder()
     address = str(tmp_path / "gpu.sock")
     found.server = Server(address, any_device=True, idle_s=float("inf"), decoder=cast(nvdec.Nvdec, found))
     threading.Thread(target=found.server.run, daemon=True).start()
-    monkeypatch.setattr(gpu_address, "running_server", lambda what: address)
-    monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
+    machine(gpu=address)
     yield found
     gpu_decoding.release()
     found.server.close()
@@ -151,7 +150,7 @@ def unusual(folder: Path, kind: str) -> Path:
     ],
 )
 def test_ffmpeg_decodes_all_else(
-    monkeypatch: pytest.MonkeyPatch, decoder: FFmpegDecoder, tmp_path: Path, kind: str
+    monkeypatch: pytest.MonkeyPatch, decoder: FFmpegDecoder, tmp_path: Path, kind: str, stand_in: StandIn
 ) -> None:
     path = unusual(tmp_path, kind)
     expected = pictures(path)
@@ -159,7 +158,7 @@ def test_ffmpeg_decodes_all_else(
     if kind == "more than announced":
         monkeypatch.setattr(decode.Decoder, "n_announced", property(lambda _: 11))
     if kind == "no room":
-        monkeypatch.setattr(kept, "share_of_memory", lambda: 8e4)
+        stand_in(share_of_memory=lambda: 8e4)
     with frames_kept():
         assert probe(path).n_frames == 12
         assert pictures(path) == expected

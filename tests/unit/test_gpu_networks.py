@@ -25,7 +25,7 @@ from pbl_pipeline.models.tflite_jax import read_model
 from pbl_pipeline.video import read_frames
 from research.benchmarks.many_videos import differences
 from research.clip_keypoints import clip_keypoints
-from tests import Environment, refused
+from tests import Environment, Machine, refused
 from tests.videos import write_video
 
 LANDMARKS, MAPS = (195, 117, 1), 64 * 64 * 39
@@ -117,13 +117,12 @@ def network_of(name: str) -> Network:
 
 
 @pytest.fixture
-def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(tmp_path: Path, machine: Machine) -> Iterator[Server]:
     """A server on the CPU, found as that of a GPU is."""
     address = str(tmp_path / "gpu.sock")
     server = Server(address, any_device=True, idle_s=float("inf"), batch=4)
     threading.Thread(target=server.run, daemon=True).start()
-    monkeypatch.setattr(gpu_address, "gpu_visible", lambda: True)
-    monkeypatch.setattr(gpu_address, "running_server", lambda what: address)
+    machine(gpu=address)
     yield server
     server.close()
 

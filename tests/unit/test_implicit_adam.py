@@ -32,7 +32,7 @@ from research.paper_objective import PAPER_COST, objective_of
 from research.walker.observe import observe
 from research.walker.views import observe_markers, observe_views
 from research.walker.walk import walk_qpos
-from tests import not_none
+from tests import Limits, not_none
 
 pytestmark = pytest.mark.slow
 
@@ -61,10 +61,10 @@ def handheld():
 
 
 @pytest.fixture
-def few_steps_a_call(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def few_steps_a_call(limits: Limits) -> Iterator[None]:
     """The compiled loop does 5 steps instead of 250."""
     compiled: Any = implicit._run_chunk
-    monkeypatch.setattr(implicit, "CHUNK", 5)
+    limits(implicit, CHUNK=5)
     compiled.clear_cache()  # of the same sizes with other steps
     yield
     compiled.clear_cache()

@@ -21,7 +21,7 @@ from pbl_pipeline.gait import (
     score_gdi,
 )
 from pbl_pipeline.gait.measurement import load_model
-from tests import not_none
+from tests import Limits, not_none
 
 NORM, MODEL = load_norm(), load_model("blazepose-33")
 SIZE = len(MODEL.mean)
@@ -186,10 +186,10 @@ def test_names_and_order_change_nothing():
         assert again == pytest.approx(first, abs=1e-6), names
 
 
-def test_the_unshrunk_index_hears_a_person_whole(monkeypatch: pytest.MonkeyPatch):
+def test_the_unshrunk_index_hears_a_person_whole(limits: Limits):
     """Of the true differences of people it finds all where the index finds a part, and states its error. In the world
     of the model all of the stated variance is there."""
-    monkeypatch.setattr("pbl_pipeline.gait.measurement.FOUND_VARIANCE", 1.0)
+    limits("pbl_pipeline.gait.measurement", FOUND_VARIANCE=1.0)
     rng, rows = np.random.default_rng(6), []
     for _ in range(200):
         person = Person(rng)

@@ -26,7 +26,7 @@ from pbl_pipeline.keypoints import (
 )
 from pbl_pipeline.methods import Stage
 from pbl_pipeline.video import Camera, CameraPose, load_attitude, load_camera, load_camera_poses
-from tests import SHARED
+from tests import SHARED, StandIn
 from tests.command import Done, pbl
 from tests.inputs import (
     CALIBRATION,
@@ -459,7 +459,7 @@ def test_lenses_of_cameras_are_taken(distortion):
 
 
 @pytest.fixture
-def fits(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+def fits(stand_in: StandIn) -> list[dict]:
     """What `fit_session` was called with; the fit is a stand-in."""
     calls: list[dict] = []
 
@@ -467,8 +467,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
         calls.append({"trials": trials, "names": names, "paramset": paramset, "motion": camera_motion, **more})
         return chain.fit_session(trials, names, paramset)
 
-    monkeypatch.setattr("pbl_pipeline.fit.fit_session", fit)
-    monkeypatch.setattr("pbl_pipeline.pipeline.fit_session", fit)
+    stand_in(fit_session=fit)
     return calls
 
 
@@ -672,14 +671,12 @@ def test_pbl_run_wants_a_log_for_each_video(tmp_path):
 def detection(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tracking and keypoints are stand-ins; the walker is seen at 1920x1080."""
     chain.install(monkeypatch)
-    monkeypatch.setattr("pbl_pipeline.pipeline.track_people", chain.track_people)
-    monkeypatch.setattr("pbl_pipeline.pipeline.detect_keypoints", chain.detect_keypoints)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("detection")
-def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
-    monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
+def test_logs_go_with_their_videos_into_the_fit(fits, tmp_path, stand_in):
+    stand_in(check_trial=lambda *_: None)
     videos = [chain.small_video(tmp_path, name) for name in ("a", "b")]
     logs = [csv_log(tmp_path / f"{a}.csv", about(0, a), {"frame": "device"}, n=400) for a in (90, 70)]
     visit, _ = pipeline.run_visit(videos, tmp_path / "out", attitude_files=logs)
@@ -692,7 +689,7 @@ def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
     assert fits[1]["motion"] == "static"
     assert all(k.phone_time_s is None for k in fits[1]["trials"])
     logs[1].write_text("nothing")
-    monkeypatch.setattr(pipeline, "track_people", lambda *a, **k: pytest.fail("work was begun"))
+    stand_in(track_people=lambda *a, **k: pytest.fail("work was begun"))
     with pytest.raises(PblError, match=r"^PHONE_LOG: "):
         pipeline.run_visit(videos, tmp_path / "out", attitude_files=logs)
 
@@ -700,8 +697,8 @@ def test_logs_go_with_their_videos_into_the_fit(fits, monkeypatch, tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("detection")
 @pytest.mark.parametrize(("markers", "expected"), [("bml_movi_87", "gauss-newton"), ("mpi_inf_3dhp_17", "blazepose")])
-def test_a_session_is_fitted_as_its_points_want(fits, monkeypatch, tmp_path, markers, expected):
-    monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
+def test_a_session_is_fitted_as_its_points_want(fits, monkeypatch, tmp_path, markers, expected, stand_in):
+    stand_in(check_trial=lambda *_: None)
     monkeypatch.setattr(ModelKeypointParams, "points", lambda _: (markers, False))
     model = ModelParams("still", "1" * 64, "2" * 64, "MIT", 10)
     method = METHODS.make("still", 1, ModelKeypointParams(model_sha256=model.sha256, model=model))

@@ -16,7 +16,7 @@ import pytest
 from pbl_pipeline import assets, interpreter
 from pbl_pipeline.errors import CODES
 from pbl_schemas.operations.embedded import binaries, server
-from tests import refused
+from tests import Limits, refused
 from tests.command import PBL, pbl, program
 from tests.source import ROOT
 from tests.videos import constant_rate, numbered_frames, write_video
@@ -123,7 +123,7 @@ def test_make_refuses_a_full_disk(checkout):
 
 
 @pytest.fixture
-def machine(tmp_path, monkeypatch, environment) -> Path:
+def machine(tmp_path, monkeypatch, environment, in_empty_folder, limits: Limits) -> Path:
     """An empty home and cache, a MariaDB that was never started, and no program that could fetch: `calls` notes those
     that are called."""
     programs = tmp_path / "bin"
@@ -133,12 +133,11 @@ def machine(tmp_path, monkeypatch, environment) -> Path:
     pip = f'*"-m pip"*) echo "$*" >> {tmp_path / "calls"}; exit 1'  # glfw calls Python as well
     program(programs, "python", f'case "$*" in {pip};; *) exec {sys.executable} "$@";; esac\n')
     monkeypatch.setattr(sys, "executable", str(programs / "python"))
-    monkeypatch.setattr(binaries, "PLACES", ())
+    limits(binaries, PLACES=())
     monkeypatch.setattr("pbl_pipeline.jax_setup.configure", lambda: None)
     environment(PATH=f"{programs}:/bin", PBL_HOME=tmp_path / "home", PBL_CACHE=tmp_path / "cache")
     environment(PBL_OFFLINE="1", DJ_HOST=None, PBL_STORE=None)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return in_empty_folder
 
 
 def without_mariadb(machine: Path) -> None:

@@ -11,15 +11,15 @@ import pytest
 from pbl_workers.web import accounts
 from research.benchmarks import mutated_files as files
 from research.benchmarks.mutated import kinds, outcomes
-from tests import refused
+from tests import Limits, refused
 from tests.guard import guarded
 
 KINDS = {kind.name: kind for kind in kinds()}
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=[pytest.mark.slow] * (k == "board.mp4")) for k in KINDS])
-def test_mutated_files_have_a_result_or_a_code(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(accounts, "LOG_N", 4)  # a hash that costs little
+def test_mutated_files_have_a_result_or_a_code(tmp_path: Path, name: str, limits: Limits):
+    limits(accounts, LOG_N=4)  # a hash that costs little
     n = 2 if name in ("walk.fit.npz", "session.json", "norm.json", "board.mp4") else 5
     found = list(outcomes(KINDS[name], range(n), tmp_path))
     assert not [o for o in found if o.what.startswith("!")]

@@ -12,7 +12,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-import pbl_pipeline.tracking
 from pbl_pipeline import models
 from pbl_pipeline.keypoints import (
     BlazePoseLandmarks,
@@ -533,9 +532,9 @@ def test_what_is_wrong_with_the_call_is_found_before_the_work(video, registered,
 
 
 @pytest.mark.slow
-def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_path, monkeypatch):
+def test_pbl_detect_shows_the_licence_before_the_work(video, registered, tmp_path, stand_in):
     path, tracking = video
-    monkeypatch.setattr(pbl_pipeline.tracking, "track_people", lambda *_, **__: tracking)
+    stand_in(track_people=lambda *_, **__: tracking)
     camera = {"camera_matrix": CAMERA.matrix.tolist(), "distortion": CAMERA.distortion.tolist()}
     (tmp_path / "camera.json").write_text(json.dumps(camera | {"image_size_px": [960, 720]}))
     arguments = ("--out", tmp_path / "k.npz", "--camera", tmp_path / "camera.json", "--person", 1)

@@ -14,7 +14,7 @@ from pbl_pipeline.errors import PblError
 from pbl_pipeline.qc import Check
 from pbl_pipeline.report import write_report
 from pbl_pipeline.visit import Recording, Visit
-from tests import Environment
+from tests import Environment, StandIn
 from tests.german import REPORT_NAMES, english_of, english_words
 from tests.integration import chain
 from tests.walking_fit import walking_fit
@@ -26,7 +26,7 @@ def test_names_are_distinct_whatever_the_files_are_called():
 
 
 @pytest.fixture
-def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def fitted(monkeypatch: pytest.MonkeyPatch, stand_in: StandIn) -> list[list[str]]:
     """Names of the trials of each fit; detection and fit are stand-ins."""
     calls: list[list[str]] = []
 
@@ -37,10 +37,8 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         calls.append(list(names))
         return chain.fit_session(trials, names, paramset, camera_motion, height_m)
 
-    chain.install_on_files(monkeypatch)
-    monkeypatch.setattr(pipeline, "detect_keypoints", detect)
-    monkeypatch.setattr(pipeline, "check_trial", lambda *_: None)
-    monkeypatch.setattr(pipeline, "fit_session", fit)
+    chain.install(monkeypatch)
+    stand_in(detect_keypoints=detect, check_trial=lambda *_: None, fit_session=fit)
     return calls
 
 
@@ -66,10 +64,9 @@ def test_an_unknown_norm_is_refused_before_the_fit(fitted: list[list[str]], tmp_
 
 @pytest.mark.slow
 def test_the_report_of_a_run_is_german_where_that_is_asked_for(
-    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    fitted: list[list[str]], tmp_path: Path, stand_in: StandIn
 ):
-    monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
-    monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
+    stand_in(**chain.NO_PICTURES)
     paths = [str(chain.small_video(tmp_path, f"walk_{name}")) for name in "ab"]
     done = CliRunner().invoke(run, [*paths, "--out", str(tmp_path / "out"), "--language", "de"], catch_exceptions=False)
     assert done.exit_code == 0
@@ -81,16 +78,14 @@ def test_the_report_of_a_run_is_german_where_that_is_asked_for(
 @pytest.mark.slow
 @pytest.mark.parametrize("outcome", ["PASS", "FAIL"])
 def test_report_and_metrics_agree_on_the_outcome(
-    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, outcome: str
+    fitted: list[list[str]], tmp_path: Path, outcome: str, stand_in: StandIn
 ):
     from pbl_pipeline.report.page import page_of
 
     written = []
     seen = Check("leg_confidence", outcome, 0.1, 0.5, "the legs are hidden" if outcome == "FAIL" else "")
-    monkeypatch.setattr("pbl_pipeline.visit.types.check_keypoints", lambda _: (seen,))
-    monkeypatch.setattr(pipeline, "render_overlay", lambda *_, **__: None)
-    monkeypatch.setattr(pipeline, "_pictures", lambda *_: ())
-    monkeypatch.setattr(pipeline, "write_report", lambda _, *shown, **__: written.append(shown))
+    stand_in(check_keypoints=lambda _: (seen,))
+    stand_in(**chain.NO_PICTURES, write_report=lambda _, *shown, **__: written.append(shown))
     visit, _ = pipeline.run_visit([chain.small_video(tmp_path, "walk")], tmp_path / "out")
     pipeline.write_results(tmp_path / "out", visit)
     content = json.loads((tmp_path / "out" / "metrics.json").read_text())["session"]
@@ -115,7 +110,7 @@ def test_a_persons_number_belongs_to_one_video(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", ["", "blur"])
 def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
-    fitted: list[list[str]], monkeypatch: pytest.MonkeyPatch, environment: Environment, tmp_path: Path, how: str
+    fitted: list[list[str]], environment: Environment, tmp_path: Path, how: str, stand_in: StandIn
 ):
     """The stand-in copy is another video; both the overlay and the report's pictures are made from it."""
     import pbl_pipeline.deidentify.video_copy as lib
@@ -127,11 +122,13 @@ def test_overlay_and_pictures_are_of_the_copy_where_the_setting_says_so(
 
     used = []
     environment(PBL_DEIDENTIFY=how)
-    monkeypatch.setattr(lib, "deidentify", copied)
-    monkeypatch.setattr(pipeline, "render_overlay", lambda path, *_, **__: used.append(path))
-    monkeypatch.setattr(pipeline, "overlay_frames", lambda path, *_, **__: used.append(path) or [])
-    monkeypatch.setattr(pipeline, "report_indices", lambda _: [])
-    monkeypatch.setattr(pipeline, "write_report", lambda *_, **__: None)
+    stand_in(
+        deidentify=copied,
+        render_overlay=lambda path, *_, **__: used.append(path),
+        overlay_frames=lambda path, *_, **__: used.append(path) or [],
+        report_indices=lambda _: [],
+        write_report=lambda *_, **__: None,
+    )
     recording = chain.small_video(tmp_path, "walk")
     pipeline.write_results(tmp_path / "out", pipeline.run_visit([recording], tmp_path / "out")[0])
     assert len(used) == 2

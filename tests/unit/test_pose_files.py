@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import functools
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from pbl_pipeline.fit.session import make_session
 from pbl_pipeline.keypoints import Keypoints, WorldMarkers
 from pbl_pipeline.keypoints.pose_files import read_poses
 from pbl_pipeline.synthetic import plain_walk
+from tests import Machine
 from tests.command import pbl
 from tests.videos import write_video
 from tests.walker import CAMERA, SIZE, observe
@@ -367,9 +367,9 @@ def test_an_ankle_without_a_point_on_the_foot_is_open():
         assert sd[0, joints.index("knee_angle_r")] < OPEN_RAD
 
 
-def test_an_h5_without_its_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_h5_without_its_package_names_the_extra(tmp_path: Path, machine: Machine):
     (tmp_path / "a.h5").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "h5py", None)
+    machine(without=["h5py"])
     with pytest.raises(PblError, match=r"pbl-pipeline\[h5\]"):
         read_keypoints(tmp_path / "a.h5", ALL)
 

@@ -18,7 +18,7 @@ from pbl_pipeline.resources import keep_large_blocks
 from pbl_schemas.operations.embedded import process
 from pbl_workers import supervisor
 from pbl_workers.process import Options
-from tests import Environment
+from tests import Environment, Limits
 from tests.command import pbl
 from tests.ended_process import Ended
 
@@ -26,10 +26,9 @@ GB = 2**30
 
 
 @pytest.fixture
-def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, dict[str, str]], None]:
+def groups(tmp_path: Path, limits: Limits) -> Callable[[str, dict[str, str]], None]:
     """Writes a tree of control groups as the kernel shows it."""
-    monkeypatch.setattr(resources, "_GROUPS", tmp_path)
-    monkeypatch.setattr(resources, "_OWN", tmp_path / "own")
+    limits(resources, _GROUPS=tmp_path, _OWN=tmp_path / "own")
 
     def write(own: str, files: dict[str, str]) -> None:
         (tmp_path / "own").write_text(own)
@@ -104,7 +103,7 @@ def test_a_worker_divides_the_cores_by_its_processes(
             seen.append({name: os.environ[name] for name in names})
 
     monkeypatch.setattr("multiprocessing.get_context", lambda _: SimpleNamespace(Process=Process, Pipe=Pipe))
-    monkeypatch.setattr("pbl_workers.process.given_gpus", tuple)
+    monkeypatch.setattr("pbl_pipeline.resources.given_gpus", tuple)
     assert pbl("worker", *asked).code == 0
     assert seen == [dict.fromkeys(names, share) | {"OMP_NUM_THREADS": "7"} for share in shares]
     assert not {*names} - {"OMP_NUM_THREADS"} & {*os.environ}
@@ -118,7 +117,7 @@ def worker_options(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Options]:
     monkeypatch.setattr(supervisor.Supervisor, "run", lambda self: found.append(self.options) or 0)
 
     def asked_for(gpus: tuple[str, ...], *asked: str) -> Options:
-        monkeypatch.setattr("pbl_workers.process.given_gpus", lambda: gpus)
+        monkeypatch.setattr("pbl_pipeline.resources.given_gpus", lambda: gpus)
         assert pbl("worker", "--processes", "auto", *asked).code == 0
         return found[-1]
 

@@ -151,6 +151,7 @@ def test_own_csv(tmp_path: Path):
     (log,) = read(f"shank_r={swing.write(tmp_path / 'b.csv', table)}")
     assert_is(log, swing)
     assert log.started_utc == pytest.approx(1772356530.0)
+    assert log.mounting is None
     check_day([log], {"walk": "2026-03-02T08:15:30Z", "other": None})
     with pytest.raises(PblError, match=r"3\.0 days from the video"):
         check_day([log], {"walk": "2026-03-04T09:15:36Z", "other": None})
@@ -164,6 +165,18 @@ def test_own_csv(tmp_path: Path):
     assert str(of_copy.value.key) == "shank.csv"
     table["start_utc"] = "2026-03-01T09:15:30"
     assert "start_utc" in refused(f"shank_r={swing.write(tmp_path / 'c.csv', table)}").found
+
+
+def test_a_stated_mounting(tmp_path: Path):
+    swing = Swing()
+    for wxyz, length in (([0.6, 0.8, 0.0, 0.0], "1"), ([0.6, 0.6, 0.6, 0.6], "1.2")):
+        table = swing.own()
+        table.loc[0, [f"mount_{a}" for a in "wxyz"]] = wxyz
+        given = f"pelvis={swing.write(tmp_path / 'a.csv', table)}"
+        if length == "1":
+            np.testing.assert_allclose(read(given)[0].mounting, wxyz)
+        else:
+            assert f"a mounting of length {length}" in refused(given).found
 
 
 GYR, ACC, QUAT = (

@@ -14,6 +14,7 @@ from pbl_pipeline import name_pattern
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.workbook import read_workbook
 from pbl_schemas.intake.sheets import read_sheets, write_template
+from tests import Limits
 from tests.guard import guarded
 
 SHEET = "xl/worksheets/sheet1.xml"
@@ -169,8 +170,8 @@ def test_the_largest_csv_takes_less_than_a_gibibyte(tmp_path: Path):
     ],
     ids=["years", "repetitions", "nested"],
 )
-def test_a_pattern_that_takes_too_much(monkeypatch: pytest.MonkeyPatch, pattern: str, words: str):
-    monkeypatch.setattr(name_pattern, "LONGEST_S", 6.0)
+def test_a_pattern_that_takes_too_much(pattern: str, words: str, limits: Limits):
+    limits(name_pattern, LONGEST_S=6.0)
     start = time.monotonic()
     with pytest.raises(PblError, match="USAGE") as error:
         name_pattern.read_names(pattern, [Path("a" * 60 + "!.mp4")])

@@ -1,9 +1,12 @@
 """Probe and frames against files whose frames, stamps and damage are known, and against OpenCV as a second decoder."""
 
 import dataclasses
+import errno
 import gc
 import hashlib
+import io
 import json
+import os
 import random
 import shutil
 import struct
@@ -37,7 +40,7 @@ from pbl_pipeline.video import (
 )
 from pbl_pipeline.video.coded_units import is_damaged
 from research.benchmarks.hostile import KINDS
-from tests import refused
+from tests import Faults, Limits, StandIn, refused
 from tests.guard import guarded
 from tests.integration import chain
 from tests.quicktime import box
@@ -232,14 +235,10 @@ def test_frames_that_an_edit_list_hides_do_not_count(with_edit_list):
     assert [grey(f) for f in read_frames(path)] == [(20 + i) % 30 for i in range(40)]
 
 
-def test_frames_that_are_announced_and_cannot_be_counted_are_lost(with_edit_list, monkeypatch):
+def test_frames_that_are_announced_and_cannot_be_counted_are_lost(with_edit_list, monkeypatch, faults):
     """A header that lies about sizes: FFmpeg opens the file as a player does, and not without its edit list."""
     monkeypatch.setattr(decode.Decoder, "n_announced", property(lambda _: 100))
-
-    def too_large(*_: object) -> int:
-        raise MemoryError(12, "Cannot allocate memory")
-
-    monkeypatch.setattr(decode, "_count_packets", too_large)
+    faults(decode, "_count_packets", MemoryError(12, "Cannot allocate memory"))
     assert "Cannot allocate memory" in refused("VIDEO_TRUNCATED", probe, with_edit_list).found
 
 
@@ -280,6 +279,25 @@ def test_missing_and_empty(tmp_path):
     assert code_of(tmp_path / "empty.mp4") == "VIDEO_EMPTY"
     refused("VIDEO_MISSING", read_frames, tmp_path / "absent.mp4")  # at the call, not at the first frame
     refused("VIDEO_EMPTY", check_file, tmp_path / "empty.mp4")
+
+
+@pytest.mark.parametrize("name", ["lost_end.mp4", "text.mp4"])
+def test_a_disk_that_fails_is_no_fault_of_the_recording(tmp_path, monkeypatch, name):
+    """FFmpeg takes what it cannot read for the end of the file."""
+    path = write_video(tmp_path / "whole.mp4", numbered_frames(10), constant_rate(10))
+    content = path.read_bytes()[:-2000] if name == "lost_end.mp4" else b"not a video" * 1000
+    lost = tmp_path / name
+    lost.write_bytes(content)
+    assert code_of(lost) in ("VIDEO_TRUNCATED", "VIDEO_NOT_A_VIDEO")
+
+    def fails(file: io.BufferedReader, *n: int) -> bytes:
+        if file.tell() and n == (1 << 20,):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return io.BufferedReader.read(file, *n)
+
+    reader = type("Failing", (io.BufferedReader,), {"read": fails})
+    monkeypatch.setattr(Path, "open", lambda self, *_, **__: reader(io.FileIO(self)))
+    assert refused("VIDEO_MISSING", probe, lost).found == "the file cannot be read (Input/output error)"
 
 
 def test_not_a_video(tmp_path):
@@ -345,16 +363,12 @@ def on_a_desktop(image: np.ndarray, i: int, wall: np.ndarray, dark: bool) -> np.
 
 @pytest.mark.parametrize(("left", "code"), [(1 << 20, "VIDEO_NOT_A_VIDEO"), (1 << 62, "MACHINE_SHORT")])
 def test_too_little_memory_is_no_fault_of_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: int, code: str
+    tmp_path: Path, left: int, code: str, limits: Limits, faults: Faults
 ):
     """A file that asks for more than there is on a machine with memory, and a file on a machine without."""
     (tmp_path / "a.mp4").write_bytes(b"content")
-
-    def no_memory(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(decode.av, "open", no_memory)
-    monkeypatch.setattr(decode, "_ENOUGH", left)
+    faults(decode.av, "open", MemoryError())
+    limits(decode, _ENOUGH=left)
     refused(code, probe, tmp_path / "a.mp4")
 
 
@@ -779,10 +793,9 @@ def pictures(path: Path) -> list[tuple[int, float, np.ndarray]]:
 
 
 @pytest.fixture
-def decodes(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], bool]:
+def decodes(faults: Faults) -> Callable[[Path], bool]:
     """True if the pictures of a file are decoded to be read."""
-    opened, real = [], frames.Decoder
-    monkeypatch.setattr(frames, "Decoder", lambda *a: opened.append(a) or real(*a))
+    opened = faults(frames, "Decoder")
 
     def read(path: Path) -> bool:
         opened.clear()
@@ -804,7 +817,9 @@ def test_kept_pictures_are_those_of_the_file(decodes: Callable[[Path], bool], vi
     assert decodes(video)
 
 
-def test_memory_of_kept_pictures_stays_for_the_next_ones_alone(monkeypatch: pytest.MonkeyPatch, video: Path) -> None:
+def test_memory_of_kept_pictures_stays_for_the_next_ones_alone(
+    monkeypatch: pytest.MonkeyPatch, video: Path, stand_in: StandIn
+) -> None:
     stays = list[bool]()
     for module in (kept, decode):
         monkeypatch.setattr(module, "keep_large_blocks", stays.append)
@@ -819,10 +834,10 @@ def test_memory_of_kept_pictures_stays_for_the_next_ones_alone(monkeypatch: pyte
         probe(video)
         assert stays[-1]
         for room in (2e5, 8e5):  # for none, and for some of the pictures
-            monkeypatch.setattr(kept, "share_of_memory", lambda room=room: room)
+            stand_in(share_of_memory=lambda room=room: room)
             probe(video)
             assert not stays[-1]
-        monkeypatch.setattr(kept, "share_of_memory", lambda: 2**30)
+        stand_in(share_of_memory=lambda: 2**30)
         probe(video)
         assert stays[-1]
     assert not stays[-1]
@@ -847,14 +862,14 @@ def test_another_file_and_a_changed_one_are_decoded(decodes: Callable[[Path], bo
 
 
 def test_a_released_one_and_one_without_room_are_decoded(
-    monkeypatch: pytest.MonkeyPatch, decodes: Callable[[Path], bool], video: Path
+    decodes: Callable[[Path], bool], video: Path, stand_in: StandIn
 ) -> None:
     with frames_kept():
         probe(video)
         release_frames()
         assert decodes(video)
         for room in (2e5, 8e5):  # for none, and for some of the pictures
-            monkeypatch.setattr(kept, "share_of_memory", lambda room=room: room)
+            stand_in(share_of_memory=lambda room=room: room)
             probe(video)
             assert decodes(video)
 

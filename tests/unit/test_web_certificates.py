@@ -15,7 +15,7 @@ from pbl_pipeline.errors import PblError
 from pbl_workers.cli.web import web
 from pbl_workers.web import Where, certificates
 from pbl_workers.web.access import host_name
-from tests import Environment, refused
+from tests import Environment, Limits, refused
 
 NAMES = ("127.0.0.1", "gait.example")
 
@@ -81,12 +81,12 @@ def test_the_authority_is_made_once_and_the_servers_certificate_for_its_names(ho
     assert certificates.authority().read_bytes() == authority
 
 
-def test_it_is_renewed_before_its_end(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_it_is_renewed_before_its_end(home: Path, limits: Limits):
     cert, _ = certificates.server_certificate(NAMES)
     first = cert.read_bytes()
     left = x509.load_pem_x509_certificate(first).not_valid_after_utc - datetime.datetime.now(datetime.UTC)
     assert left < datetime.timedelta(days=398)  # the most that browsers take
-    monkeypatch.setattr(certificates, "RENEW_DAYS", 397)
+    limits(certificates, RENEW_DAYS=397)
     certificates.server_certificate(NAMES)
     assert cert.read_bytes() != first
 

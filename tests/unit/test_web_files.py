@@ -4,6 +4,7 @@ import ast
 import csv
 import hashlib
 import html
+import itertools
 import re
 import string
 from pathlib import Path
@@ -11,6 +12,7 @@ from pathlib import Path
 from pbl_pipeline import texts, words
 from pbl_pipeline.body import SLIDES, load_body
 from pbl_pipeline.qc import CADENCE
+from pbl_pipeline.sensors import SEGMENTS
 from pbl_pipeline.shipped import shipped_text
 from tests.source import PACKAGES, ROOT, files, nodes
 
@@ -166,6 +168,18 @@ def test_a_page_in_english_has_no_codes_either():
     empty = "choice of the person ran well and found nothing to go on with: No person was found in the video."
     assert texts.on_page("en", empty) == "No person was found in the video."
     assert {n for n in load_body().joint_names if texts.library_words("en", n) == n} == {*SLIDES}
+
+
+def test_segments_of_wearable_sensors_are_words_on_pages():
+    advice = "sensors move like other segments than stated, or sides were exchanged: {}"
+    moved = ", ".join(f"{a} moves like {b}" for a, b in itertools.pairwise(SEGMENTS))
+    for language, side in (
+        ("en", "right thigh moves like left thigh"),
+        ("de", "rechter Oberschenkel bewegt sich wie linker"),
+    ):
+        shown = str(texts.on_page(language, advice.format(moved)))
+        assert side in shown
+        assert not re.search(r"\w_[rl]\b|moves" if language == "de" else r"\w_[rl]\b", shown)
 
 
 def test_no_text_of_a_page_names_a_command():

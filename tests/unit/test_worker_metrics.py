@@ -17,15 +17,17 @@ import pymysql
 import pytest
 from prometheus_client.core import GaugeMetricFamily
 
+from pbl_pipeline import resources
+from pbl_pipeline.resources import VISIBLE_GPUS, given_gpus
 from pbl_schemas import connection, fit, worker
 from pbl_schemas.store import check_store
-from pbl_workers import metrics, process, recover, registry, selftest
+from pbl_workers import metrics, process, recover, registry, run_job, selftest
 from pbl_workers.metrics import Metrics
-from pbl_workers.process import VISIBLE, Options, given_gpus
+from pbl_workers.process import Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import Supervisor, _Child
-from tests import Environment
+from tests import Environment, Limits
 from tests.command import program
 from tests.ended_process import Ended
 
@@ -102,7 +104,7 @@ def test_jobs_of_a_process_that_died_are_in_nobodys_hand(boss: SimpleNamespace):
 
 
 def test_jobs_of_a_process_that_died_while_the_database_is_away_are_settled_later(
-    boss: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    boss: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, limits: Limits
 ):
     """The supervisor goes on listening, and ends when it is told to."""
     supervisor, crashed, away = boss.supervisor, [], [True, True]
@@ -115,7 +117,7 @@ def test_jobs_of_a_process_that_died_while_the_database_is_away_are_settled_late
     monkeypatch.undo()
     monkeypatch.setattr(connection, "connect", connect)
     monkeypatch.setattr(recover, "crashed", lambda job, reason: crashed.append(job.key))
-    monkeypatch.setattr("pbl_workers.run_job.DATABASE_PAUSE_S", 0.05)
+    limits(run_job, DATABASE_PAUSE_S=0.05)
     boss.process.report(1)
     supervisor._listen(0.0)
     supervisor._settle_jobs(boss.process.child, -9)
@@ -127,7 +129,7 @@ def test_jobs_of_a_process_that_died_while_the_database_is_away_are_settled_late
     assert not away
 
 
-def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch):
+def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch, limits: Limits):
     answers = threading.Event()
     answers.set()
 
@@ -137,7 +139,7 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(metrics, "figures", figures)
     monkeypatch.setattr(worker, "installation_lock", lambda *_: contextlib.nullcontext(True))
-    monkeypatch.setattr("pbl_workers.metrics.READ_EVERY_S", 0.01)
+    limits(metrics, READ_EVERY_S=0.01)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -155,7 +157,7 @@ def test_metrics_answer_while_the_database_hangs(monkeypatch: pytest.MonkeyPatch
 
     assert asked("pbl_database_up 1.0")
     assert asked("pbl_workers 7.0")
-    monkeypatch.setattr("pbl_workers.metrics.FRESH_S", 0.2)
+    limits(metrics, FRESH_S=0.2)
     answers.clear()
     assert asked("pbl_database_up 0.0")
     answers.set()
@@ -170,11 +172,15 @@ class Bucket:
 
     protocol = "s3"
 
-    def __init__(self) -> None:
+    def __init__(self, other: bytes | OSError | None = None) -> None:
+        """other: bytes of another writer, which are there after each write, or why there are none."""
         self.objects: dict[str, bytes] = {}
+        self.other = other
 
     def put_buffer(self, content: bytes, path: str) -> None:
-        self.objects[path] = content
+        if isinstance(self.other, OSError):
+            raise self.other
+        self.objects[path] = content if self.other is None else self.other
 
     def get_buffer(self, path: str) -> bytes:
         return self.objects[path]
@@ -183,19 +189,9 @@ class Bucket:
         raise PermissionError(13, "Access Denied", path)
 
 
-class Written(Bucket):
-    """Another writer's bytes are in the bucket after each write."""
-
-    def __init__(self, content: bytes) -> None:
-        super().__init__()
-        self.other = content
-
-    def put_buffer(self, content: bytes, path: str) -> None:
-        super().put_buffer(self.other, path)
-
-
 @pytest.fixture
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Bucket:
+    """The bucket of the worker."""
     found = Bucket()
     monkeypatch.setattr(selftest, "store_backend", lambda: found)
     return found
@@ -210,23 +206,20 @@ def test_a_key_that_may_not_delete_is_enough(bucket: Bucket):
 def test_workers_that_start_together_may_read_each_others_object(bucket: Bucket):
     check_store(bucket)
     (content,) = bucket.objects.values()
-    check_store(Written(content))
+    check_store(Bucket(content))
 
 
 @pytest.mark.parametrize("damage", [lambda b: b[:-1], lambda b: b"", lambda b: bytes([b[0] ^ 1]) + b[1:]])
-def test_other_bytes_than_were_written_fail_the_test(bucket: Bucket, monkeypatch: pytest.MonkeyPatch, damage):
+def test_other_bytes_than_were_written_fail_the_test(bucket: Bucket, damage):
     check_store(bucket)
     (content,) = bucket.objects.values()
-    monkeypatch.setattr(selftest, "store_backend", lambda: Written(damage(content)))
+    bucket.other = damage(content)
     with pytest.raises(selftest.SelfTestFailed, match="other bytes"):
         selftest.check([])
 
 
-def test_a_store_that_cannot_be_written_fails_the_test(bucket: Bucket, monkeypatch: pytest.MonkeyPatch):
-    def full(content: bytes, path: str) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(bucket, "put_buffer", full)
+def test_a_store_that_cannot_be_written_fails_the_test(bucket: Bucket):
+    bucket.other = OSError(28, "No space left on device")
     with pytest.raises(selftest.SelfTestFailed, match="No space left"):
         selftest.check([])
 
@@ -245,16 +238,18 @@ CPU = ("JAX_PLATFORMS", "PBL_ONNX_DEVICE")
     [("2,5", ("2", "5")), ("GPU-8f3a, MIG-77", ("GPU-8f3a", "MIG-77")), ("", ()), ("-1", ()), ("NoDevFiles", ())],
 )
 def test_a_batch_system_says_which_gpus_are_ours(listed: str, expected: tuple, environment: Environment):
-    environment(**{VISIBLE: listed})
+    environment(**{VISIBLE_GPUS: listed})
     assert given_gpus() == expected
 
 
 @pytest.mark.parametrize(
     ("answer", "expected"), [("echo 0\necho 1", ("0", "1")), ("exit 9", ()), ("exec /bin/sleep 60", ()), (None, ())]
 )
-def test_otherwise_the_driver_lists_them(answer: str | None, expected: tuple, tmp_path: Path, monkeypatch, environment):
-    environment(**{VISIBLE: None}, PATH=tmp_path)
-    monkeypatch.setattr(process, "QUERY_S", 0.5)
+def test_otherwise_the_driver_lists_them(
+    answer: str | None, expected: tuple, tmp_path: Path, environment, limits: Limits
+):
+    environment(**{VISIBLE_GPUS: None}, PATH=tmp_path)
+    limits(resources, QUERY_S=0.5)
     if answer is not None:
         program(tmp_path, "nvidia-smi", answer)
     assert given_gpus() == expected
@@ -312,9 +307,9 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch, enviro
     seen = []
     for number, processes in ((0, 2), (1, 2), (3, 4), (4, 4)):
         for value in ("", None):  # put back what the process sets
-            environment(**dict.fromkeys((VISIBLE, MEMORY, *CPU), value))
+            environment(**dict.fromkeys((VISIBLE_GPUS, MEMORY, *CPU), value))
         process.work(Options(processes=processes, gpus=("4", "7"), phones=True).of_process(number), mock.Mock())
-        seen.append(tuple(map(os.environ.get, (VISIBLE, MEMORY, *CPU))))
+        seen.append(tuple(map(os.environ.get, (VISIBLE_GPUS, MEMORY, *CPU))))
     no = (None, None)
     assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
 

@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 
 from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_schemas import session, video, worker
-from pbl_schemas.decisions.review_decisions import record
+from pbl_schemas.decisions.review_decisions import queue_visit, record
 from pbl_schemas.intake import Registered, VisitRecord
 from pbl_schemas.intake.uploads import LARGEST, LARGEST_LOG, LOG_ENDINGS
 from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders
@@ -133,6 +133,8 @@ def register(
     )
     out += [Received(f"{stem}{copy.path.suffix}", "refused", error=alone(key=stem)) for stem, copy in logs.items()]
     remove_folders(archive_dir(), to.subject)
+    if any(one.video_id is not None for one in out):
+        queue_visit(to.session_id)
     return out
 
 

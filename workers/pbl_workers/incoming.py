@@ -22,6 +22,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import pymysql
 
@@ -29,6 +30,7 @@ from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_pipeline.files import sha256_of
 from pbl_pipeline.limited import LimitExceeded, limited
 from pbl_pipeline.names import normalised_label
+from pbl_pipeline.sensors import Given, read_given
 from pbl_pipeline.video import read_first, read_phone_log
 from pbl_schemas import video, worker
 from pbl_schemas.connection import dj
@@ -282,16 +284,21 @@ def check_log(path: Path) -> None:
     _within_limits(read_phone_log, path, LOG_S, LOG_BYTES)
 
 
-def _within_limits(read: Callable[[Path], object], path: Path, seconds: float, n_bytes: int) -> None:
+def check_worn(sensors: Sequence[Given]) -> None:
+    """Read logs of wearable sensors in a process with limits. Raises `PblError` as `read_given`; MACHINE_SHORT."""
+    _within_limits(read_given, sensors, LOG_S, LOG_BYTES)
+
+
+def _within_limits(read: Callable[[Any], object], file: Path | Sequence[Given], seconds: float, n_bytes: int) -> None:
     try:
-        limited(read, path, seconds=seconds, n_bytes=n_bytes)
+        limited(read, file, seconds=seconds, n_bytes=n_bytes)
     except LimitExceeded as error:
         raise PblError(
             "MACHINE_SHORT",
             found=f"the file was not opened: {error}",
             expected=f"{seconds:g} s of this machine and {n_bytes / 2**30:g} GiB of its memory",
             next_step="try again; if it stays so, give the server more memory, or fewer processes",
-            key=path,
+            key=file if isinstance(file, Path) else None,
         ) from error
 
 
@@ -304,7 +311,8 @@ def register_copies(visit: VisitRecord, file: str, copies: Sequence[Copy], archi
     visit.check(file)
     recording, *logs = copies
     folder = private_folder(folder_of(archive, "", visit.subject) / plain_name(visit.session_label))
-    target = folder / f"{recording.sha256[:12]}-{plain_name(file)}"
+    name = Path(plain_name(file))
+    target = folder / f"{name.stem}-{recording.sha256[:8]}{name.suffix}"
     came, note = [copy.path for copy in copies], note_placed(archive, target)
     for copy, to in zip(copies, (target, *(target.with_suffix(log.path.suffix) for log in logs)), strict=True):
         copy.path = copy.path.replace(to)

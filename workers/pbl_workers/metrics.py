@@ -13,11 +13,11 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, star
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from pbl_pipeline.resources import gpus
 from pbl_schemas import worker
 from pbl_schemas.operations.archive import disks
 from pbl_schemas.reading import status
 
-from .process import gpus
 from .queue import Claim
 from .run_job import Outcome
 

@@ -15,15 +15,18 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.sensors import Given, named
+from pbl_pipeline.temporary import new_folder
 from pbl_schemas import video, worker
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import VisitRecord, phone_recordings
 from pbl_schemas.intake.phone_recordings import PART_BYTES, Phone, Sent, upload_refused
-from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, remove_folders, unfinished
+from pbl_schemas.intake.sensors import attach_worn as attach_to_visit
+from pbl_schemas.operations.archive import LOCK, PHONE, archive_dir, folder_of, plain_name, remove_folders, unfinished
 from pbl_schemas.operations.folders import private_folder, sync_folders, write_text
 
 from . import queue
-from .incoming import Copy, check_log, check_opens, check_room, keep_free, register_copies
+from .incoming import Copy, check_log, check_opens, check_room, check_worn, keep_free, register_copies
 from .registry import FIRST
 
 
@@ -54,7 +57,7 @@ def check_part(sent: Sent, start: int, end: int, total: int) -> int:
 def check_promised(begun: Mapping[int, int], next_step: str) -> None:
     """Raise `PblError` FILE_UNWRITABLE if all recordings that were begun (byte by number) do not fit, each twice: the
     parts stay until the whole is registered."""
-    here = {one.path.name: one.n_bytes for one in unfinished(archive_dir())}
+    here = {one.path.name: one.n_bytes for one in unfinished(archive_dir(), parts_alone=True)}
     check_room(sum(max(2 * n - here.get(str(number), 0), 0) for number, n in begun.items()), next_step)
 
 
@@ -151,6 +154,25 @@ def register(phone: Phone, sent: Sent, copies: list[Copy]) -> int:
     queue.fill(video.VideoInfo, [{"video_id": result.video_id}], FIRST)
     phone_recordings.received(sent.number, result.video_id)
     return result.video_id
+
+
+def attach_worn(phone: Phone, name: str, segment: str, body: bytes) -> list[str]:
+    """Attach the log of a wearable sensor to the phone's visit; returns its segments. `segment`: "" where the names of
+    the sensors in it tell them.
+
+    Raises `PblError` USAGE without a recording; what `read_given` raises; MACHINE_SHORT.
+    """
+    with new_folder() as folder:
+        file = folder / plain_name(name)
+        file.write_bytes(body)
+        one = Given(file, segment or None)
+        try:
+            check_worn([one])
+            worn = named(one)
+            attach_to_visit(phone.session_id, worn)
+        except PblError as error:
+            raise error.with_key(file.name) from error
+    return [sensor.segment for sensor in worn if sensor.segment]
 
 
 def discard(phone: Phone, sent: Sent) -> None:

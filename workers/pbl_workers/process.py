@@ -7,45 +7,21 @@ import functools
 import logging
 import os
 import signal
-import subprocess
 import threading
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
 from pbl_pipeline import temporary
+from pbl_pipeline.bench.profile import profiled
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.resources import VISIBLE_GPUS, fewer_collections
 from pbl_pipeline.video import frames_kept
 
 from . import registry, run_job
 from .log import event, to_stderr
 from .queue import Claim
 from .run_job import Outcome
-
-#: Variable by which a process sees only some of the GPUs; batch systems set it for a job.
-VISIBLE = "CUDA_VISIBLE_DEVICES"
-#: Time after which a driver that does not answer counts as missing (s).
-QUERY_S = 30.0
-
-
-def gpus(*columns: str) -> list[list[str]]:
-    """Index and these columns of `nvidia-smi` of each GPU of the machine, as text; none without an NVIDIA driver."""
-    query = ["nvidia-smi", f"--query-gpu={','.join(('index', *columns))}", "--format=csv,noheader,nounits"]
-    try:
-        done = subprocess.run(query, capture_output=True, text=True, check=True, timeout=QUERY_S)
-    except (OSError, subprocess.SubprocessError):
-        return []
-    return [[cell.strip() for cell in line.split(",")] for line in done.stdout.splitlines()]
-
-
-def given_gpus() -> tuple[str, ...]:
-    """Names of the GPUs, as `CUDA_VISIBLE_DEVICES` takes them: those that this variable lists, else all of the machine;
-    none if there is no NVIDIA driver."""
-    listed = os.environ.get(VISIBLE)
-    if listed is None:
-        listed = ",".join(row[0] for row in gpus())
-    return tuple(name for name in map(str.strip, listed.split(",")) if name not in ("", "-1", "NoDevFiles"))
-
 
 log = logging.getLogger("pbl.worker")
 
@@ -74,6 +50,7 @@ class Options:
     short: bool = False
     long: bool = False
     phone: bool = False
+    profile: str = ""  # folder for the processor times of each process (`bench.profile`)
 
     @property
     def lone(self) -> bool:
@@ -111,8 +88,9 @@ class Options:
 
 def work(options: Options, pipe: Connection) -> None:
     """Run a working process (`Options.of_process`): connect, run the self-test, work."""
+    fewer_collections()
     if options.gpus:
-        os.environ[VISIBLE] = options.gpus[0]
+        os.environ[VISIBLE_GPUS] = options.gpus[0]
     if options.phone:
         os.environ |= {"JAX_PLATFORMS": "cpu", "PBL_ONNX_DEVICE": "cpu"}
     if options.processes > 1:
@@ -154,6 +132,8 @@ def work(options: Options, pipe: Connection) -> None:
             raise SystemExit(SELFTEST_FAILED) from error
 
     def report(job: Claim | None, outcome: Outcome | None) -> None:
+        if job is not None:
+            stage_is(job.table.__name__ if outcome is None else "-")
         try:
             pipe.send((job, outcome))
         except OSError:  # the supervisor has ended: so does this process
@@ -170,7 +150,7 @@ def work(options: Options, pipe: Connection) -> None:
             worker.long_waits = functools.partial(report, None, None)
         event(log, logging.INFO, "worker started", resource=options.resource, worker=beats.worker)
         try:
-            with frames_kept():
+            with frames_kept(), profiled(options.profile) as stage_is:
                 worker.run(once=options.once, max_jobs=options.max_jobs)
         finally:
             event(log, logging.INFO, "worker ended", done=worker.done, failed=worker.failed)

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from pbl_schemas import chain, fit, review, tracking, video, worker
+from pbl_schemas.decisions.review_decisions import QUEUE
 from pbl_schemas.reading.visit_progress import Scope, of_visit
 from pbl_schemas.rows import inside
 from pbl_schemas.worker import installation_lock
@@ -127,14 +128,7 @@ def refresh_scope(scope: Scope) -> Refreshed:
     return _queue_missing(scope, own=True)
 
 
-def queue_visit(session_id: int) -> None:
-    """Queue what a decision made computable of a visit, so that pages and workers see it immediately."""
-    refresh_scope(of_visit(session_id))
-
-
-def queue_visit_of(video_id: int) -> None:
-    """`queue_visit` of the visit that a recording belongs to."""
-    queue_visit(int((video.Video & {"video_id": video_id}).fetch1("session_id")))
+QUEUE.append(lambda session_id: refresh_scope(of_visit(session_id)))
 
 
 def _queue_missing(scope: Scope | None, own: bool = False) -> Refreshed:

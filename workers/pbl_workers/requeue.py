@@ -7,7 +7,7 @@ import datetime
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pbl_pipeline.errors import PblError
+from pbl_pipeline.errors import CODES, MACHINE, PblError
 from pbl_schemas import computed_tables, fit, gait, gdi, keypoints, kinetics, tracking, video
 from pbl_schemas.datajoint_setup import columns_read_once, dj
 from pbl_schemas.intake import Methods
@@ -16,23 +16,24 @@ from pbl_schemas.jobs import jobs_of, keys_of
 from pbl_schemas.method_names import keys_named
 from pbl_schemas.method_rows import resolve_method
 from pbl_schemas.plan import default_fit, plan_fits, unsuited
+from pbl_schemas.reading.status import error_counts, queue_counts
 from pbl_schemas.rows import delete_below, inside, parts
 
 from . import queue
 from .registry import AGAIN, table_named
 
-#: Errors whose cause lies outside of the recording and may be gone tomorrow.
-OUTSIDE = (
-    "ASSET_MISSING",
-    "MODEL_MISSING",
-    "VIDEO_MISSING",
-    "WORKER_CRASH",
-    "DEVICE_UNAVAILABLE",
-    "STORE_UNAVAILABLE",
-    "MACHINE_SHORT",
-)
+#: Codes of the machine that the same program and limits meet again.
+_STAY = ("INTERNAL", "TIME_LIMIT")
 #: Rows deleted in one transaction, and most of which the dependent ones are counted before.
 CHUNK = 200
+
+
+def retry_outside() -> dict[str, int]:
+    """Make error rows pending again whose cause lies in the machine or its services (`errors.CODES`) and may be gone
+    tomorrow; code -> how many."""
+    server = video.Video.connection
+    there = {code for _, code in error_counts(server, queue_counts(server))} - {*_STAY}
+    return {code: sum(retry(code).values()) for code in sorted(there) if CODES[code].cause == MACHINE}
 
 
 def retry(
@@ -68,15 +69,15 @@ def _of_video(table: Any, video_id: int) -> list[dict[str, Any]]:
 # ---------------------------------------------------------------------------------------------------------- reprocess
 @dataclasses.dataclass(frozen=True)
 class Reprocess:
-    """Plan of repeated computations. `add`: selections of a method, which is fitted by `fit_method` where it is one of
-    the keypoints; `outdated`: keys whose results are deleted; `unasked`: number of those that are not computed again
-    now, because the recording is marked as not usable, or another selection took their place."""
+    """Plan of repeated computations, whose rows the server counts until it is carried out."""
 
     table: str
-    add: list[dict[str, Any]]
-    outdated: list[dict[str, Any]]
-    below: dict[str, int]
-    fit_method: str | None = None
+    add: Any = ()  # query of the selections that lack a method
+    chosen: dict[str, str] = dataclasses.field(default_factory=dict)  # the columns that name it
+    fit_method: str | None = None  # that which fits it where it is one of the keypoints
+    outdated: Any = ()  # query of the results that are deleted
+    below: dict[str, int] = dataclasses.field(default_factory=dict)  # rows that go with them, where they are few
+    # How many are not computed again now: recordings that are marked as not usable, or of another selection by now.
     unasked: int = 0
 
 
@@ -115,15 +116,10 @@ def plan_new_method(table: str, method: str, since: datetime.date | None = None)
     if prefix == "kinetics":  # also visits that were registered before forces could be planned
         rows = dj.U("session_id") & (gait.GaitPlan & recorded)
     others = [k for k in rows.primary_key if k != column]
-    have = {tuple(r[k] for k in others) for r in (selection & {column: chosen}).proj().to_dicts()}
+    lacking = (dj.U(*others) & rows) - (selection & {column: chosen}).proj()
     # The choice of the subject follows the tracking: that of this version, not of the older row.
     beside = {"subject_method": resolve_ingest(Methods())["subject_method"]} if prefix == "tracking" else {}
-    add: dict[tuple, dict[str, Any]] = {}
-    for row in rows.to_dicts():
-        key = tuple(row[k] for k in others)
-        if key not in have:
-            add.setdefault(key, {**row, column: chosen, **beside})
-    return Reprocess(name, list(add.values()), [], {}, default_fit(chosen) if name == "Keypoints" else None)
+    return Reprocess(name, lacking, {column: chosen, **beside}, default_fit(chosen) if name == "Keypoints" else None)
 
 
 def plan_again(
@@ -144,14 +140,13 @@ def plan_again(
         rows = rows & f"{prefix}_computed >= '{since:%Y-%m-%d %H:%M:%S}'"
     if before is not None:
         rows = rows & f"{prefix}_computed < '{before:%Y-%m-%d %H:%M:%S}'"
-    keys = rows.keys()
     below = {}
-    if keys and len(keys) <= CHUNK:
+    if 0 < len(rows) <= CHUNK:
         with columns_read_once():
-            counts = dj.Diagram.cascade(one & keys, part_integrity="cascade").counts()
+            counts = dj.Diagram.cascade(one & rows.keys(), part_integrity="cascade").counts()
         below = {n: c for n, c in counts.items() if c}
     unasked = len(rows.proj().restrict(dj.Not(keys_of(one)), semantic_check=False))
-    return Reprocess(one.__name__, [], keys, below, unasked=unasked)
+    return Reprocess(one.__name__, outdated=rows, below=below, unasked=unasked)
 
 
 def _named(columns: Sequence[str], name: str) -> list[tuple[str, str]]:
@@ -173,18 +168,19 @@ def carry_out(plan: Reprocess) -> Iterator[int]:
     if plan.add:
         _, selection, _ = _SELECTIONS[plan.table]
         done = 0
-        for part in parts(plan.add):
+        for part in parts({**row, **plan.chosen} for row in plan.add.to_dicts()):
             selection.insert(part, skip_duplicates=True)
             if plan.fit_method is not None:
                 plan_fits(part, plan.fit_method)
             yield (done := done + len(part))
         # A new plan of fits makes keys computable of the table before it, which plans the sets.
         queue.fill(table_named("TrialInput") if one is fit.SessionFit else one, None, AGAIN)
-    for i in range(0, len(plan.outdated), CHUNK):
-        part = plan.outdated[i : i + CHUNK]
+    keys = plan.outdated.keys() if plan.outdated else ()
+    for i in range(0, len(keys), CHUNK):
+        part = keys[i : i + CHUNK]
         delete_below(one, part)
         queue.fill(one, part, AGAIN)
-        yield min(i + CHUNK, len(plan.outdated))
+        yield min(i + CHUNK, len(keys))
 
 
 def parse_time(text: str | None) -> datetime.datetime | None:
@@ -204,8 +200,9 @@ def summary(plan: Reprocess) -> Sequence[str]:
     out = []
     if plan.add:
         out.append(f"{len(plan.add)} selections would be added for {plan.table}; nothing is deleted")
-        pairs = {(row["fit_method"], row["keypoint_method"]) for row in plan.add if "fit_method" in row}
-        out += [f"warning: {said}" for pair in sorted(pairs) if (said := unsuited(*pair))]
+        if method := plan.chosen.get("fit_method"):
+            of_points = sorted((dj.U("keypoint_method") & plan.add).to_arrays("keypoint_method"))
+            out += [f"warning: {said}" for points in of_points if (said := unsuited(method, points))]
     if plan.outdated:
         out.append(f"{len(plan.outdated)} rows of {plan.table} would be deleted and computed again")
         out += [f"  with it: {n} rows of {name}" for name, n in plan.below.items()]

@@ -23,7 +23,7 @@ from pbl_schemas.jobs import keys_of
 from pbl_schemas.rows import InputChanged
 from pbl_schemas.stored_files import remove_left_over
 
-from . import queue
+from . import queue, recover
 from .queue import Claim, ReservationLost
 
 #: Outcomes of a job.
@@ -96,7 +96,8 @@ def run(
     back for `STORE_WAIT_S`. A job whose inputs are gone or changed is put back too, each time for longer; `ATTEMPTS` of
     these make an error row.
 
-    KeyboardInterrupt and SystemExit put the job back and go on up.
+    KeyboardInterrupt and SystemExit put the job back and go on up. Raises `PblError` DEVICE_UNAVAILABLE where the
+    device does not compute: it counts as a crash of the process, which has to end.
     """
     start, attempt, repeated = time.monotonic(), _Attempt(job, computed), 0
     while True:
@@ -107,7 +108,7 @@ def run(
         except (KeyboardInterrupt, SystemExit):
             queue.put_back(job)
             raise
-        except Exception as error:  # noqa: BLE001  each kind is settled below
+        except Exception as error:
             repeated += 1
             if is_gone(error) or number_of(error) in FULL:
                 kept = repeated * DATABASE_PAUSE_S < DATABASE_WAIT_S
@@ -117,6 +118,9 @@ def run(
                 outcome = _outcome(job, LATER, error)
             elif number_of(error) in REPEAT and repeated < REPEATS:
                 continue
+            elif reason := device_failure(error):  # all further jobs of this process would meet it too
+                recover.crashed(job, reason)
+                raise _no_device(job, reason) from error
             else:
                 outcome = _settle(job, error)
             break
@@ -211,6 +215,22 @@ def cause_outside(error: BaseException) -> str | None:
         if isinstance(seen, OSError) and seen.errno in STORE_GONE and not isinstance(error, PblError):
             return f"STORE: {type(seen).__name__}: {seen}"
     return None
+
+
+def device_failure(error: BaseException) -> str:
+    """Return JAX's message where the device does not compute, a GPU that is gone or has no memory left, else ""."""
+    seen = next((e for e in causes(error) if type(e).__name__ in ("JaxRuntimeError", "XlaRuntimeError")), None)
+    return " ".join(str(seen).split())[:200] if seen else ""
+
+
+def _no_device(job: Claim, reason: str) -> PblError:
+    return PblError(
+        "DEVICE_UNAVAILABLE",
+        found=reason,
+        expected="a device that computes",
+        next_step="see whether `nvidia-smi` lists it and memory is free; the job waits for another process",
+        key=str(job),
+    )
 
 
 def number_of(error: BaseException) -> int:

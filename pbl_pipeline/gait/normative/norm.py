@@ -15,7 +15,9 @@ import numpy as np
 from pbl_pipeline.bounded import parse_json, read_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.paramset import canonical_json, structured
+from pbl_pipeline.records import record
 from pbl_pipeline.results.cycles import BODY_ANGLES
+from pbl_pipeline.results.index import NormFacts
 
 #: The original index (Schwartz & Rozumalski 2008): nine angles x 51 points.
 NINE_ANGLES: tuple[str, ...] = (
@@ -103,20 +105,11 @@ DEFAULT_NORM = "gillette-166-body-angles"
 _FOLDER = resources.files("pbl_pipeline.gait.normative").joinpath("data")
 
 
-@dataclasses.dataclass(frozen=True)
-class NormativeSet:
-    """Healthy gait with which a cycle is compared."""
+@record(kw_only=True)
+class NormativeSet(NormFacts):
+    """Healthy gait with which a cycle is compared. `variables` are names of `ANGLE_NAMES`."""
 
-    #: Identity, number of normative vectors, their source, definition of their angles.
-    name: str
-    version: int
-    n: int
-    source: str
-    licence: str
-    convention: str
-    #: Names of the angles in the feature vector (`ANGLE_NAMES`), in order, each at `percent` of the cycle.
-    variables: tuple[str, ...]
-    percent: np.ndarray  # (P,)
+    percent: np.ndarray  # (P,) of the cycle, at which each angle stands in the feature vector
     mean_deg: np.ndarray  # (V * P,) mean normative vector
     #: (K, V * P) orthonormal principal components, largest variance first, the largest entry of each positive.
     components: np.ndarray
@@ -128,8 +121,6 @@ class NormativeSet:
     #: name -> {"percent", "mean_deg", "sd_deg"}: the band of a report, also for angles outside the index.
     curves: dict[str, dict[str, np.ndarray]]
     source_sha256: str = ""  # of the file the set was built from
-    sha256: str = ""  # of the numbers above, checked at loading
-    angle_model: str = PLUG_IN_GAIT  # definition of the angles, one of `ANGLE_MODELS`
     mapped_from: str = ""  # the definition in which they were measured, if they were mapped from another one
 
     def log_distance(self, vectors: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ class Samples:
     counter: np.ndarray | None = None  # (N,)
     stated_hz: float | None = None
     wraps_s: float | None = None
+    mounting: np.ndarray | None = None  # (4,) of `SensorLog`
 
 
 @dataclasses.dataclass(frozen=True)

@@ -165,7 +165,7 @@ def ingest(
         return
     if dry_run:
         raise click.UsageError("--dry-run goes with --sheet.")
-    _one_kind(videos, markers, marker_set, bool(attitude or depth or imu), rig is not None)
+    _one_kind(videos, markers, marker_set, bool(attitude or depth), bool(imu), rig is not None)
     files = _files(len(videos), attitude, depth, imu)
     visits, results = _visits(videos or markers, name_pattern, stated)
     if imu and len({visit for _, visit in visits}) > 1:
@@ -178,7 +178,7 @@ def ingest(
     if methods.fit is not None:
         _warn(methods, bool(markers))
     if rig is not None:
-        results += register([SeveralCameras(videos, rig, visits[0][1])], methods)
+        results += register([SeveralCameras(videos, rig, visits[0][1], files[0])], methods)
     elif markers:
         results += register([LaboratoryMarkers(markers[i], visit, marker_set, up) for i, visit in visits], methods)
     else:
@@ -255,16 +255,18 @@ def _visits(
 
 
 def _one_kind(
-    videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, with_files: bool, rig: bool
+    videos: tuple[Path, ...], markers: tuple[Path, ...], marker_set: str | None, of_phone: bool, worn: bool, rig: bool
 ) -> None:
-    """Raise `click.UsageError` unless there are videos, or markers or views of a rig without a phone's files."""
+    """Raise `click.UsageError` unless there are videos, or views of a rig without a phone's files, or markers without
+    any."""
     for wrong, text in (
         (not videos and not markers, "Missing argument 'VIDEOS...' (or --markers FILE)."),
         (videos and markers, "Videos and --markers in one call: register each in a separate call."),
         (
-            (markers or rig) and with_files,
-            "--attitude, --depth and --imu belong to videos of one camera, not to --markers or --rig.",
+            (markers or rig) and of_phone,
+            "--attitude and --depth belong to videos of one camera, not to --markers or --rig.",
         ),
+        (markers and worn, "--imu goes with videos, not with --markers."),
         (markers and rig, "--rig goes with videos, not with --markers."),
         (marker_set is not None and not markers, "--marker-set goes with --markers."),
     ):

@@ -8,13 +8,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.results.events import SetEvent
 
 from .. import fit, gait, video
 from ..plan import locked
 from ..reading.objects import load_trial_fit
 from ..rows import delete_below, utc_now
 from ..transactions import repeated
-from .review_decisions import last_decision, meanwhile, record
+from .review_decisions import last_decision, meanwhile, queue_visit, record
 
 if TYPE_CHECKING:
     from pbl_pipeline import gait as lib
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 Event = tuple[float, str, str, float | None]
 #: Tracking method and number of a person, None for laboratory markers.
 Person = tuple[str | None, int | None]
-#: Parts of an `Event` in the tables' columns, after their prefix.
-_COLUMNS = ("time", "side", "kind", "probability")
 #: Two times closer than this are the same (s): what a page sends is rounded.
 _SAME_S = 0.0015
 
@@ -64,16 +63,16 @@ def shown_events(video_id: int) -> ShownEvents | None:
     key = None if trial is None else gait.newest_events(trial)
     if key is None:
         return None
-    detected = (gait.GaitEvents.Event & key).to_dicts(order_by="event_no")
+    detected = gait.GaitEvents.Event.records(key)
     counts = gait.correction_of(key)
     about = {} if counts is None else (gait.EventCorrection & counts).fetch1()
-    hand = [] if counts is None else (gait.EventCorrection.Event & counts).to_dicts(order_by="corrected_no")
+    hand = None if counts is None else tuple(map(dataclasses.astuple, gait.EventCorrection.Event.records(counts)))
     last = last_decision(key["video_id"], "events")
     computed = (gait.GaitEvents & key).fetch1("events_computed")
     return ShownEvents(
         key=key,
-        detected=tuple(tuple(e[f"event_{k}"] for k in _COLUMNS) for e in detected),
-        hand=None if counts is None else tuple(tuple(e[f"corrected_{k}"] for k in _COLUMNS) for e in hand),
+        detected=tuple((e.time_s, e.side, e.event, e.probability) for e in detected),
+        hand=hand,
         by=about.get("correction_by", ""),
         at=about.get("correction_at"),
         n_changed=int(about.get("correction_changed", 0)),
@@ -127,7 +126,8 @@ def take_back(video_id: int, by: str, seen: str) -> dict[str, int]:
 @repeated
 def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen: str) -> dict[str, int]:
     trial = int(before.key["video_id"])
-    with locked(int((video.Video & {"video_id": trial}).fetch1("session_id"))):
+    session_id = int((video.Video & {"video_id": trial}).fetch1("session_id"))
+    with locked(session_id):
         now = _must_be_shown(trial)
         if now.state != seen:
             raise meanwhile(trial, "events")
@@ -142,12 +142,10 @@ def _decide(before: ShownEvents, events: tuple[Event, ...] | None, by: str, seen
             n_changed = _n_changed(events, now.detected)
             after = {"by": "hand", "changed": n_changed, "events": _listed(events)}
             number = _insert(now.key, gait.measured_person(now.key), by, correction_changed=n_changed)
-            names = [f"corrected_{k}" for k in _COLUMNS]
-            gait.EventCorrection.Event.insert(
-                {**number, "corrected_no": i, **dict(zip(names, e, strict=True))} for i, e in enumerate(events, 1)
-            )
+            gait.EventCorrection.Event.insert_records(number, [SetEvent(*e) for e in events])
         was = {"by": "automatic" if now.hand is None else "hand", "events": _listed(now.events)}
         record("events", by, {"method": now.method}, was, after, video_id=trial)
+        queue_visit(session_id)
         cycles = (gait.GaitCycle & _of_events(now.key)).proj("correction_no").to_dicts()
         outdated = [r for r in cycles if (gait.correction_of(r) or {}).get("correction_no") != r["correction_no"]]
         return delete_below(gait.GaitCycle, [{k: r[k] for k in gait.GaitCycle.primary_key} for r in outdated])
@@ -174,7 +172,7 @@ def _insert(key: Mapping[str, Any], person: Person, by: str, **columns: Any) -> 
             "correction_changed": 0,
             "correction_tracking": person[0],
             "correction_person": person[1],
-            "correction_by": by[:64],
+            "correction_by": by,
             "correction_at": utc_now(),
             **columns,
         }

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pbl_pipeline.errors import PblError
+from pbl_pipeline.names import check_label
 from pbl_pipeline.qc import CADENCE
 from pbl_pipeline.words import UNUSABLE
 
@@ -16,7 +18,7 @@ from ..jobs import jobs_of
 from ..plan import locked, plan_anew, queues_before_fit
 from ..review import Decision, Viewing
 from ..rows import delete_below, moment, utc_now
-from ..transactions import in_transaction, next_id, repeated
+from ..transactions import after_commit, in_transaction, next_id, repeated
 from . import not_usable
 from .candidates import selection_of
 from .not_usable import Unusable
@@ -95,7 +97,8 @@ def decide_person(
     """
     selection = selection_of(video_id, tracking_method)
     failed = jobs_of(tracking.SubjectChoice)  # declares the job table, which would end a transaction
-    with locked(int((video.Video & {"video_id": video_id}).fetch1("session_id"))):  # concurrent decisions wait here
+    session_id = int((video.Video & {"video_id": video_id}).fetch1("session_id"))
+    with locked(session_id):  # concurrent decisions wait here
         if seen is not None and person_state(video_id, selection["tracking_method"]) != seen:
             raise meanwhile(video_id, "person")
         rows = (tracking.SubjectChoice & selection).to_dicts()
@@ -105,6 +108,7 @@ def decide_person(
         deleted = tracking.drop_outdated_choices(selection)
         about = {"tracking_method": selection["tracking_method"]}
         record("person", by, about, before, {"person": person}, video_id=video_id)
+        queue_visit(session_id)
     return deleted
 
 
@@ -121,13 +125,14 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
     and the session is planned without it: exactly what depends on it is pending. Nothing is deleted, so taking it back
     brings back what was computed; frozen slices stay as they are.
 
-    Raises `PblError` USAGE for an unknown reason, or "other" without words; DB_NOT_FOUND for an unknown recording;
-    DECIDED_MEANWHILE if `seen` is another state than the tables'.
+    Raises `PblError` USAGE for an unknown reason, "other" without words, or a note of more than 500 characters;
+    DB_NOT_FOUND for an unknown recording; DECIDED_MEANWHILE if `seen` is another state than the tables'.
 
     `reason`, `note`: one of `words.UNUSABLE`, and more in free words (no names), which "other" asks for. `seen`:
     `usable_state` of the page on which it was decided; None: not compared.
     """
-    note = " ".join(note.split())[:500]
+    note = " ".join(note.split())
+    check_label("note", note, 500)
     if reason not in UNUSABLE or (reason == "other" and not note):
         raise PblError(
             "USAGE",
@@ -136,7 +141,7 @@ def mark_not_usable(video_id: int, reason: str, note: str = "", by: str = "", se
             next_step="choose a reason, and say more in the note; nothing was changed",
             key=f"video_id={video_id}",
         )
-    _decide_usable(video_id, {"unusable_reason": reason, "unusable_note": note, "unusable_by": by[:64]}, by, seen)
+    _decide_usable(video_id, {"unusable_reason": reason, "unusable_note": note, "unusable_by": by}, by, seen)
 
 
 def take_back(video_id: int, by: str = "", seen: str | None = None) -> None:
@@ -167,6 +172,7 @@ def _decide_usable(video_id: int, mark: dict[str, str] | None, by: str, seen: st
         reason = after.note if after else ""
         record("usable", by, {}, _said(before), _said(after), reason, video_id=video_id)
         plan_anew(session_id, failed)
+        queue_visit(session_id)
 
 
 def _said(mark: Unusable | None) -> dict[str, str]:
@@ -223,6 +229,7 @@ def accept_check(key: Mapping[str, Any], number: int, by: str, reason: str) -> N
             about["cadence"] = {str(trial["video_id"]): cadence for trial, cadence in refused}
         record("check", by, about, {"outcome": outcome}, {"outcome": "accepted"}, reason, session_id=session_id)
         delete_below(gait.GaitCycle, [trial for trial, _ in refused])
+        queue_visit(session_id)
 
 
 def may_be_accepted(check: str, outcome: str) -> bool:
@@ -279,19 +286,31 @@ def accepted_sql(check: str, checks: str, of_visit: str) -> str:
     )
 
 
+#: Functions that queue what a decision about a visit (session_id) made computable.
+QUEUE: list[Callable[[int], object]] = []
+
+
+def queue_visit(session_id: int) -> None:
+    """Queue what a decision made computable of a visit, once it is committed, so that pages and workers see it."""
+    for queue in QUEUE:
+        after_commit(functools.partial(queue, session_id))
+
+
 def record(what: str, by: str, about: dict, before: dict, after: dict, reason: str = "", **of: int) -> None:
-    """Insert a row of Decision; `of`: session_id or video_id. Inside the transaction of what was decided."""
+    """Insert a row of Decision; `of`: session_id or video_id. Inside the transaction of what was decided. Raises
+    `PblError` USAGE for a reason of more than 500 characters."""
+    check_label("reason", reason, 500)
     Decision.insert1(
         {
             "decision_id": next_id(Decision, "decision_id"),
             **of,
             "decision_what": what,
-            "decision_by": by[:64],
+            "decision_by": by,
             "decision_at": utc_now(),
             "decision_about": about,
             "decision_before": before,
             "decision_after": after,
-            "decision_reason": reason[:500],
+            "decision_reason": reason,
         }
     )
 
@@ -301,7 +320,7 @@ def record_viewing(of: str, number: int, what: str, by: str) -> None:
     `what`: the viewed part of it, such as "video" or "report"."""
     if not {"video_id": video.Video, "session_id": session.Session}[of] & {of: number}:
         return
-    row = {of: number, "viewing_what": what[:16], "viewing_by": by[:64], "viewing_at": utc_now()}
+    row = {of: number, "viewing_what": what, "viewing_by": by, "viewing_at": utc_now()}
     in_transaction(lambda: Viewing.insert1({"viewing_id": next_id(Viewing, "viewing_id"), **row}))
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,7 +19,8 @@ import numpy as np
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import check_label
 from pbl_pipeline.paramset import canonical_json
-from pbl_pipeline.records import number
+from pbl_pipeline.records import number, to_row
+from pbl_pipeline.results.video_facts import Intrinsics
 
 from .. import keypoints, lab, video
 from ..queues import forget_errors
@@ -35,19 +35,11 @@ def camera_row(camera: Camera, size_px: tuple[int, int]) -> dict[str, Any]:
     """Return the library's `Camera` of upright pictures (width, height) as a row of CameraCalibration, without its
     number. Raises `PblError` USAGE for the name of a file or camera with control characters."""
     check_label("name of the calibration", camera.source, 1000)
-    row = {
-        "camera_width": size_px[0],
-        "camera_height": size_px[1],
-        "camera_fx": float(camera.matrix[0, 0]),
-        "camera_fy": float(camera.matrix[1, 1]),
-        "camera_cx": float(camera.matrix[0, 2]),
-        "camera_cy": float(camera.matrix[1, 2]),
-        "camera_distortion": [float(d) for d in camera.distortion],
-        "camera_origin": "measured",
-        "camera_note": camera.source.removeprefix("file:").strip()[:255],
-        # Only where it is known: calibrations that were stored without it keep their hash.
-        **({"camera_focal_sd": sd} if math.isfinite(sd := camera.focal_rel_sd * camera.focal_px) else {}),
-    }
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix
+    sd, note = camera.focal_rel_sd * camera.focal_px, camera.source.removeprefix("file:").strip()
+    found = to_row(Intrinsics("measured", *size_px, fx, fy, cx, cy, camera.distortion, sd, note))
+    # Only what is known: calibrations that were stored without `camera_focal_sd` keep their hash.
+    row = {name: value for name, value in found.items() if value is not None}
     return {**row, "camera_sha256": hashlib.sha256(canonical_json(row).encode()).hexdigest()}
 
 

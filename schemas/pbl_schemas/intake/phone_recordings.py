@@ -28,7 +28,7 @@ PART_BYTES, MOST_PARTS, MOST_LOG_BYTES = 2**20, 900, 32 * 2**20
 #: Recordings that one link takes.
 MOST_RECORDINGS = 100
 #: Statements of a phone about a recording: longest text of each (characters), and whole numbers.
-TEXTS = {"activity": 32, "pace": 32, "aid": 64, "step": 64, "note": 500, "camera": 128, "sensor": 64}
+TEXTS = {"activity": 32, "pace": 32, "aid": 64, "step": 64, "note": 500, "camera": 128, "sensor": 64, "worn": 8}
 NUMBERS = ("frames", "dropped")
 _refused = functools.partial(
     PblError,
@@ -105,7 +105,7 @@ def make_link(session_id: int, by: str, hours: float = HOURS, protocol: str | No
                 "session_id": session_id,
                 "protocol": protocol,
                 "link_key_sha256": hashed(key),
-                "link_by": by[:64],
+                "link_by": by,
                 "link_created": now,
                 "link_expires": now + datetime.timedelta(hours=hours),
             }

@@ -256,14 +256,14 @@ def session_ids(visits: Iterable[VisitRecord]) -> dict[tuple[str, str], int]:
     if missing:
         first = next_id(session.Session, "session_id", len(missing))
         numbers |= {key: first + i for i, key in enumerate(missing)}
-    dates = {(v.subject, v.session_label): v.date for v in visits if v.date is not None}
+    dates, now = {(v.subject, v.session_label): v.date for v in visits if v.date is not None}, utc_now()
     session.Session.insert(
         {
             "session_id": numbers[key],
             "subject": key[0],
             "session_label": key[1],
             "session_date": dates.get(key) or day_of(key[1]),
-            "session_created": utc_now(),
+            "session_created": now,
         }
         for key in missing
     )

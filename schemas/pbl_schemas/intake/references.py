@@ -131,10 +131,11 @@ def add_reference(
     video_id = find_video(about)
     path = Path(path).absolute()
     truth = read_reference(path, source, shift_s)
+    check_label("source", truth.source, _LONGEST["source"], least=1)
     sha256 = sha256_of(path)
     what = {"source": truth.source, "convention": truth.convention, "sha256": sha256, "shift_s": float(shift_s)}
     key = {"video_id": video_id, "reference": hashlib.sha256(canonical_json(what).encode()).hexdigest()[:16]}
-    of_source = {"video_id": video_id, "reference_source": truth.source[:64]}
+    of_source = {"video_id": video_id, "reference_source": truth.source}
     table = validation.ReferenceKinematics
     with table.connection.transaction:
         current = (table & of_source & {"reference_current": True}).to_dicts(order_by="reference_created")

@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 import shutil
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,10 @@ from pbl_pipeline.files import sha256_of
 from pbl_pipeline.temporary import new_folder
 
 from .. import fit, keypoints, session, video
+from ..queues import forget_errors
 from ..rows import counted, delete_below, utc_now
+from ..transactions import in_transaction
+from .records import usage
 
 if TYPE_CHECKING:
     from pbl_pipeline.sensors import Given
@@ -28,11 +31,12 @@ NONE = "none"
 @dataclasses.dataclass(frozen=True)
 class Sensors:
     """Sensor files of one video; None and () change nothing. attitude: a log, or `NONE`; imu: sensors that the person
-    wore at its visit."""
+    wore at its visit; sums: SHA-256 of the files, once they were read."""
 
     attitude: Path | None = None
     depth: Path | None = None
     imu: Sequence[Given] = ()
+    sums: Mapping[Path, str] = dataclasses.field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return self.attitude is not None or self.depth is not None or bool(self.imu)
@@ -44,8 +48,8 @@ class Sensors:
 
     def read(self) -> tuple[Sensors, PhoneLog | None]:
         """Read the logs, if there are any, and check that the other files exist; returns these files with the names of
-        the sensors in them, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT for a file
-        without bytes; SENSOR_LOG, USAGE as `read_given`."""
+        the sensors in them and their sums, and the phone's log. Raises `PblError` FILE_MISSING, PHONE_LOG; FILE_FORMAT
+        for a file without bytes; SENSOR_LOG, USAGE as `read_given`."""
         from pbl_pipeline.sensors import read_given
         from pbl_pipeline.video import read_phone_log
 
@@ -55,24 +59,43 @@ class Sensors:
         logs = iter(read_given([given for given in self.imu if given.segment is not None]))
         imu = [g if g.segment is None else dataclasses.replace(g, sensor=next(logs).name) for g in self.imu]
         log = read_phone_log(self.attitude) if self.has_log and self.attitude is not None else None
-        return dataclasses.replace(self, imu=imu), log
+        files = {self.attitude, self.depth, *(given.file for given in imu)} - {None, Path(NONE)}
+        return dataclasses.replace(self, imu=imu, sums={path: _sha256(path) for path in files if path is not None}), log
 
 
 def attach(video_id: int, given: Sensors, log: PhoneLog | None) -> list[str]:
-    """Insert what the video does not have yet; returns it in words. Call it in a transaction.
+    """Insert what the video does not have yet, of files that were read (`Sensors.read`); returns it in words. Call it
+    in a transaction.
 
     Another log (or none) takes the older one's place, and what was computed with that is deleted: keypoints and after.
     """
     key = {"video_id": video_id}
     done = []
     if given.attitude is not None:
-        done += _attach_log(key, given.attitude, log)
-    if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth)):
+        done += _attach_log(key, given.attitude, given.sums, log)
+    if given.depth is not None and (how := _keep(video.DepthVideo, "depth", key, given.depth, given.sums)):
         done.append(f"depth video {given.depth.name} was {how}")
-    return done + _attach_sensors(key, given.imu)
+    return done + _attach_sensors(key, given.imu, given.sums)
 
 
-def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[str]:
+def attach_worn(session_id: int, given: Sequence[Given]) -> list[str]:
+    """Attach logs of wearable sensors to a visit that has a video; returns it in words. Raises `PblError` USAGE without
+    a video, what `Sensors.read` and `fit.check_sensors` raise."""
+    videos = (video.Video & {"session_id": session_id}).to_arrays("video_id")
+    if not len(videos):
+        raise usage("sensors of a visit without a recording", "at least one recording", next_step="film first")
+    return attach_now(int(min(videos)), Sensors(imu=given).read()[0])
+
+
+def attach_now(video_id: int, worn: Sensors) -> list[str]:
+    """Attach sensors that a person wore, which were read, in a transaction; returns it in words."""
+    done = in_transaction(lambda: attach(video_id, worn, None), fresh=True)
+    if done:
+        forget_errors(video_id)  # fits of the visit may have failed by its older sensors
+    return done
+
+
+def _attach_log(key: dict[str, Any], path: Path, sums: Mapping[Path, str], log: PhoneLog | None) -> list[str]:
     table = video.PhoneAttitude & key
     if log is None:
         if not table:
@@ -89,7 +112,7 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
         "attitude_sensors": {name: len(s.time_s) for name, s in log.sensors.items()},
         "attitude_notes": list(log.notes),
     }
-    how = _keep(video.PhoneAttitude, "attitude", key, path, about)
+    how = _keep(video.PhoneAttitude, "attitude", key, path, sums, about)
     if not how:
         return []
     return [
@@ -97,7 +120,7 @@ def _attach_log(key: dict[str, Any], path: Path, log: PhoneLog | None) -> list[s
     ]
 
 
-def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
+def _attach_sensors(key: dict[str, Any], given: Sequence[Given], sums: Mapping[Path, str]) -> list[str]:
     """Attach logs of wearable sensors to a video, and delete the fits of its visit that were made without them. A log
     of a segment takes the place of the visit's older one. Raises what `fit.check_sensors` raises for all together."""
     if not given:
@@ -112,7 +135,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
     done, worn = [], False
     for (file, rate), own in files.items():
         rows = of_visit.to_dicts()
-        sha256 = None if str(file) == NONE else _sha256(file)
+        sha256 = None if str(file) == NONE else sums[file]
         if same := next((r for r in rows if r["imu_sha256"] == sha256), None):  # further sensors of a file
             before, rate = same["imu_segments"] or {}, rate if own else same["imu_rate"]
             own = {s: name for s, name in before.items() if name not in own.values()} | own
@@ -132,7 +155,7 @@ def _attach_sensors(key: dict[str, Any], given: Sequence[Given]) -> list[str]:
             continue
         number = max((int(n) for n in (video.WearableImu & key).to_arrays("imu")), default=0) + 1
         about = {"imu_segments": own or None, "imu_rate": rate}
-        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, about)
+        _keep(video.WearableImu, "imu", {**key, "imu": number}, file, sums, about)
         where = f"sensors on {', '.join(sorted(own))}" if own else "kept and not read: no segment of the body is known"
         done.append(f"wearable IMU file {file.name} was attached, {where}")
         worn |= bool(own)
@@ -178,27 +201,30 @@ def _sha256(path: Path) -> str:
         return sha256_of(_zipped(path, folder / "log.zip"))
 
 
-def _keep(table: Any, prefix: str, key: dict[str, Any], path: Path, about: dict[str, Any] | None = None) -> str:
-    """Insert a copy of a file as the row with this key; return "attached", "replaced" for an older one, or "" for the
-    same bytes."""
+def _keep(
+    table: Any,
+    prefix: str,
+    key: dict[str, Any],
+    path: Path,
+    sums: Mapping[Path, str],
+    about: dict[str, Any] | None = None,
+) -> str:
+    """Insert a file, or a folder as a zip, as the row with this key; return "attached", "replaced" for an older one, or
+    "" for the same bytes."""
     before = (table & key).to_dicts()
+    if before and before[0][f"{prefix}_sha256"] == sums[path]:
+        return ""
     with new_folder() as folder:
-        copy = folder / f"{prefix}{path.suffix if path.is_file() else '.zip'}"
-        source = path if path.is_file() else _zipped(path, copy)
-        sha256 = sha256_of(source)
-        if before and before[0][f"{prefix}_sha256"] == sha256:
-            return ""
-        if source != copy:
-            shutil.copyfile(source, copy)
+        file = path if path.is_file() else _zipped(path, folder / f"{prefix}.zip")
         (table & key).delete(prompt=False)
         table.insert1(
             {
                 **key,
                 f"{prefix}_name": path.name[-255:],
-                f"{prefix}_sha256": sha256,
-                f"{prefix}_size": copy.stat().st_size,
+                f"{prefix}_sha256": sums[path],
+                f"{prefix}_size": file.stat().st_size,
                 f"{prefix}_created": utc_now(),
-                f"{prefix}_file": copy,
+                f"{prefix}_file": file,
                 **(about or {}),
             }
         )

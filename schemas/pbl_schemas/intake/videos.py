@@ -21,7 +21,7 @@ from ..transactions import in_transaction, next_id
 from .calibrations import camera_id_of, camera_row, known_camera
 from .records import File, Methods, Recording, RefusedFile, Registered, VisitRecord, usage
 from .registration import register
-from .sensors import NONE, Sensors, attach, delete_keypoints
+from .sensors import NONE, Sensors, attach, attach_now, delete_keypoints
 
 if TYPE_CHECKING:
     from pbl_pipeline.video import PhoneLog
@@ -39,6 +39,7 @@ class SeveralCameras(Recording):
     videos: Sequence[Path]
     calibration: Path
     visit: VisitRecord
+    sensors: Sensors = dataclasses.field(default_factory=Sensors)  # those that the person wore
     motion: ClassVar[str] = video.ONE_OF_SEVERAL  # type: ignore[misc]
     rig: dict[str, Any] = dataclasses.field(default_factory=dict, init=False)  # columns of Rig
     seen_by: list[str] = dataclasses.field(default_factory=list, init=False)  # the camera of each video
@@ -90,7 +91,7 @@ class SeveralCameras(Recording):
             found = "the same video as two cameras"
             raise usage(found, "a video of each camera", next_step="name each camera's own video", key=twice[0])
         check_same_times(times, paths[0])
-        self.files = tuple(files)
+        self.files, (self.sensors, _) = tuple(files), self.sensors.read()
         self.rig = {"rig_sha256": sha256_of(self.calibration), "rig_cameras": names}
 
     def check_known(self, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -108,6 +109,9 @@ class SeveralCameras(Recording):
                 key=self.files[0].path,
             )
 
+    def update(self, row: Mapping[str, Any]) -> list[str]:
+        return attach_now(int(row["video_id"]), self.sensors) if self.sensors else []
+
     def check_session(self, session_id: int) -> None:
         check_same_number(session_id, len(self.files), self.files[0].path)
 
@@ -117,7 +121,8 @@ class SeveralCameras(Recording):
             {"video_id": number, "rig_id": rig_id, "rig_trial": numbers[0], "rig_camera": camera}
             for number, camera in zip(numbers, self.seen_by, strict=True)
         )
-        return [f"trial {numbers[0]}, camera {camera}" for camera in self.seen_by]
+        first, *others = (f"trial {numbers[0]}, camera {camera}" for camera in self.seen_by)
+        return ["; ".join((first, *attach(numbers[0], self.sensors, None))), *others]
 
     def _rig_id(self) -> int:
         """The number of the rig of this calibration, which is registered where it is new."""

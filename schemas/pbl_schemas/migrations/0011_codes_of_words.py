@@ -8,6 +8,7 @@ Forces that were refused because of a word for no aid are deleted, and computed 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from pbl_pipeline.texts import code_of
@@ -26,16 +27,33 @@ _COLUMNS = (
 )
 
 
-def statements(conn: Any) -> list[str]:
-    """Updates of the words that have a code, and deletions of the forces."""
-    there, out = catalog.names(), []
+def _words(conn: Any) -> Iterator[tuple[str, str, dict[str, str]]]:
+    """Yield table, column, and code by word of the words that it has and that have a code."""
+    there = catalog.names()
     for stage, name, column, kind in _COLUMNS:
         schema = connection.schema_name(stage)
         if (schema, name) not in there:
             continue
         table = catalog.quote(schema, name)
         words = [str(word) for (word,) in conn.query(f"SELECT DISTINCT {column} FROM {table}").fetchall()]
-        coded = {word: code for word in words if (code := code_of(kind, word)) != word}
+        yield table, column, {word: code for word in words if (code := code_of(kind, word)) != word}
+
+
+def restated(conn: Any) -> set[int]:
+    """Numbers of the visits whose words become codes."""
+    visits, out = catalog.quote(connection.schema_name("session"), "session"), set()
+    for table, column, coded in _words(conn):
+        if coded and column != "forces_aid":
+            key, words = "subject" if column == "population" else "session_id", ", ".join(map(literal, coded))
+            of_words = f"SELECT session_id FROM {visits} JOIN {table} USING ({key}) WHERE {column} IN ({words})"
+            out |= {int(number) for (number,) in conn.query(of_words).fetchall()}
+    return out
+
+
+def statements(conn: Any) -> list[str]:
+    """Updates of the words that have a code, and deletions of the forces."""
+    out = []
+    for table, column, coded in _words(conn):
         if coded and column == "forces_aid":
             of_none = ", ".join(literal(word) for word, code in coded.items() if code == "none")
             conn.dependencies.load(force=True)

@@ -20,6 +20,7 @@ from pbl_schemas.datajoint_setup import dj, read_heading_again
 from pbl_schemas.operations import catalog
 from pbl_schemas.operations.catalog import quote
 from pbl_schemas.operations.declare import declare_all
+from pbl_schemas.rows import inside, parts
 from pbl_schemas.stages import STAGES, modules
 from pbl_schemas.tables_version import applied, numbered, record, refuse_newer, title
 
@@ -71,12 +72,14 @@ Say = Callable[[str], None]
 @dataclasses.dataclass(frozen=True)
 class Migration:
     """A module of migrations/. `statements(conn)` returns what is still to be done; `changed(conn)` set and gait_method
-    ("": all) of the results that have other numbers then, or none until they are computed again."""
+    ("": all) of the results that have other numbers then, or none until they are computed again; `restated(conn)` the
+    visits about which the same is said in other words."""
 
     number: int
     name: str
     statements: Callable[[Any], list[str]]
     changed: Callable[[Any], list[tuple[str, str]]] = lambda _: []
+    restated: Callable[[Any], set[int]] = lambda _: set()
 
     @property
     def title(self) -> str:
@@ -97,7 +100,8 @@ class Migrated:
 def available() -> list[Migration]:
     """Return all migrations, in the order of their numbers. Raises ValueError as `tables_version.numbered`."""
     loaded = ((n, name, importlib.import_module(f"pbl_schemas.migrations.{n:04d}_{name}")) for n, name in numbered())
-    return [Migration(n, name, m.statements, getattr(m, "changed", lambda _: [])) for n, name, m in loaded]
+    own = ("statements", "changed", "restated")
+    return [Migration(n, name, **{f: getattr(m, f) for f in own if hasattr(m, f)}) for n, name, m in loaded]
 
 
 def workers_of_other_versions() -> list[str]:
@@ -205,18 +209,22 @@ def _touched(conn: Any, due: Sequence[Migration]) -> list[str]:
         f"SELECT subject, session_label FROM {sets} JOIN {visits} USING (session_id) WHERE fit_set = %s LIMIT 1",  # noqa: S608
         f"SELECT JSON_VALUE(decision_about, '$.check'), decision_by FROM {decisions} WHERE decision_what = 'check'"  # noqa: S608
         f" AND JSON_VALUE(decision_about, '$.fit_set') = %s AND {of_method} ORDER BY decision_id",
-        f"SELECT study_slice FROM {members} JOIN {slices} USING (study_slice) WHERE slice_fit_set = %s"  # noqa: S608
+        f"SELECT study_slice, session_id FROM {members} JOIN {slices} USING (study_slice) WHERE slice_fit_set = %s"  # noqa: S608
         " AND (%s = '' OR gait_method = %s)",
     )
-    out, of_slices = [], Counter[str]()
+    out, of_slices = list[str](), set[tuple[str, int]]()
     for fit_set, method in sorted({pair for m in due for pair in m.changed(conn)}):
         args = (fit_set, method, method)
         visit, checks, names = (conn.query(q, args=args[: q.count("%s")]).fetchall() for q in queries)
         said = "".join(f"visit {label} of {subject}" for subject, label in visit)
         out.append(f"changes: the results of {said}{f' by {method}' if method else ''}")
         out += [f"changes: the check {c} of {said}, which {who} accepted, is to be accepted again" for c, who in checks]
-        of_slices.update(name for (name,) in names)
-    slices = [f"changes: {n} visits of the slice {name}" for name, n in sorted(of_slices.items())]
+        of_slices.update(names)
+    for some in parts({number for m in due for number in m.restated(conn)}):
+        frozen = f"SELECT study_slice, session_id FROM {members} WHERE {inside('session_id', some)}"  # noqa: S608
+        of_slices.update(conn.query(frozen).fetchall())
+    counts = sorted(Counter(name for name, _ in of_slices).items())
+    slices = [f"changes: {n} visits of the slice {name}" for name, n in counts]
     return out + [f"{line}; a backup of before has its numbers" for line in slices]
 
 

@@ -119,13 +119,16 @@ def _begun(archive: Path) -> list[Path]:
     return []
 
 
-def unfinished(archive: Path) -> list[Unfinished]:
-    """Return what phones and browsers have begun to send, and recordings in their place of which a process was killed
-    before they had a row, while other processes write and remove it. What this account may not see is left out."""
+def unfinished(archive: Path, parts_alone: bool = False) -> list[Unfinished]:
+    """Return what phones and browsers have begun to send, and, unless `parts_alone`, recordings in their place of which
+    a process was killed before they had a row, for which tables are read; while other processes write and remove it.
+    What this account may not see is left out."""
     out = []
     for path in _begun(archive):
         with contextlib.suppress(FileNotFoundError, PermissionError):
             own, placed = path.stat(), path.suffix == _PLACED
+            if placed and parts_alone:
+                continue
             parts = _placed(archive, path)[1] if placed else path.iterdir() if path.is_dir() else (path,)
             files = [f.stat() for f in parts]
             last_s = max([own.st_mtime, *(f.st_mtime for f in files if not placed)])

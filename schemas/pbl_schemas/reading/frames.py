@@ -186,10 +186,7 @@ def cycle_curves(restriction: Any = True) -> pd.DataFrame:
     visits = current_sets() * fit.SessionFit.proj("fit_scale") * gdi.SessionGdi.proj("session_status")
     for row in (visits & {"session_status": "PASS"} & restriction).to_dicts(order_by="session_id"):
         key = {k: row[k] for k in gdi.SessionGdi.primary_key}
-        measures = {
-            r["session_measure"]: gait.measure_of_row(r, "session_measure")
-            for r in (gdi.SessionGdi.Measure & key).to_dicts()
-        }
+        measures = {name: m for name, (m, _) in gdi.SessionGdi.Measure.measures(key).items()}
         leg_m = lib.leg_length_m(row["fit_scale"])
         bands = lib.normal_bands(measures, leg_m)
         done, pace = video.conditions(fit.SessionFit.Trial & key), gdi.pace_of(key["gdi_method"])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pbl_pipeline.qc import in_order
 from pbl_pipeline.records import from_row
-from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, KineticMeasure, Kinetics, Solution, TrialKinetics
+from pbl_pipeline.results import CycleKinetics, Gdi, GdiCycle, Kinetics, MovementProfile, Solution, TrialKinetics
 
 from .. import fit, gait, gdi, keypoints, kinetics, tracking, video
 from ..gait import load_cycles, load_events
@@ -93,47 +93,22 @@ def load_metrics(key: Any, rows: Rows = stored_rows) -> lib.GaitMetrics:
     row = row_of(gdi.SessionGdi, key, rows)
     row_key = _of(gdi.SessionGdi, row)
     pace = gdi.pace_of(row_key["gdi_method"], rows)
-    trials = tuple(
-        dataclasses.replace(
-            _trial_metrics({**row_key, "video_id": v}, rows), pooled=video.condition(v, rows).pooled(pace)
-        )
-        for v in videos_of(row_key, rows)
-    )
+    trials = tuple(_trial_metrics({**row_key, "video_id": v}, pace, rows) for v in videos_of(row_key, rows))
     pooled = [t for t in trials if t.pooled]
-    norm_name, model, params_hash = _index_of(row_key, rows)
     checks = in_order(gdi.SessionGdi.Check.records(row_key, rows))
-    index = from_row(
-        Gdi,
-        row,
-        "session_gdi",
-        status="PASS" if row["session_gdi"] is not None else "EMPTY",
-        n_left=sum(t.gdi.n_left for t in pooled),
-        n_right=sum(t.gdi.n_right for t in pooled),
-        norm=norm_name,
-        model=model,
-        params_hash=params_hash,
-        cycles=tuple(c for t in pooled for c in t.gdi.cycles),
-        qc=tuple(c for c in checks if c.check in INDEX_CHECKS),
-        profile=gdi.load_profile(gdi.SessionGdi.Profile, row_key, row, rows),
-    )
-    measures = _spatiotemporal(
-        rows(gdi.SessionGdi.Measure, row_key),
-        "session_measure",
-        status=row["session_status"],
-        reason=row["session_reason"],
+    cycles = [c for t in pooled for c in t.gdi.cycles]
+    own = tuple(c for c in checks if c.check in INDEX_CHECKS)
+    status = "EMPTY" if row["session_gdi"] is None else "PASS"
+    index = _index(gdi.SessionGdi, row, "session_gdi", cycles, rows, qc=own, status=status)
+    measures = lib.Spatiotemporal(
+        row["session_status"],
+        row["session_reason"],
+        *_measures(gdi.SessionGdi.Measure, row_key, rows),
         n_cycles_found=sum(t.spatiotemporal.n_cycles_found for t in pooled),
         n_cycles_used=int(row["session_cycles"]),
         n_steps_used=sum(t.spatiotemporal.n_steps_used for t in pooled),
     )
-    return lib.GaitMetrics(
-        trials=trials,
-        status=row["session_status"],
-        reason=row["session_reason"],
-        spatiotemporal=measures,
-        gdi=index,
-        qc=tuple(checks),
-        params_hash=row["session_params_hash"],
-    )
+    return from_row(lib.GaitMetrics, row, trials=trials, spatiotemporal=measures, gdi=index, qc=checks)
 
 
 def pooled_cycles(key: Mapping[str, Any], rows: Rows) -> list[lib.GaitCycle]:
@@ -147,24 +122,21 @@ def pooled_cycles(key: Mapping[str, Any], rows: Rows) -> list[lib.GaitCycle]:
     return out
 
 
-def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
+def _trial_metrics(key: Mapping[str, Any], pace: str, rows: Rows) -> lib.TrialMetrics:
     from pbl_pipeline import gait as lib
 
     name = row_of(fit.SessionFit.Trial, _of(fit.SessionFit.Trial, key), rows)["trial_name"]
     of_trial = _of(gait.GaitEvents, key)
-    counts = row_of(gait.GaitCycle, of_trial, rows)
-    row = row_of(gait.Spatiotemporal, of_trial, rows)
+    row = {**row_of(gait.GaitCycle, of_trial, rows), **row_of(gait.Spatiotemporal, of_trial, rows)}
     events = load_events(of_trial, rows)
-    measures = _spatiotemporal(
-        rows(gait.Spatiotemporal.Measure, of_trial),
-        "measure",
-        status=row["measures_status"],
-        reason=row["measures_reason"],
-        n_cycles_found=int(counts["n_cycles"]),
-        n_cycles_used=int(counts["n_cycles_used"]),
-        n_steps_used=int(row["n_steps_used"]),
-    )
-    index, cycles = load_gdi(key, name, rows), tuple(load_cycles(of_trial, name, rows))
+    measures, reasons = _measures(gait.Spatiotemporal.Measure, of_trial, rows)
+    measures = from_row(lib.Spatiotemporal, row, measures=measures, reasons=reasons)
+    cycles = tuple(load_cycles(of_trial, name, rows))
+    sides = {c.number: c.side for c in cycles}
+    scores = rows(gdi.GDI.Cycle, key)
+    scored = [from_row(GdiCycle, r, trial=name, side=sides[int(r["cycle_no"])]) for r in scores]
+    checks = in_order(gdi.GDI.Check.records(key, rows))
+    index = _index(gdi.GDI, row_of(gdi.GDI, key, rows), "gdi", scored, rows, qc=checks)
     reason = events.reason or measures.reason
     return lib.TrialMetrics(
         name=name,
@@ -175,30 +147,7 @@ def _trial_metrics(key: Mapping[str, Any], rows: Rows) -> lib.TrialMetrics:
         spatiotemporal=measures,
         gdi=index,
         qc=(*events.qc, *lib.cycle_checks(measures, cycles), *index.qc),
-    )
-
-
-def load_gdi(key: Any, trial: str, rows: Rows = stored_rows) -> Gdi:
-    """The library's `Gdi` of one row of GDI."""
-    row = row_of(gdi.GDI, key, rows)
-    norm_name, model, params_hash = _index_of(row, rows)
-    sides = {int(r["cycle_no"]): r["cycle_side"] for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
-    cycles = tuple(
-        from_row(GdiCycle, r, trial=trial, number=int(r["cycle_no"]), side=sides[int(r["cycle_no"])])
-        for r in rows(gdi.GDI.Cycle, key)
-    )
-    return from_row(
-        Gdi,
-        row,
-        "gdi",
-        n_left=sum(c.side == "left" for c in cycles),
-        n_right=sum(c.side == "right" for c in cycles),
-        norm=norm_name,
-        model=model,
-        params_hash=params_hash,
-        cycles=cycles,
-        qc=in_order(gdi.GDI.Check.records(key, rows)),
-        profile=gdi.load_profile(gdi.GDI.Profile, key, row, rows),
+        pooled=video.condition(key["video_id"], rows).pooled(pace),
     )
 
 
@@ -207,24 +156,18 @@ def load_kinetics(key: Mapping[str, Any], rows: Rows = stored_rows) -> Kinetics 
     there are none."""
     from pbl_pipeline import kinetics as lib
 
-    found = rows(kinetics.Kinetics, _of(gdi.SessionGdi, key))
-    if not found:
+    computed = rows(kinetics.Kinetics, _of(gdi.SessionGdi, key))
+    if not computed:
         return None
-    row = max(found, key=lambda r: r["forces_computed"])
+    row = max(computed, key=lambda r: r["forces_computed"])
     row_key = _of(kinetics.Kinetics, row)
-    stored = {r["force_measure"]: r for r in rows(kinetics.Kinetics.Measure, row_key)}
-    measures, reasons = {}, {}
-    for name in (n for n in lib.MEASURES if n in stored):
-        own = stored[name]
-        if own["force_mean"] is None:
-            reasons[name] = own["force_missing"]
-            continue
-        measures[name] = from_row(KineticMeasure, own, "force")
+    stored = kinetics.Kinetics.Measure.measures(row_key, rows)
+    found = {n: stored[n] for n in lib.MEASURES if n in stored}
     return from_row(
         Kinetics,
         row,
-        measures=measures,
-        reasons=reasons,
+        measures={n: m for n, (m, _) in found.items() if m is not None},
+        reasons={n: why for n, (m, why) in found.items() if m is None},
         method=row["kinetics_method"],
         params_hash=row["forces_method_hash"],
         trials=tuple(_trial_kinetics(r, rows) for r in rows(kinetics.Kinetics.Trial, row_key)),
@@ -241,19 +184,14 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
     if row["trial_forces"] is not None:
         with stored_file(file_ref(row["trial_forces"])) as path:
             series, curves = load_arrays(path)
-    cycles = {int(r["cycle_no"]): r for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
+    cycles = {r["cycle_no"]: r for r in rows(gait.GaitCycle.Cycle, _of(gait.GaitCycle, row))}
 
     def cycle(own: Mapping[str, Any]) -> CycleKinetics:
-        number_of = int(own["cycle_no"])
-        about = gait.cycle_of_row(cycles[number_of], "")
-        return CycleKinetics(
-            number_of,
-            about.side,
-            about.used,
-            measures={n: float(own[n]) for n in lib.MEASURES if own[n] is not None},
-            missing=own["forces_missing"],
-            **curves.get(number_of, {}),
-        )
+        about = cycles[own["cycle_no"]]
+        measures = {n: float(own[n]) for n in lib.MEASURES if own[n] is not None}
+        of_file = curves.get(int(own["cycle_no"]), {})
+        side, used = about["cycle_side"], bool(about["cycle_used"])
+        return from_row(CycleKinetics, own, side=side, used=used, measures=measures, **of_file)
 
     of_trial = {**_of(kinetics.Kinetics, row), "video_id": row["video_id"]}
     return from_row(
@@ -265,27 +203,39 @@ def _trial_kinetics(row: Mapping[str, Any], rows: Rows) -> TrialKinetics:
     )
 
 
-def _index_of(key: Mapping[str, Any], rows: Rows) -> tuple[str, str, str]:
-    """Names of the norm and the index, and the hash of the index with this norm."""
+def _index(table: Any, row: Mapping[str, Any], prefix: str, cycles: Sequence[GdiCycle], rows: Rows, **more: Any) -> Gdi:
+    """Index of a row of GDI or SessionGdi, with its profile; `more`: fields that are not columns of the row."""
+    from pbl_pipeline.gait import NINE_ANGLES
     from pbl_pipeline.paramset import Paramset
 
-    norm = row_of(gdi.NormativeSet, {"norm": key["norm"]}, rows)["norm_name"]
-    row = row_of(gdi.GdiModel, {"gdi_method": key["gdi_method"]}, rows)
-    name, params = row["gdi_method_name"], {**row["gdi_params"], "norm": norm}
-    return norm, name, Paramset(gdi.GdiModel.stage, name, int(row["gdi_method_version"]), params).hash
+    norm = row_of(gdi.NormativeSet, {"norm": row["norm"]}, rows)["norm_name"]
+    method = row_of(gdi.GdiModel, {"gdi_method": row["gdi_method"]}, rows)
+    name, params = method["gdi_method_name"], {**method["gdi_params"], "norm": norm}
+    scores = {s.angle: s for s in table.Profile.records(_of(table, row), rows)}
+    left, right = (
+        {a: v for a in (*NINE_ANGLES, *scores) if a in scores and (v := getattr(scores[a], side)) is not None}
+        for side in ("left", "right")
+    )
+    profile = from_row(MovementProfile, row, table.Profile.prefix, left=left, right=right) if scores else None
+    return from_row(
+        Gdi,
+        row,
+        prefix,
+        n_left=sum(c.side == "left" for c in cycles),
+        n_right=sum(c.side == "right" for c in cycles),
+        norm=norm,
+        model=name,
+        params_hash=Paramset(gdi.GdiModel.stage, name, int(method["gdi_method_version"]), params).hash,
+        cycles=tuple(cycles),
+        profile=profile,
+        **more,
+    )
 
 
-def _spatiotemporal(rows: list[dict], prefix: str, **fields: Any) -> lib.Spatiotemporal:
-    """The library's `Spatiotemporal` from the rows of a Measure part table, measures in the library's order."""
+def _measures(part: Any, key: Mapping[str, Any], rows: Rows) -> tuple[dict[str, Any], dict[str, str]]:
+    """Measures of a result by their part table, in the library's order, and why one is not known."""
     from pbl_pipeline import gait as lib
 
-    by_name = {row[prefix]: row for row in rows}
-    measures, reasons = {}, {}
-    for name in (*lib.TRIAL_MEASURES, *sorted(set(by_name) - set(lib.TRIAL_MEASURES))):
-        if name not in by_name:
-            continue
-        row = by_name[name]
-        measures[name] = gait.measure_of_row(row, prefix)
-        if row[f"{prefix}_missing"]:
-            reasons[name] = row[f"{prefix}_missing"]
-    return lib.Spatiotemporal(measures=measures, reasons=reasons, **fields)
+    found = part.measures(key, rows)
+    found = {n: found[n] for n in (*lib.TRIAL_MEASURES, *found) if n in found}
+    return {n: m for n, (m, _) in found.items()}, {n: why for n, (_, why) in found.items() if why}

@@ -10,7 +10,7 @@ from pbl_pipeline import methods
 from pbl_pipeline.change import INDEX, Change, change_since, measure_changes, not_alike
 from pbl_pipeline.errors import PblError
 
-from .. import fit, gait, gdi, keypoints, lab, review, session, video
+from .. import fit, gdi, keypoints, lab, review, session, video
 from ..datajoint_setup import dj
 from ..decisions.not_usable import unusable
 from ..methods import METHOD_TABLES
@@ -97,7 +97,7 @@ def _measures(sessions: Any) -> dict[tuple, dict[str, Any]]:
     out: dict[tuple, dict[str, Any]] = {}
     for row in rows_inside(query, "session_id", map(int, sessions)):
         of_visit = out.setdefault(tuple(row[k] for k in chain), {})
-        if (measure := gait.measure_of_row(row, "session_measure")) is not None:
+        if (measure := gdi.SessionGdi.Measure.measure(row)) is not None:
             of_visit[row["session_measure"]] = measure
     return out
 

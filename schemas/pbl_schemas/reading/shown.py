@@ -256,12 +256,8 @@ def _measures_of(key: Mapping[str, Any]) -> dict[str, tuple[Measure | None, str]
     """Return each measure of a result by its name, with the reason where it is not known."""
     from pbl_pipeline.words import MEASURES
 
-    rows = {r["session_measure"]: r for r in (gdi.SessionGdi.Measure & key).to_dicts()}
-    return {
-        n: (gait.measure_of_row(rows[n], "session_measure"), str(rows[n]["session_measure_missing"]))
-        for n in MEASURES
-        if n in rows
-    }
+    found = gdi.SessionGdi.Measure.measures(key)
+    return {n: found[n] for n in MEASURES if n in found}
 
 
 def _tasks_of(
@@ -273,7 +269,7 @@ def _tasks_of(
     of_result = {k: v for k, v in key.items() if k in gait.GaitEvents.primary_key}
     rows = (gait.Spatiotemporal.Measure & of_result & [{"measure": n} for n in TASKS]).to_dicts()
     found = {(int(r["video_id"]), r["measure"]): r for r in rows}
-    values = {k: (gait.measure_of_row(r, "measure"), str(r["measure_missing"])) for k, r in found.items()}
+    values = {k: (gait.Spatiotemporal.Measure.measure(r), str(r["measure_missing"])) for k, r in found.items()}
     named = [(r.name, r.number) for r in recordings if r.number is not None]
     of_task = {name: {n: values[v, n] for n in TASKS if (v, n) in values} for name, v in named}
     return {name: measures for name, measures in of_task.items() if measures}

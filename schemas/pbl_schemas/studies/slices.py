@@ -44,7 +44,7 @@ _usage = functools.partial(PblError, "USAGE", next_step="see `pbl study slice --
 @dataclasses.dataclass(frozen=True)
 class Slice:
     """A frozen slice: name, hash, how many visits it has and how many of them count; `visits`: person, visit, and why
-    it does not count, empty where it does."""
+    it does not count, empty where it does; those without a role are not in the slice."""
 
     name: str
     hash: str
@@ -105,7 +105,8 @@ def freeze(
         hashes = _hashes(_frames(rows, about))
         digest = _digest(hashes.values())
         listed = zip(rows["subject"], rows["visit"], rows["reason"], strict=True)
-        made = Slice(name, digest, len(rows), int(rows["included"].sum()), tuple(listed))
+        left_out = () if roles else _without_role(cohort)
+        made = Slice(name, digest, len(rows), int(rows["included"].sum()), (*listed, *left_out))
         if dry_run:
             return made
         study.StudySlice.insert1(
@@ -115,7 +116,7 @@ def freeze(
                 "slice_roles": list(roles),
                 "slice_n": len(rows),
                 "slice_hash": digest,
-                "slice_code_version": code_version()[:64],
+                "slice_code_version": code_version(),
                 "slice_created": utc_now(),
             }
         )
@@ -251,6 +252,15 @@ def _candidates(cohort: str | None, roles: Sequence[str]) -> Any:
     if not len(found):
         raise _none("no visit", "visits of the cohort with these roles", "`pbl study import` visits")
     return found
+
+
+def _without_role(cohort: str | None) -> list[tuple[str, str, str]]:
+    """Visits that cannot be in a slice, because no role is stated."""
+    visits = session.Session - study.Visit.proj()
+    if cohort is not None:
+        visits &= (study.CohortMember & {"cohort": cohort}).proj()
+    rows = visits.to_dicts(order_by="subject, session_label")
+    return [(row["subject"], row["session_label"], "no role is stated") for row in rows]
 
 
 def _chain(visits: Any, methods: Mapping[str, str]) -> dict[str, str | None]:

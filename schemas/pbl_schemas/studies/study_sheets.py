@@ -562,8 +562,9 @@ class _Plan:
         members = {key: ({"cohort": key[0], "subject": key[1]}, s.values) for key, s in self.members.items()}
         _write(study.CohortMember, members, self.stored_members, blank)
         scores = [{"session_id": numbers[k[:2]], "instrument": k[2], **s.values} for k, s in self.scores.items()]
-        if gone := [{k: r[k] for k in ("session_id", "instrument")} for r in scores if r["score_value"] is None]:
-            (study.ClinicalScore & gone).delete_quick()
+        gone = ({k: r[k] for k in ("session_id", "instrument")} for r in scores if r["score_value"] is None)
+        for some in parts(gone):
+            (study.ClinicalScore & some).delete_quick()
         study.ClinicalScore.insert([r for r in scores if r["score_value"] is not None], replace=True)
         for stated in self.trials:
             set_condition(stated.values["video_id"], stated.values.get("activity"), stated.values.get("pace"))

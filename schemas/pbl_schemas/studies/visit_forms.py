@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import re
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ from pbl_pipeline.names import check_height, check_label, check_mass, normalised
 from pbl_pipeline.texts import code_of
 
 from .. import lab, session, study, video
-from ..decisions.review_decisions import decisions, record
+from ..decisions.review_decisions import decisions, queue_visit, record
 from ..intake.records import set_condition, set_height, set_mass, set_population
 from ..intake.sheets import Row, Sheet, conflict, date_of, number_of, refused
 from ..rows import moment
@@ -105,6 +106,13 @@ def register_visit(values: Mapping[str, str], by: str) -> tuple[int | None, dict
     return in_transaction(lambda: _register(given, by))
 
 
+def _check_visit(label: str) -> None:
+    """Raise a `PblError` for a label that is too long, or looks like a day and is none, such as 9/3/2026."""
+    check_label("visit", label, longest=NEW["visit"])
+    if re.fullmatch(r"\d{1,4}([./-])\d\d?\1\d{2,4}", label):
+        date_of(Row("visit", {"visit": label}), "visit")
+
+
 def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, PblError]]:
     errors: dict[str, PblError] = {}
     for name in ("subject", "visit"):
@@ -112,7 +120,7 @@ def _register(given: dict[str, str], by: str) -> tuple[int | None, dict[str, Pbl
             errors[name] = refused("an empty field", "a value", "write it", name)
     checks: dict[str, Callable[[str], Any]] = {
         "subject": lambda text: check_subject(text, "write the code of the person"),
-        "visit": functools.partial(check_label, "visit", longest=NEW["visit"]),
+        "visit": _check_visit,
         "date": lambda text: date_of(Row("date", {"date": text}), "date"),
         "role": lambda text: check_role(text, "role"),
         "population": functools.partial(check_label, "population", longest=NEW["population"]),
@@ -306,6 +314,9 @@ def _write(now: Form, changed: Mapping[str, str], by: str, reason: str) -> None:
         was, after = ({"value": now.stored(name, v)} for v in (now.values[name], text))
         of = {"video_id": int(number)} if number else {"session_id": now.session_id}
         record(_KINDS[kind], by, {}, was, after, reason, **of)
+    of_all = {"subject": now.subject} if "height_m" in changed else {"session_id": now.session_id}
+    for visit in (session.Session & of_all).to_arrays("session_id"):
+        queue_visit(int(visit))
 
 
 def _stripped(values: Mapping[str, str]) -> dict[str, str]:

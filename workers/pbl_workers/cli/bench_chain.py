@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 from collections import defaultdict
 from collections.abc import Sequence
@@ -35,6 +36,8 @@ class Measured:
     original_bytes: int
     result_bytes: int
     jobs_s: dict[str, float]
+    #: Stage, what is done, and its processor time (s) in all processes; empty unless asked for.
+    profile: list[tuple[str, str, float]] = dataclasses.field(default_factory=list)
 
 
 @click.command(epilog="Example: pbl bench chain walk.mp4 --videos 32 --processes 2")
@@ -43,6 +46,7 @@ class Measured:
 @click.option("--processes", type=Processes(), default="auto", show_default=True, help="As for `pbl worker`.")
 @click.option("--machines", type=click.IntRange(1), default=1, show_default=True, help="For how many is the cost.")
 @click.option("--seconds", type=click.FloatRange(0.1), help="Length of the recordings that the cost is for.")
+@click.option("--profile", is_flag=True, help="Also print the processor time by stage and by what is done.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write all figures to this file.")
 def chain(
     video: Path | None,
@@ -50,6 +54,7 @@ def chain(
     processes: int | str,
     machines: int,
     seconds: float | None,
+    profile: bool,
     json_path: Path | None,
 ) -> None:
     """Put copies of VIDEO through all tables with `pbl worker`, and print what many recordings cost.
@@ -68,7 +73,7 @@ def chain(
         check_file(video)  # raises what is wrong with the file before anything is measured
     options = options_of("all", processes, once=True, selftest=False)
     with new_folder() as folder:
-        found = _measure(folder, video, videos or 4 * options.processes, options)
+        found = _measure(folder, video, videos or 4 * options.processes, options, profile)
     keep("chain", [{"cores": cores(), **dataclasses.asdict(found)}], json_path)
     click.echo(text(found, cores(), seconds or found.video_s, machines))
 
@@ -103,10 +108,29 @@ def text(found: Measured, cores: int, video_s: float, machines: int) -> str:
     rate = f"{n} recordings of {found.video_s:.3g} s in {found.seconds:.0f} s: {n / found.seconds:.3g} a second"
     such = "one such machine" if machines == 1 else f"{machines} such machines"
     processor = f"{found.processor_s / n:.3g} s of processor time each"
-    return f"{where}: {rate}, {processor}\n\n{parts}\n\n{such}:\n{cost}"
+    return "\n\n".join([f"{where}: {rate}, {processor}", parts, *profile_text(found), f"{such}:\n{cost}"])
 
 
-def _measure(folder: Path, video: Path | None, n: int, options: Any) -> Measured:
+def profile_text(found: Measured) -> list[str]:
+    """The table of the profile, if there is one: seconds of processor time a recording, by stage and kind."""
+    from pbl_pipeline.bench.run import number, table
+
+    if not found.profile:
+        return []
+    by_stage, by_kind = defaultdict[str, float](float), defaultdict[str, float](float)
+    cells = defaultdict[tuple[str, str], float](float)
+    for stage, kind, seconds in found.profile:
+        for sums, key in ((by_stage, stage), (by_kind, kind), (cells, (stage, kind))):
+            sums[key] += seconds / found.videos
+    kinds = sorted(by_kind, key=lambda kind: -by_kind[kind])
+    rows = [{"stage": s} | {k: cells[s, k] for k in kinds} | {"all": v} for s, v in by_stage.items()]
+    rows.sort(key=lambda row: -row["all"])
+    rows.append({"stage": "all", **by_kind, "all": sum(by_kind.values())})
+    columns = [(k, lambda row, k=k: number(row[k]) if row[k] >= 0.005 else "") for k in (*kinds, "all")]
+    return [table(rows, [("s a recording", lambda row: row["stage"]), *columns])]
+
+
+def _measure(folder: Path, video: Path | None, n: int, options: Any, profile: bool = False) -> Measured:
     from pbl_pipeline.bench.detect import demo_clip
     from pbl_pipeline.video import probe
 
@@ -127,6 +151,9 @@ def _measure(folder: Path, video: Path | None, n: int, options: Any) -> Measured
         _compute(_registered(folder, film, 0, first), options)
         before = _stored(folder)
         copies = _registered(folder, film, first, n)
+        if profile:
+            (folder / "profile").mkdir()
+            options = dataclasses.replace(options, profile=str(folder / "profile"))
         seconds, processor_s, jobs_s = _compute(copies, options)
         return Measured(
             videos=n,
@@ -138,6 +165,7 @@ def _measure(folder: Path, video: Path | None, n: int, options: Any) -> Measured
             original_bytes=n * len(film),
             result_bytes=_stored(folder) - before,
             jobs_s=jobs_s,
+            profile=[row for path in (folder / "profile").glob("*.json") for row in json.loads(path.read_text())],
         )
     finally:
         embedded.stop(folder=embedded.Folder(folder / "db"))

@@ -125,18 +125,17 @@ def release() -> None:
 
 @cron.command()
 def reprocess() -> None:
-    """Retry error rows whose cause was outside the recording: a missing model or file, a crash.
+    """Retry error rows whose cause was outside the recording: a missing model or file, a full disk, a crash.
 
     A cron job never deletes results: for another method or newer code see `pbl reprocess`.
 
     Example: pbl cron reprocess
     """
     import pbl_schemas
-    from pbl_workers.requeue import OUTSIDE, retry
+    from pbl_workers.requeue import retry_outside
 
     pbl_schemas.activate(methods=False)
-    done = {code: sum(retry(code).values()) for code in OUTSIDE}
-    click.echo(", ".join(f"{n} {code}" for code, n in done.items() if n) or "nothing to try again")
+    click.echo(", ".join(f"{n} {code}" for code, n in retry_outside().items() if n) or "nothing to try again")
 
 
 @cron.command()

@@ -81,7 +81,7 @@ def web(
         tls_cert, tls_key = certificates.server_certificate(sorted(Where(host, hostnames=hostnames).names))
         click.echo(f"Phones trust this page once they have {certificates.authority()}: docs/capture.md")
     where = Where(host or "127.0.0.1", port, tls_cert, tls_key, behind_proxy, hostnames)
-    serve(where, (name or getpass.getuser())[:64], roles, visit, folder=shown)
+    serve(where, name or getpass.getuser(), roles, visit, folder=shown)
 
 
 @web.group(epilog="Example: pbl web account add R.Viewer --role reviewer")

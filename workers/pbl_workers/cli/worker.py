@@ -107,8 +107,8 @@ def worker(
 
 def options_of(resource: str, processes: int | str | None, batch: int | None = None, **others: Any) -> Options:
     """Options of a worker on this machine. processes, batch: as given on the command line."""
-    from pbl_pipeline.resources import processes_at_once
-    from pbl_workers.process import Options, given_gpus
+    from pbl_pipeline.resources import given_gpus, processes_at_once
+    from pbl_workers.process import Options
 
     gpus = given_gpus() if FIT in GROUPS[resource] else ()
     if processes == "auto":

@@ -18,6 +18,7 @@ from starlette.types import Receive, Scope, Send
 from pbl_pipeline import settings, texts
 from pbl_pipeline.errors import PblError
 
+from .. import refresh  # noqa: F401  decisions queue by it what they made computable
 from . import (
     access,
     audit,

@@ -9,7 +9,6 @@ from starlette.responses import RedirectResponse, Response
 
 from pbl_schemas.decisions import event_corrections, review_decisions
 
-from ..refresh import queue_visit_of
 from . import site
 from .access import Refused, form_of, sender
 from .address import Address, number_of
@@ -28,7 +27,6 @@ async def usable_or_not(request: Request) -> Response:
         await site.ask(request, review_decisions.mark_not_usable, number, reason, note, sender(request), seen)
     else:
         raise Refused("form")
-    await site.ask(request, queue_visit_of, number)
     return RedirectResponse(f"/recordings/{number}", 303)
 
 
@@ -40,7 +38,6 @@ async def events(request: Request) -> Response:
     else:
         found = _events(fields.get("events", ""))
         await site.ask(request, event_corrections.save, number, found, sender(request), seen)
-    await site.ask(request, queue_visit_of, number)
     return RedirectResponse(f"/recordings/{number}", 303)
 
 

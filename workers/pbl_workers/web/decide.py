@@ -18,7 +18,6 @@ from pbl_pipeline.temporary import new_folder
 from pbl_schemas import reading, video
 from pbl_schemas.decisions import candidates, review_decisions
 
-from ..refresh import queue_visit, queue_visit_of
 from . import site
 from .access import Refused, form_of, sender
 from .address import Address, number_of
@@ -33,7 +32,6 @@ async def person(request: Request) -> Response:
     chosen = _number(fields.get("person", ""))
     method, seen = fields.get("method", ""), fields.get("seen", "")
     await site.ask(request, review_decisions.decide_person, number, chosen, method, sender(request), seen)
-    await site.ask(request, queue_visit_of, number)
     return RedirectResponse(f"/recordings/{number}", 303)
 
 
@@ -41,7 +39,6 @@ async def accept(request: Request) -> Response:
     fields = await form_of(request)
     number, shown = number_of(request), _number(fields.get("result", ""))
     await site.ask(request, _accept, number, shown, fields, sender(request))
-    await site.ask(request, queue_visit, number)
     return RedirectResponse(f"/visits/{number}?result={shown}", 303)
 
 

@@ -22,7 +22,7 @@ from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.gait import load_norm, norm_names
 from pbl_pipeline.visit import Recording, Visit, recording_facts, visit_facts
-from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant
+from pbl_pipeline.words import ANGLES, MEASURES, STAGES, TASKS, capital, check_words, number, significant, without_unit
 from pbl_schemas.intake.sheets import with_point
 from pbl_schemas.reading.shown import ShownVisit
 from pbl_schemas.rows import moment
@@ -132,7 +132,7 @@ def _environment() -> jinja2.Environment:
         moment=moment,
         angle_words=[title for title, _ in ANGLES.values()],
     )
-    found.filters |= {"capital": capital, "norm_people": norm_people}
+    found.filters |= {"capital": capital, "norm_people": norm_people, "without_unit": without_unit}
     return found
 
 

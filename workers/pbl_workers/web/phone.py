@@ -14,6 +14,7 @@ import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 from weakref import WeakValueDictionary
 
 import segno
@@ -26,10 +27,11 @@ from pbl_pipeline import texts
 from pbl_pipeline.bounded import parse_json
 from pbl_pipeline.errors import PblError
 from pbl_pipeline.names import whole_number
+from pbl_pipeline.sensors import SEGMENTS
 from pbl_pipeline.words import capital
 from pbl_schemas.capture import UPLOADING
 from pbl_schemas.intake import phone_recordings
-from pbl_schemas.intake.phone_recordings import MOST_HOURS, PART_BYTES, Phone, Sent
+from pbl_schemas.intake.phone_recordings import MOST_HOURS, MOST_LOG_BYTES, PART_BYTES, Phone, Sent
 from pbl_schemas.intake.protocols import steps_of
 from pbl_schemas.operations.archive import UNFINISHED_DAYS
 from pbl_schemas.reading.usable import PENDING, Next, Usable, next_pass, usual_seconds
@@ -120,6 +122,7 @@ async def page(request: Request) -> Response:
     }
     usual = usual_words(reader_language(request), await site.ask(request, usual_seconds))
     values = {"phone": request.state.phone, "words": json.dumps(said), "usual": usual, "part_bytes": PART_BYTES}
+    values["segments"] = SEGMENTS
     return pages.show(request, "capture.html", 200, _MAY, **values)
 
 
@@ -188,6 +191,20 @@ async def authority(request: Request) -> Response:
     if not certificates.authority().is_file():
         raise HTTPException(404)
     return FileResponse(certificates.authority(), media_type="application/x-x509-ca-cert", filename="laboratory.crt")
+
+
+async def worn(request: Request) -> Response:
+    """Take the log of a wearable sensor, whose name and segment the headers state."""
+    body = await _body(request, "application/octet-stream", MOST_LOG_BYTES)
+    phone, headers = request.state.phone, request.headers
+    name, segment = unquote(headers.get("x-name", "")), headers.get("x-segment", "")
+    if segment not in ("", *SEGMENTS):
+        raise Refused("form")
+    segments = await site.ask(request, phone_uploads.attach_worn, phone, name, segment, body)
+    with contextlib.suppress(PblError):  # others wait
+        compute(request, phone.session_id, False)
+    language = reader_language(request)
+    return JSONResponse({"segments": ", ".join(texts.library_words(language, segment) for segment in segments)})
 
 
 class Phones:
@@ -301,6 +318,7 @@ def routes() -> list[Address]:
         Address("/phone/look.json", phones.look, FILM, methods=["POST"]),
         Address("/phone/recordings.json", begin, FILM, methods=["POST"]),
         Address("/phone/recordings/{phone_recording:int}.json", part, FILM, methods=["PUT"]),
+        Address("/phone/sensors.json", worn, FILM, methods=["POST"]),
         Address("/phone/finish/{phone_recording:int}.json", phones.finish, FILM, methods=["POST"]),
     ]
 

@@ -14,13 +14,11 @@ from starlette.responses import RedirectResponse, Response
 from pbl_pipeline import texts
 from pbl_pipeline.errors import PblError
 from pbl_schemas import lab
-from pbl_schemas import session as sessions
 from pbl_schemas.studies import visit_forms
 
 from .. import browser_uploads
 from ..browser_uploads import Arriving, Place, Received
 from ..incoming import VIDEO_ENDINGS, Copy, check_room
-from ..refresh import queue_visit
 from . import pages, site
 from .access import BODY_BYTES, Refused, check_fields, check_token, form_of, sender
 from .address import Address, number_of, page
@@ -60,8 +58,6 @@ async def register(request: Request) -> Response:
     number, errors = await site.ask(request, visit_forms.register_visit, fields, sender(request))
     if errors:
         return await new(request, fields, errors)
-    if fields.get("height_m", "").strip():  # fits of the person's other visits may have gone
-        await site.ask(request, _queue_visits_of_person, number)
     return RedirectResponse(f"/visits/{number}", 303)
 
 
@@ -82,11 +78,9 @@ async def facts(
 async def correct(request: Request) -> Response:
     fields = dict(await form_of(request))
     number, seen, reason = number_of(request), fields.pop("seen", ""), fields.pop("reason", "").strip()
-    changed, errors = await site.ask(request, visit_forms.correct_facts, number, fields, sender(request), seen, reason)
+    _, errors = await site.ask(request, visit_forms.correct_facts, number, fields, sender(request), seen, reason)
     if errors:
         return await facts(request, fields, errors)
-    if changed:
-        await site.ask(request, _queue_visits_of_person if "height_m" in changed else queue_visit, number)
     return RedirectResponse(f"/visits/{number}", 303)
 
 
@@ -129,8 +123,6 @@ async def send(request: Request) -> Response:
     finally:
         for one in arriving:
             await asyncio.to_thread(one.discard)
-    if any(one.video_id is not None for one in outcomes):
-        await site.ask(request, queue_visit, to.session_id)
     if all(one.status == "registered" for one in outcomes):
         return RedirectResponse(f"/visits/{to.session_id}", 303)
     return upload_page(request, to, stated, outcomes)
@@ -219,12 +211,6 @@ async def _begin(to: Place, part: Part, outcomes: list[Received]) -> Arriving | 
             raise
         outcomes.append(Received(str(error.key), "refused", error=error))
         return None
-
-
-def _queue_visits_of_person(session_id: int) -> None:
-    subject = (sessions.Session & {"session_id": session_id}).fetch1("subject")
-    for visit in (sessions.Session & {"subject": subject}).to_arrays("session_id"):
-        queue_visit(int(visit))
 
 
 def _populations() -> list[str]:

@@ -220,6 +220,22 @@ async function sendAll() {
   await show();
 }
 
+// Logs of wearable sensors, which an app or a computer wrote while it was filmed.
+$("[name=worn]").onchange = () => { $(".worn").hidden = !$("[name=worn]").checked; };
+$(".worn input").onchange = async () => {
+  const input = $(".worn input"), lines = $(".worn ul"), segment = $(".worn select").value;
+  for (const file of input.files) {
+    const headers = { "content-type": "application/octet-stream", "x-name": encodeURIComponent(file.name), "x-segment": segment };
+    const line = item(file.name, t("sending", { n: 0 }));
+    lines.prepend(line);
+    const said = await request("/phone/sensors.json", { method: "POST", headers, body: file }).then(
+      (told) => `\u2713 ${told.segments}`, (error) => (error instanceof Refusal ? `${error.message}; ${error.expected}` : t("no_network")));
+    line.replaceWith(item(file.name, said));
+  }
+  input.value = "";
+};
+$("[name=worn]").onchange();
+
 /** The steps of the protocol: what came is ticked off, a tap chooses what is filmed now. @param {any[]} steps */
 function lead(steps) {
   const open = steps.find((step) => step.done < step.passes), now = steps.find((step) => step.number === chosen?.number);

@@ -74,7 +74,7 @@ export class Refusal extends Error {
   /** @param {number} status @param {any} error */
   constructor(status, error) {
     super(error?.found ?? String(status));
-    this.status = status, this.code = error?.code ?? "";
+    this.status = status, this.code = error?.code ?? "", this.expected = error?.expected ?? "";
   }
 }
 
