@@ -320,6 +320,7 @@ def wearables(session: Session) -> Wearables:
         "follows": 0.8 * count * np.roll(count, -1, axis=0) * (np.diff(p.trial, append=-1) == 0)[:, None],
         "mount": quats(2),
         "world": quats(trials, 2),
+        "mount_sd_deg": [20.0, 3.0],
         "sd_rad": [0.3, 0.5],
         "bias_sd_rad_s": [0.02, 0.05],
         "level_sd_rad": np.full((trials, 2), 0.1),
