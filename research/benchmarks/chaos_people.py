@@ -188,6 +188,8 @@ class People:
                 self._decider.stdin.flush()
             number += 1
             while line := self._decider.stdout.readline():
+                if not line.startswith(("asked ", "done ", "error ")):
+                    continue  # DataJoint prints its warnings there
                 what, of, rest = line.rstrip("\n").split(" ", 2)
                 if what == "error":
                     self.ended[f"decision: {rest.split()[0]}"] += 1
