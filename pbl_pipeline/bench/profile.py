@@ -8,7 +8,7 @@ import os
 import sys
 import threading
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -51,7 +51,7 @@ def profiled(folder: str) -> Iterator[Callable[[str], None]]:
 
     Threads without Python's stack, such as those of XLA, count as what the main thread does or waits for.
     """
-    found, stage, ended = Counter[tuple[str, str]](), ["-"], threading.Event()
+    found, stage, ended = defaultdict[tuple[str, str], float](float), ["-"], threading.Event()
     found["-", "start, imports"] = time.process_time()
     sampler = threading.Thread(target=_sample, args=(found, stage, ended), daemon=True)
     if folder:
@@ -66,10 +66,11 @@ def profiled(folder: str) -> Iterator[Callable[[str], None]]:
             (Path(folder) / f"{os.getpid()}.json").write_text(json.dumps(rows), encoding="utf-8")
 
 
-def _sample(found: Counter[tuple[str, str]], stage: list[str], ended: threading.Event) -> None:
+def _sample(found: defaultdict[tuple[str, str], float], stage: list[str], ended: threading.Event) -> None:
     main, before, all_before = threading.main_thread().ident, _clocks(), time.process_time()
     while not ended.wait(EVERY_S):
-        spent, all_now, frames, clocks = Counter[str](), time.process_time(), sys._current_frames(), _clocks()
+        spent, all_now = defaultdict[str, float](float), time.process_time()
+        frames, clocks = sys._current_frames(), _clocks()
         for thread, now in clocks.items():
             last = before.get(thread, 0.0)  # of an earlier thread of that number if it is later than now
             spent[kind_of(frames.get(thread))] += now - last if now >= last else now

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from pbl_pipeline.body import PELVIS_TURNS, SLIDES, Y_UP_TO_Z_UP, load_body
 from pbl_pipeline.errors import PblError
@@ -132,6 +131,8 @@ def floor_under_person_m(trial: ExportTrial) -> np.ndarray | None:
     if len(times) < 3:
         return None
     size = min(1 + 2 * round(0.5 * _WINDOW_S / interval_of(times)), len(times))
+    from scipy.signal import savgol_filter  # takes longer to import than most commands run
+
     followed = np.asarray(savgol_filter(lowest, size, 1), float)
     pelvis = poses.position_m[known, poses.index("pelvis"), :2]
     path = float(np.linalg.norm(np.ptp(pelvis, axis=0)))

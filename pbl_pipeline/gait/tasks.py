@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
-from scipy.signal import find_peaks
 
 from pbl_pipeline import words
 from pbl_pipeline.qc import Check, failed
@@ -208,6 +207,8 @@ def stands(motion: TaskMotion, least: float | None = None) -> Stands:
 
 def _peaks(value: np.ndarray, least: float) -> np.ndarray:
     """Return the maxima from which the values fall by `least` on both sides, or to an end, before they are higher."""
+    from scipy.signal import find_peaks  # takes longer to import than most commands run
+
     return find_peaks(np.pad(value, 1, constant_values=value.min() - least), prominence=least)[0] - 1
 
 

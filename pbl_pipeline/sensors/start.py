@@ -13,7 +13,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation, Slerp
 
 from .orientation import SAMPLE_S, Orientation, rate_of
@@ -142,6 +141,8 @@ def _known_rate(sensor: Orientation, time: np.ndarray) -> np.ndarray:
 def _correlation(long: np.ndarray, short: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Correlation of a signal with each part of a longer one, where that is known, and the share that is."""
     known, long, short = np.isfinite(long), np.nan_to_num(long), short - short.mean()
+    from scipy.signal import fftconvolve  # takes longer to import than most commands run
+
     slide = lambda a, b: fftconvolve(a, b[::-1], "valid")  # noqa: E731
     ones = np.ones(len(short))
     n = np.maximum(slide(known, ones), 1.0)

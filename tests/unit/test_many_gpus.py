@@ -4,6 +4,7 @@ import functools
 import subprocess
 import threading
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,7 +31,7 @@ class Sums:
 
 
 @pytest.fixture
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> SimpleNamespace:
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: Environment) -> Iterator[SimpleNamespace]:
     """Three GPUs: the servers that were started on each, and those on which none starts."""
     found = SimpleNamespace(servers=dict[str, Server](), gpu_at=dict[str, str](), dead=set[str](), started=list[str]())
 
@@ -82,6 +83,7 @@ def test_processes_take_the_gpus_in_turn_each_with_a_server(machine: SimpleNames
 
 def test_where_a_gpu_disappears_the_next_one_computes(machine: SimpleNamespace) -> None:
     first, second = in_new_process(), in_new_process()
+    assert [n(PICTURE)[1].item() for n in (first, second)] == [48] * 2
     machine.dead.add("1")
     machine.servers["1"].close()
     address = next(at for at, gpu in machine.gpu_at.items() if gpu == "1")

@@ -5,11 +5,13 @@ import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from pbl_pipeline.bench import profile
 from pbl_pipeline.bench.profile import kind_of, profiled
+from tests import Limits
 
 
 def spend(seconds: float) -> None:
@@ -24,7 +26,7 @@ NETWORK: dict = {"spend": spend}
 exec(compile("def compute(seconds):\n    spend(seconds)", "/x/pbl_pipeline/models/network.py", "exec"), NETWORK)
 
 
-def frames(*stack: tuple[str, str]) -> SimpleNamespace | None:
+def frames(*stack: tuple[str, str]) -> Any:
     """Frames by their files and functions, the innermost first."""
     found = None
     for file, name in reversed(stack):
@@ -48,8 +50,8 @@ def test_the_innermost_frame_that_is_known_counts(stack: list[tuple[str, str]], 
     assert kind_of(frames(*stack)) == kind
 
 
-def test_stages_and_threads_add_up_to_the_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(profile, "EVERY_S", 0.005)
+def test_stages_and_threads_add_up_to_the_process(tmp_path: Path, limits: Limits) -> None:
+    limits(profile, EVERY_S=0.005)
     began = time.process_time()
     with profiled(str(tmp_path)) as stage_is:
         stage_is("Keypoints")

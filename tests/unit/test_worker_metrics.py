@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
 
+import jax
 import pymysql
 import pytest
 from prometheus_client.core import GaugeMetricFamily
@@ -27,7 +28,7 @@ from pbl_workers.process import Options
 from pbl_workers.queue import Claim
 from pbl_workers.run_job import DONE, Outcome
 from pbl_workers.supervisor import Supervisor, _Child
-from tests import Environment, Limits
+from tests import Environment, Limits, refused
 from tests.command import program
 from tests.ended_process import Ended
 
@@ -312,6 +313,22 @@ def test_a_process_sees_its_own_gpu_only(monkeypatch: pytest.MonkeyPatch, enviro
         seen.append(tuple(map(os.environ.get, (VISIBLE_GPUS, MEMORY, *CPU))))
     no = (None, None)
     assert seen == [("4", None, *no), ("7", None, *no), ("7", "false", *no), (*no, "cpu", "cpu")]
+
+
+def test_where_the_device_fails_the_process_ends_and_the_job_is_left_to_another(monkeypatch: pytest.MonkeyPatch):
+    """A process whose GPU is gone would make an error row of each further fit."""
+    lost = jax.errors.JaxRuntimeError("INTERNAL: CUDA error:\n device lost")
+    counted = []
+
+    def make(_: object) -> str:
+        raise RuntimeError("the fit failed") from lost
+
+    monkeypatch.setattr(run_job._Attempt, "make", make)
+    monkeypatch.setattr(recover, "crashed", lambda *given: counted.append(given))
+    job = Claim(fit.SessionFit, {"fit_set": "a"}, 5, "here", 1, 1)
+    error = refused("DEVICE_UNAVAILABLE", run_job.run, job)
+    assert error.found == "INTERNAL: CUDA error: device lost"
+    assert counted == [(job, error.found)]
 
 
 def test_a_process_that_died_is_replaced_by_one_with_the_same_gpu(monkeypatch: pytest.MonkeyPatch):

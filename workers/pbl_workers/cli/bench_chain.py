@@ -117,16 +117,15 @@ def profile_text(found: Measured) -> list[str]:
 
     if not found.profile:
         return []
-    by_stage, by_kind = defaultdict[str, float](float), defaultdict[str, float](float)
-    cells = defaultdict[tuple[str, str], float](float)
+    sums = defaultdict[tuple[str, str], float](float)  # by stage and kind, each of them or "all"
     for stage, kind, seconds in found.profile:
-        for sums, key in ((by_stage, stage), (by_kind, kind), (cells, (stage, kind))):
-            sums[key] += seconds / found.videos
-    kinds = sorted(by_kind, key=lambda kind: -by_kind[kind])
-    rows = [{"stage": s} | {k: cells[s, k] for k in kinds} | {"all": v} for s, v in by_stage.items()]
-    rows.sort(key=lambda row: -row["all"])
-    rows.append({"stage": "all", **by_kind, "all": sum(by_kind.values())})
-    columns = [(k, lambda row, k=k: number(row[k]) if row[k] >= 0.005 else "") for k in (*kinds, "all")]
+        for where in ((stage, kind), (stage, "all"), ("all", kind), ("all", "all")):
+            sums[where] += seconds / found.videos
+    stages = sorted({s for s, _ in sums} - {"all"}, key=lambda stage: -sums[stage, "all"])
+    kinds = sorted({k for _, k in sums} - {"all"}, key=lambda kind: -sums["all", kind])
+    rows = [{"stage": stage} for stage in (*stages, "all")]
+    shown = lambda value: number(value) if value >= 0.005 else ""  # noqa: E731
+    columns = [(k, lambda row, k=k: shown(sums[row["stage"], k])) for k in (*kinds, "all")]
     return [table(rows, [("s a recording", lambda row: row["stage"]), *columns])]
 
 
